@@ -1,0 +1,19 @@
+"""Differentiable mechanics: from energies, dissipation functions and constraints to motions and identified machines."""
+
+from ._integrate import RESULTS as RESULTS, Trajectory as Trajectory, simulate as simulate
+from ._manifold import (
+    Baumgarte as Baumgarte,
+    NoStabilisation as NoStabilisation,
+    Projection as Projection,
+    consistent_state as consistent_state,
+)
+from ._mechanics import (
+    Residual as Residual,
+    constraint_jacobian as constraint_jacobian,
+    constraint_residual as constraint_residual,
+    energy as energy,
+    mass_matrix as mass_matrix,
+    momentum as momentum,
+)
+from ._multipliers import Acceleration as Acceleration, acceleration as acceleration, constraint_force as constraint_force
+from ._system import System as System

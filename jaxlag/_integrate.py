@@ -1,0 +1,314 @@
+"""The motion: diffrax integrates the constrained accelerations, and the samples are put back on the constraints."""
+
+import functools
+import warnings
+from collections.abc import Callable
+from typing import Any
+
+import diffrax as dfx
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, PyTree
+
+from ._checks import checked, is_concrete, parameters, state
+from ._manifold import IMPOSSIBLE, Baumgarte, NoStabilisation, Projection, nearest_state
+from ._multipliers import NO_INERTIA, constrained_acceleration
+from ._sensitivities import differentiable
+from ._system import System, bind
+
+
+class RESULTS(dfx.RESULTS):  # pyright: ignore
+    """Why a motion ended: those of diffrax, and three of mechanics."""
+
+    not_finite = "`q0`, `qdot0`, `ts` and `params` must be finite, but there is a NaN or an infinity among them. Look for missing values."
+    no_inertia = NO_INERTIA
+    impossible_start = IMPOSSIBLE
+
+
+class Trajectory(eqx.Module):
+    """A motion at sample times: each field has the samples as its first axis.
+
+    - `ts`: the times; `q`, `qdot`, `qddot`: structured like q0; `multipliers`: λ by the constraint's name.
+    - `result`: `RESULTS.successful`, or the reason of failure; samples that were not reached are NaN.
+    - `stats`: `num_steps`, `num_accepted_steps`, `num_rejected_steps`, and `start_moved`, how far the start was projected.
+    """
+
+    ts: Float[Array, " T"]
+    q: PyTree
+    qdot: PyTree
+    qddot: PyTree
+    multipliers: dict[str, PyTree]
+    result: RESULTS
+    stats: dict[str, Any]
+
+    @property
+    def succeeded(self) -> Any:
+        """Whether the motion was computed to its end."""
+        return self.result == RESULTS.successful
+
+    def __repr__(self) -> str:
+        if not is_concrete(self):
+            return "Trajectory(traced)"
+        batch = self.ts.shape[:-1]
+        rows = [("coordinates", _listed(self.q))]
+        if self.multipliers:
+            rows.append(("constraints", ", ".join(self.multipliers)))
+        steps, rejected = (np.asarray(self.stats[key]) for key in ("num_steps", "num_rejected_steps"))
+        rows.append(("steps", f"{steps.max()}, {rejected.max()} of them rejected" + (" (the most in the batch)" if batch else "")))
+        if self.multipliers:
+            rows.append(("start moved by", f"{np.max(self.stats['start_moved']):.2g}"))
+        rows.append(("result", "successful" if np.all(self.succeeded) else _reason(self.result)))
+        of = f"{' × '.join(map(str, batch))} motions of " if batch else ""
+        head = f"Trajectory: {of}{self.ts.shape[-1]} samples, t = {np.min(self.ts):g} … {np.max(self.ts):g}"
+        return "\n".join([head, *(f"  {name:<15}{value}" for name, value in rows)])
+
+
+def simulate(
+    system: System,
+    q0: PyTree,
+    qdot0: PyTree,
+    ts: Any,
+    params: PyTree = None,
+    *,
+    solver: dfx.AbstractSolver | None = None,
+    rtol: float | None = None,
+    atol: float | None = None,
+    stabilisation: Projection | Baumgarte | NoStabilisation = Projection(),
+    max_steps: int = 100_000,
+    adjoint: dfx.AbstractAdjoint | None = None,
+    progress: bool = False,
+    throw: bool = True,
+) -> Trajectory:
+    r"""The motion of a system from a start, at the times `ts`.
+
+    $$ M\ddot q = f + G^T\lambda, \qquad g(t, q) = 0, \qquad a(t, q, \dot q) = 0 $$
+
+    Differentiable in q0, qdot0, ts and params, forward and reverse, to any order, under `jit` and `vmap`, with no setting.
+    The start is put on the constraints first (and `stats["start_moved"]` says how far it was off), inside what is differentiated.
+
+    **Arguments:**
+
+    - `q0`, `qdot0`: the state at ts[0]; pytrees of one structure. Any consistent units.
+    - `ts`: sample times, increasing, at least two.
+    - `params`: what the functions of the system name.
+    - `solver`: any explicit or diagonally implicit Runge–Kutta solver of diffrax. Default `diffrax.Tsit5()`; stiff systems
+      want `diffrax.Kvaerno5()`, high accuracy `diffrax.Dopri8()`.
+    - `rtol`, `atol`: tolerances of the step size control. Defaults 1e-8 and 1e-10 in double, 1e-4 and 1e-6 in single precision.
+    - `stabilisation`: how the constraints are kept, `Projection()`, `Baumgarte(...)` or `NoStabilisation()`.
+    - `max_steps`: steps after which the motion is given up.
+    - `adjoint`: a diffrax adjoint, to be used in place of the derivative rule of this package.
+    - `progress`: shows a bar while it runs.
+    - `throw`: whether a failure raises. If not, or under `jit`, `Trajectory.result` holds the reason, and samples not reached are NaN.
+
+    **Returns:** a `Trajectory`.
+
+    **Raises:** `ValueError` or `TypeError` for unusable arguments; `RuntimeError` where the integration fails (out of steps, not finite).
+
+    **Source:** Hairer, Lubich & Wanner, Geometric Numerical Integration, section IV.4 (projection); Kidger, On Neural Differential Equations.
+
+    ```python
+    import jax, jax.numpy as jnp
+    import jaxlag as jl
+    oscillator = jl.System(lambda q, qdot, c: 0.5 * qdot**2 - 0.5 * c * q**2)
+    motion = jl.simulate(oscillator, 1.0, 0.0, jnp.linspace(0, 10, 11), {"c": 4.0})
+    motion.q[-1]  # cos(2 · 10) = 0.408
+    jax.grad(lambda c: jl.simulate(oscillator, 1.0, 0.0, jnp.linspace(0, 10, 11), {"c": c}).q[-1])(4.0)  # −(10/4) sin 20 = −2.28
+    ```
+    """
+    q0, qdot0 = state(q0, qdot0, ("q0", "qdot0"))
+    dtype = jax.tree.leaves(q0)[0].dtype
+    ts = _sample_times(ts, dtype)
+    how = _How(solver or dfx.Tsit5(), stabilisation, max_steps, adjoint, progress)
+    single = jnp.finfo(dtype).bits < 64
+    if single:
+        _warn_of_single_precision()
+    tolerances = (rtol or (1e-4 if single else 1e-8), atol or (1e-6 if single else 1e-10))
+    tolerances = tuple(jnp.asarray(tolerance, dtype) for tolerance in tolerances)
+    trajectory = _simulate(system, how, q0, qdot0, ts, parameters(params, q0), tolerances)
+    if throw:
+        _raise_failure(trajectory)
+    return trajectory
+
+
+class _How(eqx.Module):
+    """The choices of numerics, which a compiled program is made for."""
+
+    solver: dfx.AbstractSolver
+    stabilisation: Any = eqx.field(static=True)
+    max_steps: int = eqx.field(static=True)
+    adjoint: dfx.AbstractAdjoint | None
+    progress: bool = eqx.field(static=True)
+
+
+@eqx.filter_jit
+def _simulate(system, how, q0, qdot0, ts, params, tolerances):
+    _, _, q, v = checked(system, ts[0], q0, qdot0, params)
+    like = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype), q0)
+    feedback, project = how.stabilisation.feedback(), how.stabilisation.project
+    n = q.size
+
+    def vector_field(t, y, params):
+        return jnp.concatenate([y[n:], constrained_acceleration(bind(system, like, params), t, y[:n], y[n:], feedback).x])
+
+    def back(t, y, params):
+        return jnp.concatenate(project(bind(system, like, params), t, y[:n], y[n:]))
+
+    constrained = bool(system.constraints)
+    back = back if constrained and project else None
+
+    def motion(adjoint, inputs, ts):
+        t0, q, v, params, tolerances = inputs
+        start = nearest_state(bind(system, like, params), t0, q, v)
+        y0 = jnp.concatenate([start.q, start.v])
+        ys, result, stats = _solve(vector_field, back, how, adjoint, t0, y0, ts, params, tolerances)
+        moved = jnp.max(jnp.abs(y0 - jnp.concatenate([q, v])))
+        finite = jnp.all(jnp.array([jnp.all(jnp.isfinite(x)) for x in jax.tree.leaves((inputs, ts)) if eqx.is_inexact_array(x)]))
+        result = RESULTS.where(start.reached, result, RESULTS.impossible_start)
+        result = RESULTS.where(start.determined, result, RESULTS.no_inertia)
+        result = RESULTS.where(finite, result, RESULTS.not_finite)
+        started = finite & start.reached & start.determined
+        return jnp.where(started & jnp.isfinite(ys), ys, jnp.nan), (result, stats | {"start_moved": jax.lax.stop_gradient(moved)})
+
+    def drift(inputs, ts, ys):
+        return jax.vmap(vector_field, (0, 0, None))(ts, ys, inputs[3])
+
+    if how.adjoint is None:
+        solve = functools.partial(motion, dfx.ForwardMode())
+        run = differentiable(solve, functools.partial(motion, dfx.RecursiveCheckpointAdjoint()), drift)
+    else:
+        run = functools.partial(motion, how.adjoint)
+    ys, (result, stats) = run((ts[0], q, v, params, tolerances), ts)
+
+    def at_sample(t, y):
+        flat = bind(system, like, params)
+        x, multipliers, _ = constrained_acceleration(flat, t, y[:n], y[n:], feedback)
+        return flat.unravel(y[:n]), flat.unravel(y[n:]), flat.unravel(x), flat.unravel_multipliers(multipliers)
+
+    return Trajectory(ts, *jax.vmap(at_sample)(ts, ys), result, stats)
+
+
+def _solve(vector_field, back, how, adjoint, t0, y0, ts, params, tolerances):
+    """States at the samples, by diffrax, and the reason it stopped."""
+    rtol, atol = tolerances
+    smallest = 4 * jnp.finfo(y0.dtype).eps * jnp.maximum(jnp.abs(ts[0]), jnp.abs(ts[-1]))
+    solution = dfx.diffeqsolve(
+        dfx.ODETerm(vector_field),
+        how.solver if back is None else _Projected(how.solver, back),
+        t0,
+        ts[-1],
+        None,
+        y0,
+        params,
+        saveat=dfx.SaveAt(ts=ts),
+        stepsize_controller=dfx.PIDController(rtol, atol, dtmin=smallest, force_dtmin=False),
+        adjoint=adjoint,
+        max_steps=how.max_steps,
+        throw=False,
+        progress_meter=dfx.TextProgressMeter() if how.progress else dfx.NoProgressMeter(),
+    )
+    ys = solution.ys
+    if back is not None:
+        ys = jax.vmap(back, (0, 0, None))(ts, ys, params)
+    stats = {key: solution.stats[key] for key in ("num_steps", "num_accepted_steps", "num_rejected_steps")}
+    return ys, RESULTS.promote(solution.result), stats
+
+
+class _Projected(dfx.AbstractWrappedSolver, dfx.AbstractAdaptiveSolver):
+    """Any Runge–Kutta solver, with each step's end put back on the constraints."""
+
+    solver: dfx.AbstractRungeKutta
+    back: Callable = eqx.field(static=True)
+
+    @property
+    def term_structure(self):
+        return self.solver.term_structure
+
+    @property
+    def interpolation_cls(self):
+        return self.solver.interpolation_cls
+
+    @property
+    def term_compatible_contr_kwargs(self):
+        return self.solver.term_compatible_contr_kwargs
+
+    @property
+    def scan_kind(self):
+        return self.solver.scan_kind
+
+    @property
+    def root_finder(self):
+        return self.solver.root_finder
+
+    @property
+    def root_find_max_steps(self):
+        return self.solver.root_find_max_steps
+
+    def order(self, terms):
+        return self.solver.order(terms)
+
+    def error_order(self, terms):
+        return self.solver.error_order(terms)
+
+    def init(self, terms, t0, t1, y0, args):
+        return self.solver.init(terms, t0, t1, y0, args)
+
+    def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
+        y1, error, dense, solver_state, result = self.solver.step(terms, t0, t1, y0, args, solver_state, made_jump)
+        y1 = self.back(t1, y1, args)
+        # A step that cannot be put back is rejected, and tried again with half the length or less.
+        error = jnp.where(jnp.all(jnp.isfinite(y1)), error, jnp.inf)
+        return y1, error, dense | {"y1": y1}, solver_state, result
+
+    def func(self, terms, t0, y0, args):
+        return self.solver.func(terms, t0, y0, args)
+
+
+def _sample_times(ts: Any, dtype: Any) -> Array:
+    ts = jnp.asarray(ts, dtype)
+    if ts.ndim != 1 or ts.size < 2:
+        raise ValueError(f"`ts` must be a list of at least two times, but has shape {ts.shape}. Start it with the time of q0.")
+    if is_concrete(ts):
+        steps = np.diff(np.asarray(ts))
+        if (steps <= 0).any():
+            i = int(np.argmax(steps <= 0))
+            raise ValueError(
+                f"`ts` must increase, but ts[{i}] = {ts[i]:g} is followed by ts[{i + 1}] = {ts[i + 1]:g}. Sort the times and drop repeated ones."
+            )
+    return ts
+
+
+@functools.cache
+def _warn_of_single_precision() -> None:
+    warnings.warn(
+        "jaxlag runs in single precision: tolerances below 1e-5 are out of reach. "
+        'For double precision: jax.config.update("jax_enable_x64", True).',
+        stacklevel=4,
+    )
+
+
+def _raise_failure(trajectory: Trajectory) -> None:
+    """Raises the reason of a failed motion, outside what is compiled; under `jit` the reason stays in the result."""
+    if not is_concrete(trajectory.result) or np.all(trajectory.succeeded):
+        return
+    reason = _reason(trajectory.result)
+    own = [RESULTS[item] for item in (RESULTS.not_finite, RESULTS.no_inertia, RESULTS.impossible_start)]
+    if reason in own:
+        raise ValueError(reason)
+    reached = np.asarray(jnp.sum(jnp.isfinite(jax.tree.leaves(trajectory.q)[0].reshape(trajectory.ts.size, -1)[:, 0])))
+    raise RuntimeError(
+        f"the motion must reach t = {trajectory.ts[-1]:g}, but stopped after {reached} of {trajectory.ts.size} samples: {reason} "
+        "Allow more `max_steps`, look at what was computed with `throw=False`, or take a solver for stiff systems, `solver=diffrax.Kvaerno5()`."
+    )
+
+
+def _reason(result: RESULTS) -> str:
+    codes = np.ravel(np.asarray(result._value))
+    failed = codes[codes != np.asarray(RESULTS.successful._value)]
+    return RESULTS[eqx.tree_at(lambda r: r._value, RESULTS.successful, jnp.asarray(failed[0]))]
+
+
+def _listed(tree: PyTree) -> str:
+    paths = [jax.tree_util.keystr(path, simple=True, separator=".") for path, _ in jax.tree_util.tree_flatten_with_path(tree)[0]]
+    return ", ".join(path or "q" for path in paths)

@@ -1,0 +1,223 @@
+"""How the constraints are kept: projection of positions and velocities, or feedback, or nothing."""
+
+import dataclasses
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, PyTree
+
+from ._checks import at_state, coordinates, is_concrete
+from ._mechanics import constraint_rows, inertia, position_residual, velocity_residual
+from ._multipliers import NO_INERTIA, is_determined, saddle_point
+from ._system import Flat, System
+
+
+@dataclasses.dataclass(frozen=True)
+class Projection:
+    """Puts positions and velocities back on the constraints after each step, and at each sample.
+
+    Newton's steps of  min ½ δqᵀM δq  with  g(t, q + δq) = 0,  then  min ½ δvᵀM δv  with  ψ(t, q, v + δv) = 0:
+    the nearest state in the metric of M, so that nothing moves that need not.
+
+    **Arguments:** `iterations`: Newton steps for the position, each of which squares the residual.
+
+    **Source:** Hairer, Lubich & Wanner, Geometric Numerical Integration, section IV.4; Eich, SIAM J. Numer. Anal. 30 (1993).
+
+    ```python
+    import jaxlag as jl
+    jl.Projection(iterations=3)
+    ```
+    """
+
+    iterations: int = 2
+
+    def feedback(self):
+        """None: the accelerations stay as they are."""
+        return None
+
+    def project(self, flat: Flat, t, q, v):
+        """The state on the constraints that is nearest to this one, which is near already."""
+        for _ in range(self.iterations):
+            g, G = position_residual(flat, t, q)
+            q = q + saddle_point(inertia(flat, t, q, v)[0], G, jnp.zeros_like(q), -g).x
+        return q, project_velocity(flat, t, q, v)
+
+
+@dataclasses.dataclass(frozen=True)
+class Baumgarte:
+    """Feeds the residuals back into the accelerations:  ψ̇ + 2α ψ + β² g = 0  (ψ̇ + 2α a = 0 for nonholonomic a).
+
+    **Arguments:** `alpha`, `beta`: in 1/time; α = β is critical damping. Large values make the equations stiff.
+
+    **Source:** Baumgarte, Comput. Methods Appl. Mech. Eng. 1 (1972) 1-16.
+
+    ```python
+    import jaxlag as jl
+    jl.Baumgarte(alpha=20.0, beta=20.0)
+    ```
+    """
+
+    alpha: float = 10.0
+    beta: float = 10.0
+
+    def feedback(self):
+        """2α ψ + β² g, added to γ."""
+
+        def residual(flat, t, q, v):
+            g, psi = flat.holonomic(t, q), velocity_residual(flat, t, q, v)
+            return 2 * self.alpha * psi + self.beta**2 * jnp.concatenate([g, jnp.zeros(psi.size - g.size, g.dtype)])
+
+        return residual
+
+    project = None
+
+
+@dataclasses.dataclass(frozen=True)
+class NoStabilisation:
+    """Leaves the constraints to the accelerations, G q̈ = −γ: the residual grows with time, as does what it spoils.
+
+    ```python
+    import jaxlag as jl
+    jl.NoStabilisation()
+    ```
+    """
+
+    def feedback(self):
+        """None: the accelerations stay as they are."""
+        return None
+
+    project = None
+
+
+def project_velocity(flat: Flat, t, q, v):
+    """The velocity that satisfies ψ(t, q, v) = 0 and is nearest to v in the metric of M."""
+    psi, G, _ = constraint_rows(flat, t, q, v)
+    return v + saddle_point(inertia(flat, t, q, v)[0], G, jnp.zeros_like(v), -psi).x
+
+
+class Consistent(NamedTuple):
+    """A state on the constraints; `reached` is false where the iteration found none, `determined` where inertia is missing."""
+
+    q: Float[Array, " n"]
+    v: Float[Array, " n"]
+    reached: Bool[Array, ""]
+    determined: Bool[Array, ""]
+
+
+def nearest_state(flat: Flat, t, q0, v0, free: Sequence[int] | None = None) -> Consistent:
+    """The state on the constraints nearest to (q0, v0), in which only the `free` coordinates move.
+
+    Newton's method on  M (q − q0) = Gᵀλ,  g(t, q) = 0,  with M = M(q0). The iteration itself is not differentiated: two
+    more Newton steps after it are, which gives derivatives that are exact up to third order.
+    """
+    moving = np.arange(q0.size) if free is None else np.asarray(free, int)
+    both = np.ix_(moving, moving)
+    M = inertia(flat, t, q0, v0)[0][both]
+    tolerance = jnp.finfo(q0.dtype).eps ** 0.5
+
+    def newton(q, multipliers):
+        g, G = position_residual(flat, t, q)
+        bend = jax.hessian(lambda q: multipliers @ flat.holonomic(t, q))(q)[both]
+        curved = jnp.where(is_determined(M - bend, G[:, moving]), M - bend, M)
+        step, multipliers, _ = saddle_point(curved, G[:, moving], M @ (q0 - q)[moving], -g)
+        return q.at[moving].add(step), multipliers, jnp.max(jnp.abs(step)), _off(g, G, q)
+
+    def unfinished(carry):
+        q, _, step, off, count = carry
+        return (count < 50) & jnp.isfinite(step) & ((step > tolerance * (1 + jnp.max(jnp.abs(q)))) | (off > tolerance))
+
+    def iterate(carry):
+        q, multipliers, _, _, count = carry
+        return *jax.lax.stop_gradient(newton(q, multipliers)), count + 1
+
+    far = jnp.asarray(jnp.finfo(q0.dtype).max, q0.dtype)
+    start = jnp.zeros(flat.holonomic(t, q0).size, q0.dtype)
+    carry = jax.lax.stop_gradient((q0, start, far, far))
+    q, multipliers, *_ = jax.lax.while_loop(unfinished, iterate, (*carry, 0))
+    for _ in range(2):
+        q, multipliers, _, _ = newton(q, multipliers)
+
+    psi, G, _ = constraint_rows(flat, t, q, v0)
+    nearest = saddle_point(inertia(flat, t, q, v0)[0][both], G[:, moving], jnp.zeros_like(v0[moving]), -psi)
+    v = v0.at[moving].add(nearest.x)
+    off = jnp.maximum(_off(*position_residual(flat, t, q), q), _off(velocity_residual(flat, t, q, v), G, v))
+    return Consistent(q, v, off < tolerance, nearest.determined)
+
+
+def _off(residual, rows, x):
+    """Largest residual, measured in the units of its row: what rounding makes of it is some eps."""
+    size = jnp.sum(jnp.abs(rows), axis=1) * (1 + jnp.max(jnp.abs(x)))
+    return jnp.max(jnp.abs(residual) / jnp.where(size > 0, size, 1), initial=0.0)
+
+
+def consistent_state(
+    system: System, q: PyTree, qdot: PyTree, params: PyTree = None, *, t: Any = 0.0, fixed: Sequence[Any] = ()
+) -> tuple[PyTree, PyTree]:
+    r"""State on the constraints that is nearest to the one given, in the metric of M.
+
+    $$ \min \tfrac12 (q - q_0)^T M (q - q_0) \text{ with } g(t, q) = 0, \qquad
+       \min \tfrac12 (\dot q - \dot q_0)^T M (\dot q - \dot q_0) \text{ with } \dot g = 0,\ a = 0 $$
+
+    **Arguments:** the state `q`, `qdot` (one pytree structure), `params`, the time `t`; `fixed` lists coordinates whose position and
+    velocity stay as given: keys where q is a mapping, indices where it is an array or a sequence. Any consistent units.
+
+    **Returns:** (q, qdot), structured like q; differentiable in every argument, up to third derivatives.
+
+    **Raises:** `ValueError` where no such state was found, where inertia is missing, or where `fixed` names no coordinate.
+    Under `jit` the state is NaN there.
+
+    **Source:** Hairer, Lubich & Wanner, Geometric Numerical Integration, section IV.4.
+
+    ```python
+    import jax.numpy as jnp
+    import jaxlag as jl
+    rod = jl.System(lambda qdot: 0.5 * qdot @ qdot, holonomic=lambda q, l: q @ q - l**2)
+    jl.consistent_state(rod, jnp.array([3.0, 4.0]), jnp.array([1.0, 0.0]), {"l": 10.0})  # [6, 8], [0.64, −0.48]
+    ```
+    """
+    core = _StateOn(_fixed_indices(coordinates(q, "q"), tuple(fixed)))
+    (q, qdot), reached, determined = at_state(core, system, q, qdot, params, t)
+    if is_concrete(reached, determined):
+        if not determined:
+            raise ValueError(NO_INERTIA)
+        if not reached:
+            raise ValueError(IMPOSSIBLE)
+    return q, qdot
+
+
+IMPOSSIBLE = (
+    "`holonomic` and `nonholonomic` must be satisfied by some state near the start, but none was found. "
+    "Start nearer, fix fewer coordinates, or look for constraints that contradict each other."
+)
+
+
+@dataclasses.dataclass(frozen=True)
+class _StateOn:
+    """`nearest_state` with some coordinates held; compared by them, so that it compiles once."""
+
+    held: tuple[int, ...]
+
+    def __call__(self, flat: Flat, t, q, v):
+        free = [i for i in range(q.size) if i not in self.held]
+        q, v, reached, determined = nearest_state(flat, t, q, v, free)
+        known = reached & determined
+        return (flat.unravel(jnp.where(known, q, jnp.nan)), flat.unravel(jnp.where(known, v, jnp.nan))), reached, determined
+
+
+def _fixed_indices(q: PyTree, fixed: tuple) -> tuple[int, ...]:
+    leaves, structure = jax.tree.flatten(q)
+    ends = np.cumsum([leaf.size for leaf in leaves])
+    indices = [np.arange(end - leaf.size, end).reshape(leaf.shape) for end, leaf in zip(ends, leaves, strict=True)]
+    tree = jax.tree.unflatten(structure, indices)
+    held: list[int] = []
+    for name in fixed:
+        try:
+            part = getattr(tree, name) if isinstance(name, str) and hasattr(tree, "_fields") else tree[name]
+        except (KeyError, IndexError, TypeError, AttributeError):
+            there = sorted(map(str, tree)) if isinstance(tree, dict) else f"of structure {structure}"
+            raise ValueError(f"`fixed` must name coordinates of q, but holds {name!r}. The coordinates are {there}.") from None
+        held += [int(i) for leaf in jax.tree.leaves(part) for i in np.ravel(leaf)]
+    return tuple(sorted(set(held)))

@@ -1,0 +1,99 @@
+"""Derivatives of a whole motion: one rule that serves forward and reverse mode, to any order."""
+
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax.flatten_util import ravel_pytree
+
+# Up to this many perturbed numbers the Jacobian comes whole out of one vectorised forward pass; beyond it a tangent is
+# pushed forward, or a cotangent pulled back, alone. Where the two cross: tests/benchmarks/bench_gradient.py.
+FORWARD_LIMIT = 48
+
+
+def differentiable(solve: Callable[..., Any], pull_back: Callable[..., Any], drift: Callable[..., Any]) -> Callable[..., Any]:
+    """`solve(inputs, ts) -> (y, aux)` with a derivative rule that needs no setting and no choice of mode.
+
+    The rule's tangent is J dx, with the Jacobian J from the same pass as the value: linear in dx, so that it can be
+    transposed, and serves `grad` as well as `jvp`. Within the rule the function that returns value and Jacobian carries
+    the same rule, built only when it is differentiated in its turn; so derivatives of every order follow.
+
+    - `solve`: has forward-mode derivatives in `inputs`, a pytree. `aux` is not differentiated.
+    - `pull_back`: the same function with reverse-mode derivatives, for many inputs.
+    - `drift(inputs, ts, y)`: dy/dts, each sample to its own time.
+    """
+
+    @eqx.filter_custom_jvp
+    def motion(inputs, ts):
+        return solve(inputs, ts)
+
+    @motion.def_jvp
+    def rule(primals, tangents):
+        (inputs, ts), (d_inputs, d_ts) = primals, tangents
+        perturbed = jax.tree.map(lambda d: d is not None, d_inputs, is_leaf=lambda d: d is None)
+        moving, still = eqx.partition(inputs, perturbed)
+        x, unravel = ravel_pytree(moving)
+        dx = ravel_pytree(d_inputs)[0]
+        of_x = lambda f: lambda x_and_still, *rest: f(eqx.combine(unravel(x_and_still[0]), x_and_still[1]), *rest)
+        at_x = of_x(solve), of_x(pull_back), of_x(drift)
+        change = None
+        if x.size == 0:
+            y, aux = motion(inputs, ts)
+        elif x.size <= FORWARD_LIMIT:
+            (y, J), aux = differentiable(*_with_jacobian(*at_x))((x, still), ts)
+            change = jax.tree.map(lambda rows: rows @ dx, J)
+        else:
+            y, aux = motion(inputs, ts)
+            change = _jacobian_product(at_x[0], at_x[1], (x, still), ts, y, dx)
+        if d_ts is not None:
+            shift = jax.tree.map(lambda rate: (rate.T * d_ts).T, drift(inputs, ts, y))
+            change = shift if change is None else jax.tree.map(jnp.add, change, shift)
+        return (y, aux), (change, jax.tree.map(lambda _: None, aux))
+
+    return motion
+
+
+def _with_jacobian(solve, pull_back, drift):
+    """The three functions of `differentiable` for (y, ∂y/∂x) in place of y, where inputs = (x, still)."""
+
+    def both(f):
+        def value_and_jacobian(inputs, ts):
+            x, still = inputs
+            along = lambda e: jax.jvp(lambda x: f((x, still), ts), (x,), (e,), has_aux=True)
+            y, J, aux = jax.vmap(along, out_axes=(None, -1, None))(jnp.eye(x.size, dtype=x.dtype))
+            return (y, J), aux
+
+        return value_and_jacobian
+
+    def drift_of_both(inputs, ts, y_and_J):
+        (x, still), (y, J) = inputs, y_and_J
+        along = lambda e, column: jax.jvp(lambda x, y: drift((x, still), ts, y), (x, y), (e, column))
+        return jax.vmap(along, in_axes=(0, -1), out_axes=(None, -1))(jnp.eye(x.size, dtype=x.dtype), J)
+
+    # A Jacobian of more columns than FORWARD_LIMIT never comes here, and solve has forward mode: it serves as both.
+    return both(solve), both(pull_back), drift_of_both
+
+
+def _jacobian_product(solve, pull_back, inputs, ts, y, dx):
+    """J dx by one forward pass, whose transpose is one reverse pass.
+
+    JAX takes a transpose from the user in `custom_linear_solve` alone, so the product is stated as the solution of
+    [[1, 0], [−J, 1]] (a, b) = (dx, 0).
+    """
+    x, still = inputs
+
+    def product(a):
+        return jax.jvp(lambda x: solve((x, still), ts)[0], (x,), (a,))[1]
+
+    def transposed(b):
+        return jax.vjp(lambda x: pull_back((x, still), ts)[0], x)[1](b)[0]
+
+    add, subtract = (lambda u, v: jax.tree.map(jnp.add, u, v)), (lambda u, v: jax.tree.map(jnp.subtract, u, v))
+    return jax.lax.custom_linear_solve(
+        lambda z: (z[0], subtract(z[1], product(z[0]))),
+        (dx, jax.tree.map(jnp.zeros_like, y)),
+        lambda _, z: (z[0], add(z[1], product(z[0]))),
+        lambda _, z: (z[0] + transposed(z[1]), z[1]),
+    )[1]

@@ -1,0 +1,182 @@
+"""The mechanical system as its user states it, and the same system over flat vectors."""
+
+import dataclasses
+from collections.abc import Callable, Mapping
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax.flatten_util import ravel_pytree
+from jaxtyping import Array, Float, PyTree
+
+from ._arguments import call, names
+
+Terms = tuple[tuple[str, Callable], ...]
+SLOTS = ("lagrangian", "dissipation", "force", "holonomic", "nonholonomic")
+
+
+@dataclasses.dataclass(frozen=True, init=False, repr=False)
+class System:
+    r"""A mechanical system, stated by its energies, forces and constraints.
+
+    $$ \frac{d}{dt}\frac{\partial L}{\partial\dot q} - \frac{\partial L}{\partial q}
+       + \frac{\partial D}{\partial\dot q} = Q + G^T\lambda, \qquad g(t, q) = 0, \qquad a(t, q, \dot q) = 0 $$
+
+    Each slot takes one function or a mapping of named functions, whose terms add up and whose results come
+    back under these names (one function alone goes by the name of its slot). A function receives exactly the
+    arguments it names: `t`, `q`, `qdot`, `params`, any entry of `params` where that is a mapping, and, in
+    `dissipation` and `force`, `multipliers`.
+
+    **Arguments:**
+
+    - `lagrangian`: L(t, q, q̇), a real scalar.
+    - `dissipation`: D(t, q, q̇), a real scalar; the generalized force is −∂D/∂q̇.
+    - `force`: Q(t, q, q̇), shaped like q; where q is a mapping, coordinates may be left out.
+    - `holonomic`: g(t, q), any array or pytree of arrays, kept at zero.
+    - `nonholonomic`: a(t, q, q̇), affine in q̇, kept at zero.
+
+    Any consistent set of units. A system is immutable, hashable and compared by its functions.
+
+    **Raises:** `TypeError` where a slot holds no function; `ValueError` where two constraints share a name.
+
+    **Source:** Goldstein, Classical Mechanics, 3rd ed., sections 1.5 and 2.4; sign of λ: M q̈ = f + Gᵀλ.
+
+    ```python
+    import jaxlag as jl
+
+    def lagrangian(q, qdot, m, c):
+        return 0.5 * m * qdot**2 - 0.5 * c * q**2
+
+    system = jl.System(lagrangian, dissipation=lambda qdot, b: 0.5 * b * qdot**2)
+    jl.acceleration(system, q=1.0, qdot=0.5, params={"m": 2.0, "c": 8.0, "b": 1.0}).qddot  # -4.25
+    ```
+    """
+
+    lagrangian: Terms
+    dissipation: Terms
+    force: Terms
+    holonomic: Terms
+    nonholonomic: Terms
+
+    def __init__(
+        self,
+        lagrangian: Callable | Mapping[str, Callable],
+        *,
+        dissipation: Callable | Mapping[str, Callable] | None = None,
+        force: Callable | Mapping[str, Callable] | None = None,
+        holonomic: Callable | Mapping[str, Callable] | None = None,
+        nonholonomic: Callable | Mapping[str, Callable] | None = None,
+    ):
+        for slot, given in zip(SLOTS, (lagrangian, dissipation, force, holonomic, nonholonomic), strict=True):
+            object.__setattr__(self, slot, _terms(slot, given))
+        if not self.lagrangian:
+            raise TypeError("`lagrangian` must be a function L(q, qdot), but none was given. Hand over at least the kinetic energy.")
+        for twice in {name for name, _ in self.holonomic} & {name for name, _ in self.nonholonomic}:
+            raise ValueError(
+                f"`holonomic` and `nonholonomic` must name their constraints differently, but both have {twice!r}. Rename one."
+            )
+
+    def __repr__(self) -> str:
+        def listed(slot: str, terms: Terms) -> str:
+            return slot if [name for name, _ in terms] == [slot] else f"{slot}: {', '.join(name for name, _ in terms)}"
+
+        return f"System({'; '.join(listed(slot, getattr(self, slot)) for slot in SLOTS if getattr(self, slot))})"
+
+    @property
+    def constraints(self) -> tuple[str, ...]:
+        """Names of all constraints, in the order of the rows of G."""
+        return tuple(name for name, _ in (*self.holonomic, *self.nonholonomic))
+
+
+def _terms(slot: str, given: Any) -> Terms:
+    if given is None:
+        return ()
+    terms = tuple(given.items()) if isinstance(given, Mapping) else ((slot, given),)
+    for name, function in terms:
+        if not isinstance(name, str) or not callable(function):
+            raise TypeError(
+                f"`{slot}` must be a function or a mapping from names to functions, but it holds {function!r} under {name!r}. "
+                "Hand over the function itself, not its value."
+            )
+        try:
+            hash(function)
+        except TypeError:
+            raise TypeError(
+                f"`{slot}` must hold hashable functions, but {name!r} is a {type(function).__name__} that holds arrays. "
+                "Put its arrays into params and let the function name them."
+            ) from None
+    return terms
+
+
+def role(slot: str, name: str) -> str:
+    """How messages speak of a user's function."""
+    return f"`{slot}`" if name == slot else f"`{slot}` {name!r}"
+
+
+class Flat(NamedTuple):
+    """A system with its parameters, over flat vectors q, v of length n and λ of length m: what the mechanics works on."""
+
+    lagrangian: Callable[..., Float[Array, ""]]  # L(t, q, v)
+    dissipation: Callable[..., Float[Array, ""]]  # D(t, q, v, λ)
+    force: Callable[..., Float[Array, " n"]]  # Q(t, q, v, λ)
+    holonomic: Callable[..., Float[Array, " h"]]  # g(t, q)
+    nonholonomic: Callable[..., Float[Array, " k"]]  # a(t, q, v)
+    unravel: Callable[[Float[Array, " n"]], PyTree]
+    unravel_multipliers: Callable[[Float[Array, " m"]], dict[str, PyTree]]
+    needs_multipliers: bool
+    holonomic_names: tuple[str, ...]
+
+
+def bind(system: System, like: PyTree, params: PyTree) -> Flat:
+    """The system over flat vectors, for coordinates structured `like` these, which need be shapes only."""
+    zeros = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), like)
+    zero, unravel = ravel_pytree(zeros)
+
+    def value(slot, name, function, t, q, v, **more):
+        state = {"t": t, "q": unravel(q)} | ({} if v is None else {"qdot": unravel(v)}) | more
+        return call(function, role(slot, name), params, **state)
+
+    def scalar(slot, t, q, v, **more):
+        total = sum((value(slot, *term, t, q, v, **more) for term in getattr(system, slot)), start=jnp.zeros((), q.dtype))
+        return jnp.asarray(total, q.dtype)
+
+    def vector(slot, t, q, v):
+        parts = [ravel_pytree(value(slot, *term, t, q, v))[0].astype(q.dtype) for term in getattr(system, slot)]
+        return jnp.concatenate([jnp.zeros(0, q.dtype), *parts])
+
+    def force(t, q, v, multipliers):
+        named = {"multipliers": unravel_multipliers(multipliers)}
+        parts = [ravel_like(zeros, value("force", *term, t, q, v, **named)) for term in system.force]
+        return sum(parts, start=jnp.zeros_like(q))
+
+    one = jnp.zeros((), zero.dtype)
+    shapes = [
+        jax.eval_shape(lambda slot=slot, term=term: value(slot, *term, one, zero, None if slot == "holonomic" else zero))
+        for slot in ("holonomic", "nonholonomic")
+        for term in getattr(system, slot)
+    ]
+    _, unravel_values = ravel_pytree([jax.tree.map(lambda s: jnp.zeros(s.shape, zero.dtype), shape) for shape in shapes])
+
+    def unravel_multipliers(multipliers):
+        return dict(zip(system.constraints, unravel_values(multipliers), strict=True))
+
+    return Flat(
+        lagrangian=lambda t, q, v: scalar("lagrangian", t, q, v),
+        dissipation=lambda t, q, v, multipliers: scalar("dissipation", t, q, v, multipliers=unravel_multipliers(multipliers)),
+        force=force,
+        holonomic=lambda t, q: vector("holonomic", t, q, None),
+        nonholonomic=lambda t, q, v: vector("nonholonomic", t, q, v),
+        unravel=unravel,
+        unravel_multipliers=unravel_multipliers,
+        needs_multipliers=any(names(function, "multipliers") for _, function in (*system.dissipation, *system.force)),
+        holonomic_names=tuple(name for name, _ in system.holonomic),
+    )
+
+
+def ravel_like(zeros: PyTree, partial: PyTree) -> Float[Array, " n"]:
+    """`partial`, which may leave out coordinates, as a flat vector in the order of `zeros`; raises KeyError on others."""
+    given = dict(jax.tree_util.tree_flatten_with_path(partial)[0])
+    leaves = [jnp.asarray(given.pop(path, zero), zero.dtype) for path, zero in jax.tree_util.tree_flatten_with_path(zeros)[0]]
+    for path in given:
+        raise KeyError(jax.tree_util.keystr(path))
+    return ravel_pytree(leaves)[0]
