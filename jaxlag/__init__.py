@@ -1,5 +1,6 @@
 """Differentiable mechanics: from energies, dissipation functions and constraints to motions and identified machines."""
 
+from ._identify import Experiment as Experiment, Fit as Fit, fit as fit
 from ._integrate import RESULTS as RESULTS, Trajectory as Trajectory, simulate as simulate
 from ._manifold import (
     Baumgarte as Baumgarte,

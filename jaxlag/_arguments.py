@@ -65,7 +65,7 @@ def check_entries(params: Any) -> None:
 
 
 def _unknown(role: str, name: str, state: Mapping[str, Any], params: Any) -> str:
-    own = [*state, "params"]
+    own = [known for known in STATE_NAMES if known in (*state, "params")]
     if isinstance(params, Mapping):
         entries = sorted(map(str, params))
         where = f"the entries of params: {', '.join(entries)}" if entries else "params has no entries"

@@ -10,22 +10,28 @@ import numpy as np
 from jaxtyping import Array, PyTree
 
 from ._arguments import call, check_entries
-from ._system import Flat, System, bind, ravel_like, role
+from ._system import Flat, System, bind, role
+
+
+def is_vector(node: Any) -> bool:
+    """Whether `node` is a list of plain numbers, which is taken as a vector."""
+    return isinstance(node, list) and all(isinstance(entry, (float, int)) for entry in node)
 
 
 def coordinates(q: Any, name: str) -> PyTree[Array]:
-    """`q` as a pytree of floating arrays; integers are taken as floats."""
+    """`q` as a pytree of floating arrays; integers are taken as floats, and a list of numbers as a vector."""
 
     def floating(path, leaf):
         where = f"`{name}{jax.tree_util.keystr(path)}`"
+        leaf = np.asarray(leaf) if is_vector(leaf) else leaf
         if not isinstance(leaf, (float, int, complex, np.generic, np.ndarray, jax.Array)):
             raise TypeError(f"{where} must be a real number or array, but is a {type(leaf).__name__}. Hand over numbers only.")
-        dtype = np.result_type(leaf) if not isinstance(leaf, jax.Array) else leaf.dtype
-        if dtype == bool or not jnp.issubdtype(dtype, jnp.number) or jnp.issubdtype(dtype, jnp.complexfloating):
+        dtype = np.asarray(leaf).dtype if not isinstance(leaf, jax.Array) else leaf.dtype
+        if jnp.issubdtype(dtype, jnp.bool_) or not jnp.issubdtype(dtype, jnp.number) or jnp.issubdtype(dtype, jnp.complexfloating):
             raise TypeError(f"{where} must be real, but has dtype {dtype}. Hand over floating-point numbers.")
         return jnp.asarray(leaf, None if jnp.issubdtype(dtype, jnp.floating) and not isinstance(leaf, float) else float)
 
-    q = jax.tree_util.tree_map_with_path(floating, q, is_leaf=lambda leaf: leaf is None)
+    q = jax.tree_util.tree_map_with_path(floating, q, is_leaf=lambda node: node is None or is_vector(node))
     if not jax.tree.leaves(q):
         raise TypeError(f"`{name}` must hold at least one coordinate, but it is empty. Hand over a number, an array or a dict of them.")
     return q
@@ -35,14 +41,15 @@ def state(q: Any, qdot: Any, names: tuple[str, str] = ("q", "qdot")) -> tuple[Py
     """Position and velocity as arrays of one structure, of equal shapes and one dtype."""
     q, qdot = coordinates(q, names[0]), coordinates(qdot, names[1])
     have, need = jax.tree.structure(qdot), jax.tree.structure(q)
-    if have != need:
+    if have != need:  # type: ignore[operator]
         raise TypeError(f"`{names[1]}` must be structured like `{names[0]}`, {need}, but is {have}. Give each coordinate its velocity.")
     dtype = jnp.result_type(*jax.tree.leaves((q, qdot)))
     for (path, x), v in zip(jax.tree_util.tree_flatten_with_path(q)[0], jax.tree.leaves(qdot), strict=True):
         if x.shape != v.shape:
             at = jax.tree_util.keystr(path)
             raise ValueError(
-                f"`{names[1]}{at}` must have the shape of `{names[0]}{at}`, {x.shape}, but has {v.shape}. Give each coordinate its velocity."
+                f"`{names[1]}{at}` must have the shape of `{names[0]}{at}`, {x.shape}, but has {v.shape}. "
+                "Give each coordinate its velocity."
             )
     return jax.tree.map(lambda x: x.astype(dtype), (q, qdot))
 
@@ -60,6 +67,22 @@ def parameters(params: PyTree, like: PyTree[Array]) -> PyTree:
     return jax.tree.map(array, params)
 
 
+def sample_times(ts: Any, dtype: Any) -> Array:
+    """The sample times as a vector, at least two and increasing."""
+    ts = jnp.asarray(ts, dtype)
+    if ts.ndim != 1 or ts.size < 2:
+        raise ValueError(f"`ts` must be a list of at least two times, but has shape {ts.shape}. Start it with the time of q0.")
+    if is_concrete(ts):
+        steps = np.diff(np.asarray(ts))
+        if (steps <= 0).any():
+            i = int(np.argmax(steps <= 0))
+            raise ValueError(
+                f"`ts` must increase, but ts[{i}] = {ts[i]:g} is followed by ts[{i + 1}] = {ts[i + 1]:g}. "
+                "Sort the times and drop repeated ones."
+            )
+    return ts
+
+
 def is_concrete(*trees: PyTree) -> bool:
     """Whether the numbers are at hand, so that Python may look at them; under `jit` and `vmap` they are not."""
     return not any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(trees))
@@ -73,8 +96,7 @@ def check(system: System, t: Array, q: PyTree[Array], qdot: PyTree[Array], param
             out = _shape_of(function, role(slot, name), params, t=t, q=q, qdot=qdot, **more)
             if not (_is_real(out) and out.shape == ()):
                 raise ValueError(
-                    f"{role(slot, name)} must return a real scalar, but returned {_spoken(out)}. "
-                    "Did you forget to sum, e.g. `qdot @ qdot`?"
+                    f"{role(slot, name)} must return a real scalar, but returned {_spoken(out)}. Did you forget to sum, e.g. `qdot @ qdot`?"
                 )
     for slot in ("holonomic", "nonholonomic"):
         for name, function in getattr(system, slot):
@@ -111,7 +133,9 @@ def checked(system: System, t: Array, q: PyTree, qdot: PyTree, params: PyTree) -
 
 
 def _multipliers(system, t, q, qdot, params):
-    slots = [(role(s, n), f, {} if s == "holonomic" else {"qdot": qdot}) for s in ("holonomic", "nonholonomic") for n, f in getattr(system, s)]
+    slots = [
+        (role(s, n), f, {} if s == "holonomic" else {"qdot": qdot}) for s in ("holonomic", "nonholonomic") for n, f in getattr(system, s)
+    ]
     shapes = [_shape_of(f, spoken, params, t=t, q=q, **velocity) for spoken, f, velocity in slots]
     return dict(zip(system.constraints, jax.tree.map(lambda s: jnp.zeros(s.shape, s.dtype), shapes), strict=True))
 
@@ -143,6 +167,3 @@ def _check_force(spoken: str, out: Any, q: PyTree) -> None:
             raise ValueError(f"{spoken}{at} must be real and of shape {shapes[path].shape}, but is {_spoken(leaf)}. {cure}")
     if not isinstance(q, dict) and len(jax.tree.leaves(out)) != len(shapes):
         raise ValueError(f"{spoken} must be shaped like q, but returned {len(jax.tree.leaves(out))} of {len(shapes)} entries. {cure}")
-
-
-__all__ = ["at_state", "check", "checked", "coordinates", "is_concrete", "parameters", "ravel_like", "state"]

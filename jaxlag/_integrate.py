@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PyTree
 
-from ._checks import checked, is_concrete, parameters, state
+from ._checks import checked, is_concrete, parameters, sample_times, state
 from ._manifold import IMPOSSIBLE, Baumgarte, NoStabilisation, Projection, nearest_state
 from ._multipliers import NO_INERTIA, constrained_acceleration
 from ._sensitivities import differentiable
@@ -59,7 +59,7 @@ class Trajectory(eqx.Module):
         rows.append(("steps", f"{steps.max()}, {rejected.max()} of them rejected" + (" (the most in the batch)" if batch else "")))
         if self.multipliers:
             rows.append(("start moved by", f"{np.max(self.stats['start_moved']):.2g}"))
-        rows.append(("result", "successful" if np.all(self.succeeded) else _reason(self.result)))
+        rows.append(("result", "successful" if np.all(self.succeeded) else reason_of(self.result)))
         of = f"{' × '.join(map(str, batch))} motions of " if batch else ""
         head = f"Trajectory: {of}{self.ts.shape[-1]} samples, t = {np.min(self.ts):g} … {np.max(self.ts):g}"
         return "\n".join([head, *(f"  {name:<15}{value}" for name, value in rows)])
@@ -104,9 +104,9 @@ def simulate(
 
     **Returns:** a `Trajectory`.
 
-    **Raises:** `ValueError` or `TypeError` for unusable arguments; `RuntimeError` where the integration fails (out of steps, not finite).
+    **Raises:** `ValueError` or `TypeError` for unusable arguments; `RuntimeError` where the integration fails.
 
-    **Source:** Hairer, Lubich & Wanner, Geometric Numerical Integration, section IV.4 (projection); Kidger, On Neural Differential Equations.
+    **Source:** Hairer, Lubich & Wanner, Geometric Numerical Integration, section IV.4 (projection).
 
     ```python
     import jax, jax.numpy as jnp
@@ -119,13 +119,13 @@ def simulate(
     """
     q0, qdot0 = state(q0, qdot0, ("q0", "qdot0"))
     dtype = jax.tree.leaves(q0)[0].dtype
-    ts = _sample_times(ts, dtype)
+    ts = sample_times(ts, dtype)
     how = _How(solver or dfx.Tsit5(), stabilisation, max_steps, adjoint, progress)
     single = jnp.finfo(dtype).bits < 64
     if single:
         _warn_of_single_precision()
-    tolerances = (rtol or (1e-4 if single else 1e-8), atol or (1e-6 if single else 1e-10))
-    tolerances = tuple(jnp.asarray(tolerance, dtype) for tolerance in tolerances)
+    defaults = (1e-4, 1e-6) if single else (1e-8, 1e-10)
+    tolerances = tuple(jnp.asarray(given or default, dtype) for given, default in zip((rtol, atol), defaults, strict=True))
     trajectory = _simulate(system, how, q0, qdot0, ts, parameters(params, q0), tolerances)
     if throw:
         _raise_failure(trajectory)
@@ -149,9 +149,11 @@ def _simulate(system, how, q0, qdot0, ts, params, tolerances):
     feedback, project = how.stabilisation.feedback(), how.stabilisation.project
     n = q.size
 
+    @eqx.filter_jit  # so that diffrax's many calls trace it once
     def vector_field(t, y, params):
         return jnp.concatenate([y[n:], constrained_acceleration(bind(system, like, params), t, y[:n], y[n:], feedback).x])
 
+    @eqx.filter_jit
     def back(t, y, params):
         return jnp.concatenate(project(bind(system, like, params), t, y[:n], y[n:]))
 
@@ -265,20 +267,6 @@ class _Projected(dfx.AbstractWrappedSolver, dfx.AbstractAdaptiveSolver):
         return self.solver.func(terms, t0, y0, args)
 
 
-def _sample_times(ts: Any, dtype: Any) -> Array:
-    ts = jnp.asarray(ts, dtype)
-    if ts.ndim != 1 or ts.size < 2:
-        raise ValueError(f"`ts` must be a list of at least two times, but has shape {ts.shape}. Start it with the time of q0.")
-    if is_concrete(ts):
-        steps = np.diff(np.asarray(ts))
-        if (steps <= 0).any():
-            i = int(np.argmax(steps <= 0))
-            raise ValueError(
-                f"`ts` must increase, but ts[{i}] = {ts[i]:g} is followed by ts[{i + 1}] = {ts[i + 1]:g}. Sort the times and drop repeated ones."
-            )
-    return ts
-
-
 @functools.cache
 def _warn_of_single_precision() -> None:
     warnings.warn(
@@ -292,21 +280,23 @@ def _raise_failure(trajectory: Trajectory) -> None:
     """Raises the reason of a failed motion, outside what is compiled; under `jit` the reason stays in the result."""
     if not is_concrete(trajectory.result) or np.all(trajectory.succeeded):
         return
-    reason = _reason(trajectory.result)
-    own = [RESULTS[item] for item in (RESULTS.not_finite, RESULTS.no_inertia, RESULTS.impossible_start)]
-    if reason in own:
+    reason = reason_of(trajectory.result)
+    if reason in map(reason_of, (RESULTS.not_finite, RESULTS.no_inertia, RESULTS.impossible_start)):
         raise ValueError(reason)
     reached = np.asarray(jnp.sum(jnp.isfinite(jax.tree.leaves(trajectory.q)[0].reshape(trajectory.ts.size, -1)[:, 0])))
     raise RuntimeError(
         f"the motion must reach t = {trajectory.ts[-1]:g}, but stopped after {reached} of {trajectory.ts.size} samples: {reason} "
-        "Allow more `max_steps`, look at what was computed with `throw=False`, or take a solver for stiff systems, `solver=diffrax.Kvaerno5()`."
+        "Allow more `max_steps`, look at what was computed with `throw=False`, or take a solver for stiff systems, "
+        "`solver=diffrax.Kvaerno5()`."
     )
 
 
-def _reason(result: RESULTS) -> str:
-    codes = np.ravel(np.asarray(result._value))
-    failed = codes[codes != np.asarray(RESULTS.successful._value)]
-    return RESULTS[eqx.tree_at(lambda r: r._value, RESULTS.successful, jnp.asarray(failed[0]))]
+def reason_of(result: Any) -> str:
+    """What a result says; of a batch, what the first failure says."""
+    successful: Any = RESULTS.successful
+    failed = np.ravel(result._value)[np.ravel(result != successful)]
+    one = eqx.tree_at(lambda r: r._value, successful, jnp.asarray(failed[0])) if failed.size else successful
+    return RESULTS[one]  # type: ignore[misc]
 
 
 def _listed(tree: PyTree) -> str:

@@ -117,6 +117,9 @@ def nearest_state(flat: Flat, t, q0, v0, free: Sequence[int] | None = None) -> C
     both = np.ix_(moving, moving)
     M = inertia(flat, t, q0, v0)[0][both]
     tolerance = jnp.finfo(q0.dtype).eps ** 0.5
+    rows = velocity_residual(flat, t, q0, v0).size
+    if rows == 0:  # nothing to satisfy: spares the compilation of the search
+        return Consistent(q0, v0, jnp.array(True), is_determined(M, jnp.zeros((0, moving.size), M.dtype)))
 
     def newton(q, multipliers):
         g, G = position_residual(flat, t, q)

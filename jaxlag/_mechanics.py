@@ -1,7 +1,7 @@
 """Lagrange's equations: mass matrix, forces and constraint rows by automatic differentiation.
 
-    M q̈ = f + Gᵀ λ,    M = ∂²L/∂q̇²,    f = ∂L/∂q − (∂²L/∂q̇∂q) q̇ − ∂²L/∂q̇∂t − ∂D/∂q̇ + Q
-    G q̈ = −γ,          G = ∂ψ/∂q̇,      γ = ∂ψ/∂t + (∂ψ/∂q) q̇,    ψ = (dg/dt, a)
+M q̈ = f + Gᵀ λ,    M = ∂²L/∂q̇²,    f = ∂L/∂q − (∂²L/∂q̇∂q) q̇ − ∂²L/∂q̇∂t − ∂D/∂q̇ + Q
+G q̈ = −γ,          G = ∂ψ/∂q̇,      γ = ∂ψ/∂t + (∂ψ/∂q) q̇,    ψ = (dg/dt, a)
 """
 
 from typing import Any, NamedTuple

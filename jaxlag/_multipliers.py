@@ -82,11 +82,11 @@ def pseudo_inverse(S: Float[Array, "m m"]) -> Float[Array, "m m"]:
         return jnp.where(S > 0, 1 / jnp.where(S > 0, S, 1), 0)
     size = jnp.diagonal(S)
     D = jnp.where(size > 0, jax.lax.rsqrt(jnp.where(size > 0, size, 1)), 1)
-    values, U = jnp.linalg.eigh(D[:, None] * S * D)
+    values, U = jnp.linalg.eigh(S * jnp.outer(D, D))
     kept = values > jnp.finfo(S.dtype).eps ** 0.625 * values[-1]
-    inverse = (U * jnp.where(kept, 1 / jnp.where(kept, values, 1), 0)) @ U.T * D * D[:, None]
+    inverse = U @ (jnp.where(kept, 1 / jnp.where(kept, values, 1), 0)[:, None] * U.T) * jnp.outer(D, D)
     # Least norm in the units given: take out of range and domain what lies in the null space of S, spanned by V.
-    V = D[:, None] * U * ~kept
+    V = D[:, None] * U * ~kept[None, :]
     out = jnp.eye(m, dtype=S.dtype) - V @ jnp.linalg.solve(V.T @ V + jnp.diag(kept.astype(S.dtype)), V.T)
     return out @ inverse @ out
 

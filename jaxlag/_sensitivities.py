@@ -48,7 +48,7 @@ def differentiable(solve: Callable[..., Any], pull_back: Callable[..., Any], dri
             y, aux = motion(inputs, ts)
             change = _jacobian_product(at_x[0], at_x[1], (x, still), ts, y, dx)
         if d_ts is not None:
-            shift = jax.tree.map(lambda rate: (rate.T * d_ts).T, drift(inputs, ts, y))
+            shift = jax.tree.map(lambda rate: jax.vmap(jnp.multiply)(rate, d_ts), drift(inputs, ts, y))
             change = shift if change is None else jax.tree.map(jnp.add, change, shift)
         return (y, aux), (change, jax.tree.map(lambda _: None, aux))
 
@@ -79,21 +79,26 @@ def _with_jacobian(solve, pull_back, drift):
 def _jacobian_product(solve, pull_back, inputs, ts, y, dx):
     """J dx by one forward pass, whose transpose is one reverse pass.
 
-    JAX takes a transpose from the user in `custom_linear_solve` alone, so the product is stated as the solution of
-    [[1, 0], [−J, 1]] (a, b) = (dx, 0).
+    JAX takes a transpose from the user in `custom_linear_solve` alone: here a symmetric one whose "solution" of (a, b) is
+    (Jᵀb, Ja). Of the two products the one that is not asked for is dropped by the compiler.
     """
     x, still = inputs
 
-    def product(a):
-        return jax.jvp(lambda x: solve((x, still), ts)[0], (x,), (a,))[1]
+    def products(_, z):
+        a, b = z
+        pushed = jax.jvp(lambda x: solve((x, still), ts)[0], (x,), (a,))[1]
+        pulled = jax.vjp(lambda x: pull_back((x, still), ts)[0], x)[1](b)[0]
+        return pulled, pushed
 
-    def transposed(b):
-        return jax.vjp(lambda x: pull_back((x, still), ts)[0], x)[1](b)[0]
+    def matrix(z):
+        only_first = eqx.internal.nondifferentiable(x, msg=SECOND_ORDER)
+        return z[0] + 0 * only_first, z[1]
 
-    add, subtract = (lambda u, v: jax.tree.map(jnp.add, u, v)), (lambda u, v: jax.tree.map(jnp.subtract, u, v))
-    return jax.lax.custom_linear_solve(
-        lambda z: (z[0], subtract(z[1], product(z[0]))),
-        (dx, jax.tree.map(jnp.zeros_like, y)),
-        lambda _, z: (z[0], add(z[1], product(z[0]))),
-        lambda _, z: (z[0] + transposed(z[1]), z[1]),
-    )[1]
+    nothing = jax.tree.map(lambda leaf: jnp.zeros_like(leaf) + 0 * jnp.sum(dx), y)  # linear in dx, as JAX wants all of it
+    return jax.lax.custom_linear_solve(matrix, (dx, nothing), products, symmetric=True)[1]
+
+
+SECOND_ORDER = (
+    f"second derivatives of a motion must be with respect to at most {FORWARD_LIMIT} numbers, but there are more. "
+    "Differentiate twice with respect to fewer, or use Gauss–Newton, which needs first derivatives only."
+)

@@ -12,6 +12,7 @@ from jaxtyping import Array, Float, PyTree
 from ._arguments import call, names
 
 Terms = tuple[tuple[str, Callable], ...]
+Slot = Any  # a function, a mapping from names to functions, or None: `_terms` checks it, with a sentence
 SLOTS = ("lagrangian", "dissipation", "force", "holonomic", "nonholonomic")
 
 
@@ -60,12 +61,12 @@ class System:
 
     def __init__(
         self,
-        lagrangian: Callable | Mapping[str, Callable],
+        lagrangian: Slot,
         *,
-        dissipation: Callable | Mapping[str, Callable] | None = None,
-        force: Callable | Mapping[str, Callable] | None = None,
-        holonomic: Callable | Mapping[str, Callable] | None = None,
-        nonholonomic: Callable | Mapping[str, Callable] | None = None,
+        dissipation: Slot = None,
+        force: Slot = None,
+        holonomic: Slot = None,
+        nonholonomic: Slot = None,
     ):
         for slot, given in zip(SLOTS, (lagrangian, dissipation, force, holonomic, nonholonomic), strict=True):
             object.__setattr__(self, slot, _terms(slot, given))
@@ -132,26 +133,27 @@ def bind(system: System, like: PyTree, params: PyTree) -> Flat:
     zeros = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), like)
     zero, unravel = ravel_pytree(zeros)
 
-    def value(slot, name, function, t, q, v, **more):
+    def value(slot, term, t, q, v, **more):
+        name, function = term
         state = {"t": t, "q": unravel(q)} | ({} if v is None else {"qdot": unravel(v)}) | more
         return call(function, role(slot, name), params, **state)
 
     def scalar(slot, t, q, v, **more):
-        total = sum((value(slot, *term, t, q, v, **more) for term in getattr(system, slot)), start=jnp.zeros((), q.dtype))
+        total = sum((value(slot, term, t, q, v, **more) for term in getattr(system, slot)), start=jnp.zeros((), q.dtype))
         return jnp.asarray(total, q.dtype)
 
     def vector(slot, t, q, v):
-        parts = [ravel_pytree(value(slot, *term, t, q, v))[0].astype(q.dtype) for term in getattr(system, slot)]
+        parts = [ravel_pytree(value(slot, term, t, q, v))[0].astype(q.dtype) for term in getattr(system, slot)]
         return jnp.concatenate([jnp.zeros(0, q.dtype), *parts])
 
     def force(t, q, v, multipliers):
         named = {"multipliers": unravel_multipliers(multipliers)}
-        parts = [ravel_like(zeros, value("force", *term, t, q, v, **named)) for term in system.force]
+        parts = [ravel_like(zeros, value("force", term, t, q, v, **named)) for term in system.force]
         return sum(parts, start=jnp.zeros_like(q))
 
     one = jnp.zeros((), zero.dtype)
     shapes = [
-        jax.eval_shape(lambda slot=slot, term=term: value(slot, *term, one, zero, None if slot == "holonomic" else zero))
+        jax.eval_shape(lambda slot=slot, term=term: value(slot, term, one, zero, None if slot == "holonomic" else zero))
         for slot in ("holonomic", "nonholonomic")
         for term in getattr(system, slot)
     ]

@@ -1,0 +1,18 @@
+"""Tests run in double precision, with strict ranks and every shape annotation checked."""
+
+import jax
+import pytest
+from jaxtyping import install_import_hook
+
+jax.config.update("jax_enable_x64", True)
+jax.config.update("jax_numpy_rank_promotion", "raise")
+
+with install_import_hook("jaxlag", "beartype.beartype"):
+    import jaxlag  # noqa: F401
+
+
+@pytest.fixture
+def single_precision():
+    jax.config.update("jax_enable_x64", False)
+    yield
+    jax.config.update("jax_enable_x64", True)

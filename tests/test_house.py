@@ -1,0 +1,66 @@
+"""The order of the files: each imports only from files before it; and every public name is documented with an example that runs."""
+
+import ast
+import inspect
+import pathlib
+import re
+import subprocess
+import sys
+
+import pytest
+
+import jaxlag
+
+PACKAGE = pathlib.Path(jaxlag.__file__).parent
+ORDER = [
+    "_arguments",
+    "_system",
+    "_checks",
+    "_mechanics",
+    "_multipliers",
+    "_manifold",
+    "_sensitivities",
+    "_integrate",
+    "_identify",
+    "plot",
+]
+PUBLIC = [name for name in vars(jaxlag) if not name.startswith("_") and callable(getattr(jaxlag, name))]
+
+
+def _imported(file):
+    for node in ast.walk(ast.parse(file.read_text())):
+        if isinstance(node, ast.ImportFrom) and node.level == 1:
+            yield from ([node.module] if node.module else [alias.name for alias in node.names])
+
+
+@pytest.mark.parametrize("name", ORDER)
+def test_a_file_imports_only_from_files_before_it(name):
+    assert set(_imported(PACKAGE / f"{name}.py")) <= set(ORDER[: ORDER.index(name)])
+
+
+def test_every_file_has_its_place():
+    assert {f.stem for f in PACKAGE.glob("*.py")} - {"__init__", "__main__"} == set(ORDER)
+
+
+@pytest.mark.parametrize("library, home", [("diffrax", "_integrate"), ("matplotlib", "plot")])
+def test_a_library_has_one_home(library, home):
+    users = {f.stem for f in PACKAGE.glob("*.py") if re.search(rf"^\s*(import|from) {library}", f.read_text(), re.M)}
+    assert users <= {home}
+
+
+@pytest.mark.parametrize("name", PUBLIC)
+def test_every_public_name_has_a_docstring(name):
+    assert len(inspect.getdoc(getattr(jaxlag, name)) or "") > 60
+
+
+@pytest.mark.parametrize("name", [name for name in PUBLIC if "```python" in (inspect.getdoc(getattr(jaxlag, name)) or "")])
+def test_docstring_examples_run_and_give_what_they_say(name):
+    doc = inspect.getdoc(getattr(jaxlag, name))
+    for block in re.findall(r"```python\n(.*?)```", doc, re.S):
+        exec(block, {})
+
+
+def test_import_has_no_side_effects():
+    code = "import jax; before = jax.config.values.copy(); import jaxlag; assert jax.config.values == before"
+    run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert run.returncode == 0 and run.stdout == run.stderr == "", run.stderr
