@@ -40,10 +40,12 @@ class Projection:
 
     def project(self, flat: Flat, t, q, v):
         """The state on the constraints that is nearest to this one, which is near already."""
+        M = inertia(flat, t, q, v)[0]  # at the start serves throughout: what is put right is small
         for _ in range(self.iterations):
             g, G = position_residual(flat, t, q)
-            q = q + saddle_point(inertia(flat, t, q, v)[0], G, jnp.zeros_like(q), -g).x
-        return q, project_velocity(flat, t, q, v)
+            q = q + saddle_point(M, G, jnp.zeros_like(q), -g).x
+        psi, G, _ = constraint_rows(flat, t, q, v)
+        return q, v + saddle_point(M, G, jnp.zeros_like(v), -psi).x
 
 
 @dataclasses.dataclass(frozen=True)
@@ -92,12 +94,6 @@ class NoStabilisation:
     project = None
 
 
-def project_velocity(flat: Flat, t, q, v):
-    """The velocity that satisfies ψ(t, q, v) = 0 and is nearest to v in the metric of M."""
-    psi, G, _ = constraint_rows(flat, t, q, v)
-    return v + saddle_point(inertia(flat, t, q, v)[0], G, jnp.zeros_like(v), -psi).x
-
-
 class Consistent(NamedTuple):
     """A state on the constraints; `reached` is false where the iteration found none, `determined` where inertia is missing."""
 
@@ -140,8 +136,7 @@ def nearest_state(flat: Flat, t, q0, v0, free: Sequence[int] | None = None) -> C
     start = jnp.zeros(flat.holonomic(t, q0).size, q0.dtype)
     carry = jax.lax.stop_gradient((q0, start, far, far))
     q, multipliers, *_ = jax.lax.while_loop(unfinished, iterate, (*carry, 0))
-    for _ in range(2):
-        q, multipliers, _, _ = newton(q, multipliers)
+    (q, _), _ = jax.lax.scan(lambda carry, _: (newton(*carry)[:2], None), (q, multipliers), length=2)
 
     psi, G, _ = constraint_rows(flat, t, q, v0)
     nearest = saddle_point(inertia(flat, t, q, v0)[0][both], G[:, moving], jnp.zeros_like(v0[moving]), -psi)

@@ -132,7 +132,7 @@ def _constraint_jacobian(flat, t, q, v):
 
 
 class Residual(NamedTuple):
-    """How far a state is from its constraints, by their names."""
+    """How far a state is from its constraints: `position` holds g, `velocity` holds dg/dt and a, each by the constraint's name."""
 
     position: dict[str, PyTree]
     velocity: dict[str, PyTree]

@@ -57,11 +57,11 @@ def by_scipy(seed):
             make_drive.b, make_drive.c, make_drive.k = old
         return np.concatenate([y, phi, vx])
 
-    return curve_fit(model, ts, measured, p0=[6000.0, 20000.0, 0.3], x_scale=[3e3, 4e4, 0.6], method="trf", xtol=1e-12, ftol=1e-12)
+    return curve_fit(model, ts, measured, p0=[6000.0, 20000.0, 0.3], epsfcn=1e-8, xtol=1e-12, ftol=1e-14)
 
 
 def test_estimates_and_errors_are_those_of_scipy():
-    fit = jl.fit(vehicle.system, experiment(3), GUESS, free=("b", "c", "k"))
+    fit = jl.fit(vehicle.system, experiment(3), GUESS, free=("b", "c", "k"), rtol=1e-10, atol=1e-12)
     estimates, covariance = by_scipy(3)
     order = [fit.names.index(name) for name in ("b", "c", "k")]
     np.testing.assert_allclose([fit.estimates[name] for name in ("b", "c", "k")], estimates, rtol=1e-5)
