@@ -28,8 +28,9 @@ def inertia(flat: Flat, t, q, v) -> tuple[Float[Array, "n n"], Float[Array, " n"
 
 def applied_force(flat: Flat, t, q, v, multipliers) -> Float[Array, " n"]:
     """−∂D/∂q̇ + Q."""
-    dD_dv = jax.grad(flat.dissipation, argnums=2)(t, q, v, multipliers)
-    return flat.force(t, q, v, multipliers) - dD_dv
+    D = lambda v: sum((D(t, q, v, multipliers) for D in flat.dissipations.values()), start=jnp.zeros((), v.dtype))
+    Q = sum((Q(t, q, v, multipliers) for Q in flat.forces.values()), start=jnp.zeros_like(v))
+    return Q - jax.grad(D)(v)
 
 
 def position_residual(flat: Flat, t, q) -> tuple[Float[Array, " h"], Float[Array, "h n"]]:

@@ -1,10 +1,14 @@
 """The constrained solve: x and λ of  M x = f + Gᵀλ,  G x = c."""
 
+import dataclasses
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 import optimistix as optx
+from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float, PyTree
 
 from ._checks import at_state, is_concrete
@@ -168,35 +172,67 @@ def _acceleration(flat, t, q, v):
     return Acceleration(flat.unravel(qddot), flat.unravel_multipliers(multipliers)), determined
 
 
-def constraint_force(system: System, q: PyTree, qdot: PyTree, params: PyTree = None, *, t: Any = 0.0) -> dict[str, PyTree]:
-    """Generalized constraint force λ ∂g/∂q (or λ ∂a/∂q̇) of each constraint, by its name and structured like q.
+def constraint_force(
+    system: System, q: PyTree, qdot: PyTree, params: PyTree = None, *, t: Any = 0.0, at: Callable | None = None
+) -> dict[str, PyTree]:
+    r"""Constraint forces by the constraint's name: generalized, λ ∂g/∂q (or λ ∂a/∂q̇), or as a force on a point.
 
-    **Arguments, raises:** as `acceleration`. Their sum is Gᵀλ; with redundant constraints the sum is unique, its parts
-    are those of the λ of least norm.
+    $$ Q = \lambda\,\frac{\partial g}{\partial q}, \qquad F \cdot \delta x = Q \cdot \delta q \text{ for the point } x(t, q) $$
 
-    **Source:** Goldstein, Classical Mechanics, 3rd ed., eq. 2.24.
+    **Arguments:** as `acceleration`; `at`: the position map x(t, q) of a point, which receives the arguments it names.
+
+    **Returns:** Q structured like q; their sum is Gᵀλ. With `at`, F structured like x: the force at that point that does the same
+    virtual work, NaN where the constraint does not act through that point alone. With redundant constraints the sum is unique, its parts
+    are those of the λ of least norm. Any consistent units.
+
+    **Raises:** as `acceleration`.
+
+    **Source:** Goldstein, Classical Mechanics, 3rd ed., eqs. 2.24 and 1.49.
 
     ```python
     import jax.numpy as jnp
     import jaxlag as jl
     block = jl.System(
-        lambda q, qdot, m, g: 0.5 * m * qdot @ qdot - m * g * q[1], holonomic={"floor": lambda q: q[1]}
+        lambda q, qdot, m, g: 0.5 * m * qdot @ qdot - m * g * q[1], holonomic={"floor": lambda q: 2 * q[1]}
     )
     jl.constraint_force(block, jnp.zeros(2), jnp.zeros(2), {"m": 2.0, "g": 9.81})["floor"]  # [0, 19.62]
     ```
     """
-    force, determined = at_state(_constraint_force, system, q, qdot, params, t)
+    force, determined = at_state(_ConstraintForce(at), system, q, qdot, params, t)
     if is_concrete(determined) and not determined:
         raise ValueError(NO_INERTIA)
     return force
 
 
-def _constraint_force(flat, t, q, v):
-    _, multipliers, determined = constrained_acceleration(flat, t, q, v)
-    _, G, _ = constraint_rows(flat, t, q, v)
-    rows = flat.unravel_multipliers(jnp.arange(G.shape[0]))
-    forces = {}
-    for name, indices in rows.items():
-        of_term = jnp.concatenate([jnp.ravel(i) for i in jax.tree.leaves(indices)]).astype(int)
-        forces[name] = flat.unravel(jnp.where(determined, multipliers[of_term] @ G[of_term], jnp.nan))
-    return forces, determined
+@dataclasses.dataclass(frozen=True)
+class _ConstraintForce:
+    """The forces over flat vectors; compared by the point, so that it compiles once."""
+
+    at: Callable | None
+
+    def __call__(self, flat: Flat, t, q, v):
+        _, multipliers, determined = constrained_acceleration(flat, t, q, v)
+        _, G, _ = constraint_rows(flat, t, q, v)
+        forces = {name: multipliers[rows] @ G[rows] for name, rows in rows_by_name(flat, G.shape[0]).items()}
+        shown = flat.unravel if self.at is None else _force_on_point(flat, self.at, t, q)
+        return {name: shown(jnp.where(determined, Q, jnp.nan)) for name, Q in forces.items()}, determined
+
+
+def _force_on_point(flat, at, t, q):
+    """Q ↦ F with JᵀF = Q, J = ∂x/∂q."""
+    x, unravel = ravel_pytree(flat.position(at, t, q))
+    J = jax.jacobian(lambda q: ravel_pytree(flat.position(at, t, q))[0])(q)
+
+    def force(Q):
+        F = pseudo_inverse(J @ J.T) @ (J @ Q)
+        does_the_work = jnp.max(jnp.abs(J.T @ F - Q)) <= jnp.finfo(q.dtype).eps ** 0.5 * jnp.max(jnp.abs(Q))
+        return unravel(jnp.where(does_the_work, F, jnp.nan))
+
+    return force
+
+
+def rows_by_name(flat: Flat, m: int) -> dict[str, np.ndarray]:
+    """Which rows of G, and entries of λ, belong to which constraint."""
+    with jax.ensure_compile_time_eval():
+        rows = jax.tree.map(np.asarray, flat.unravel_multipliers(jnp.arange(m, dtype=float)))
+    return {name: np.concatenate([np.ravel(leaf) for leaf in jax.tree.leaves(rows[name])]).astype(int) for name in rows}

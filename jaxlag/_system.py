@@ -14,6 +14,7 @@ from ._arguments import call, names
 Terms = tuple[tuple[str, Callable], ...]
 Slot = Any  # a function, a mapping from names to functions, or None: `_terms` checks it, with a sentence
 SLOTS = ("lagrangian", "dissipation", "force", "holonomic", "nonholonomic")
+EXPLICIT_TIME = "time"  # how the energy that explicit time in L brings in is named among the powers
 
 
 @dataclasses.dataclass(frozen=True, init=False, repr=False)
@@ -38,7 +39,7 @@ class System:
 
     Any consistent set of units. A system is immutable, hashable and compared by its functions.
 
-    **Raises:** `TypeError` where a slot holds no function; `ValueError` where two constraints share a name.
+    **Raises:** `TypeError` where a slot holds no function; `ValueError` where two terms share a name.
 
     **Source:** Goldstein, Classical Mechanics, 3rd ed., sections 1.5 and 2.4; sign of λ: M q̈ = f + Gᵀλ.
 
@@ -72,10 +73,11 @@ class System:
             object.__setattr__(self, slot, _terms(slot, given))
         if not self.lagrangian:
             raise TypeError("`lagrangian` must be a function L(q, qdot), but none was given. Hand over at least the kinetic energy.")
-        for twice in {name for name, _ in self.holonomic} & {name for name, _ in self.nonholonomic}:
-            raise ValueError(
-                f"`holonomic` and `nonholonomic` must name their constraints differently, but both have {twice!r}. Rename one."
-            )
+        for name in self.terms:
+            if self.terms.count(name) > 1:
+                raise ValueError(
+                    f"terms must be named differently, but two are called {name!r}. Rename one, for powers and multipliers go by names."
+                )
 
     def __repr__(self) -> str:
         def listed(slot: str, terms: Terms) -> str:
@@ -87,6 +89,11 @@ class System:
     def constraints(self) -> tuple[str, ...]:
         """Names of all constraints, in the order of the rows of G."""
         return tuple(name for name, _ in (*self.holonomic, *self.nonholonomic))
+
+    @property
+    def terms(self) -> tuple[str, ...]:
+        """Names of all that does work: dissipation, forces, constraints, and explicit time in L."""
+        return (*(name for name, _ in (*self.dissipation, *self.force)), *self.constraints, EXPLICIT_TIME)
 
 
 def _terms(slot: str, given: Any) -> Terms:
@@ -118,14 +125,16 @@ class Flat(NamedTuple):
     """A system with its parameters, over flat vectors q, v of length n and λ of length m: what the mechanics works on."""
 
     lagrangian: Callable[..., Float[Array, ""]]  # L(t, q, v)
-    dissipation: Callable[..., Float[Array, ""]]  # D(t, q, v, λ)
-    force: Callable[..., Float[Array, " n"]]  # Q(t, q, v, λ)
+    dissipations: dict[str, Callable[..., Float[Array, ""]]]  # D(t, q, v, λ)
+    forces: dict[str, Callable[..., Float[Array, " n"]]]  # Q(t, q, v, λ)
     holonomic: Callable[..., Float[Array, " h"]]  # g(t, q)
     nonholonomic: Callable[..., Float[Array, " k"]]  # a(t, q, v)
+    position: Callable[..., PyTree]  # x(t, q) of a position map
     unravel: Callable[[Float[Array, " n"]], PyTree]
     unravel_multipliers: Callable[[Float[Array, " m"]], dict[str, PyTree]]
     needs_multipliers: bool
     holonomic_names: tuple[str, ...]
+    terms: tuple[str, ...]
 
 
 def bind(system: System, like: PyTree, params: PyTree) -> Flat:
@@ -138,18 +147,25 @@ def bind(system: System, like: PyTree, params: PyTree) -> Flat:
         state = {"t": t, "q": unravel(q)} | ({} if v is None else {"qdot": unravel(v)}) | more
         return call(function, role(slot, name), params, **state)
 
-    def scalar(slot, t, q, v, **more):
-        total = sum((value(slot, term, t, q, v, **more) for term in getattr(system, slot)), start=jnp.zeros((), q.dtype))
+    def lagrangian(t, q, v):
+        total = sum((value("lagrangian", term, t, q, v) for term in system.lagrangian), start=jnp.zeros((), q.dtype))
         return jnp.asarray(total, q.dtype)
+
+    def dissipation(term):
+        def potential(t, q, v, multipliers):
+            return jnp.asarray(value("dissipation", term, t, q, v, multipliers=unravel_multipliers(multipliers)), q.dtype)
+
+        return potential
 
     def vector(slot, t, q, v):
         parts = [ravel_pytree(value(slot, term, t, q, v))[0].astype(q.dtype) for term in getattr(system, slot)]
         return jnp.concatenate([jnp.zeros(0, q.dtype), *parts])
 
-    def force(t, q, v, multipliers):
-        named = {"multipliers": unravel_multipliers(multipliers)}
-        parts = [ravel_like(zeros, value("force", term, t, q, v, **named)) for term in system.force]
-        return sum(parts, start=jnp.zeros_like(q))
+    def force(term):
+        def generalized(t, q, v, multipliers):
+            return ravel_like(zeros, value("force", term, t, q, v, multipliers=unravel_multipliers(multipliers)))
+
+        return generalized
 
     one = jnp.zeros((), zero.dtype)
     shapes = [
@@ -163,15 +179,17 @@ def bind(system: System, like: PyTree, params: PyTree) -> Flat:
         return dict(zip(system.constraints, unravel_values(multipliers), strict=True))
 
     return Flat(
-        lagrangian=lambda t, q, v: scalar("lagrangian", t, q, v),
-        dissipation=lambda t, q, v, multipliers: scalar("dissipation", t, q, v, multipliers=unravel_multipliers(multipliers)),
-        force=force,
+        lagrangian=lagrangian,
+        dissipations={term[0]: dissipation(term) for term in system.dissipation},
+        forces={term[0]: force(term) for term in system.force},
         holonomic=lambda t, q: vector("holonomic", t, q, None),
         nonholonomic=lambda t, q, v: vector("nonholonomic", t, q, v),
+        position=lambda at, t, q: call(at, "a position map", params, t=t, q=unravel(q)),
         unravel=unravel,
         unravel_multipliers=unravel_multipliers,
         needs_multipliers=any(names(function, "multipliers") for _, function in (*system.dissipation, *system.force)),
         holonomic_names=tuple(name for name, _ in system.holonomic),
+        terms=system.terms,
     )
 
 
@@ -182,3 +200,9 @@ def ravel_like(zeros: PyTree, partial: PyTree) -> Float[Array, " n"]:
     for path in given:
         raise KeyError(jax.tree_util.keystr(path))
     return ravel_pytree(leaves)[0]
+
+
+def leaf_names(tree: PyTree, bare: str = "q") -> tuple[str, ...]:
+    """The leaves by their paths, e.g. "wheel.phi"; `bare` names a leaf without a path."""
+    paths = [jax.tree_util.keystr(path, simple=True, separator=".") for path, _ in jax.tree_util.tree_flatten_with_path(tree)[0]]
+    return tuple(path or bare for path in paths)

@@ -52,7 +52,7 @@ WRONG = {
     "contradicting constraints": (lambda: run(jl.System(energy, holonomic={"a": lambda q: q - 1.0, "b": lambda q: q - 2.0})), "must be satisfied by some state near the start"),
     "no function": (lambda: jl.System(energy, dissipation=0.5), "`dissipation` must be a function or a mapping from names to functions, but it holds 0.5"),
     "no lagrangian": (lambda: jl.System(None), r"`lagrangian` must be a function L\(q, qdot\)"),
-    "constraints of one name": (lambda: jl.System(energy, holonomic={"a": lambda q: q}, nonholonomic={"a": lambda qdot: qdot}), "must name their constraints differently, but both have 'a'"),
+    "constraints of one name": (lambda: jl.System(energy, holonomic={"a": lambda q: q}, nonholonomic={"a": lambda qdot: qdot}), "terms must be named differently, but two are called 'a'"),
     "fixed coordinate that is none": (lambda: jl.consistent_state(pendulum.polar, {"r": 1.0, "phi": 0.0}, {"r": 0.0, "phi": 0.0}, pendulum.params, fixed=("psi",)), r"`fixed` must name coordinates of q, but holds 'psi'. The coordinates are \['phi', 'r'\]"),
     "consistent state that is impossible": (lambda: jl.consistent_state(jl.System(energy, holonomic=lambda q: q**2 + 1.0), 1.0, 0.0, {"c": 1.0}), "none was found"),
 }  # fmt: skip

@@ -12,7 +12,7 @@ import jaxlag as jl
 from jaxlag.examples import vehicle
 
 sys.path.insert(0, str(Path(__file__).parent / "data"))
-import make_drive  # noqa: E402
+import make_drive
 
 GUESS = vehicle.params | {"b": 6000.0, "c": 20000.0, "k": 0.3}
 

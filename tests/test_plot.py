@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 import jaxlag as jl
+from jaxlag._integrate import _Stated
 from jaxlag import plot
 
 matplotlib.use("Agg")
@@ -28,7 +29,7 @@ def close_figures():
 def motion(q):
     """A trajectory that was not simulated, so that the tests know every number of it."""
     samples = jax.tree.map(lambda start: jnp.stack([jnp.asarray(start + t) for t in TIMES]), q)
-    return jl.Trajectory(jnp.asarray(TIMES), samples, samples, samples, {}, jl.RESULTS.successful, {})
+    return jl.Trajectory(jnp.asarray(TIMES), samples, samples, samples, {}, jl.RESULTS.successful, {}, None, _Stated.of(None, {}))
 
 
 def fitted(*residuals, of, sigma=0.5):

@@ -1,0 +1,174 @@
+"""A check-up of a system at one state, before it is run: findings in words, with the cure."""
+
+import dataclasses
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import PyTree
+
+from ._checks import at_state, coordinates
+from ._mechanics import constraint_rows, inertia, position_residual
+from ._multipliers import constrained_acceleration, rows_by_name
+from ._system import Flat, System, leaf_names
+
+
+@dataclasses.dataclass(frozen=True)
+class Examination:
+    """What `examine` found; printed, a report.
+
+    - `coordinates`, `degrees_of_freedom`, `rank` of G, `redundant`: rows of G that depend on rows before them, by constraint.
+    - `off_position`, `off_velocity`: the largest residual of each constraint. `smallest_inertia`: the least eigenvalue of M on the
+      motions the constraints allow. `dissipated`: the least of q̇·∂D/∂q̇ near the state, by term.
+    - `time_constants`: 1/|eigenvalue| of the linearised motion, the fastest and the slowest. `findings`: sentences with the cure.
+    """
+
+    coordinates: tuple[str, ...]
+    degrees_of_freedom: int
+    rank: int
+    rows: int
+    redundant: dict[str, int]
+    off_position: dict[str, float]
+    off_velocity: dict[str, float]
+    smallest_inertia: float
+    dissipated: dict[str, float]
+    time_constants: tuple[float, float]
+    findings: tuple[str, ...]
+
+    def __repr__(self) -> str:
+        fastest, slowest = self.time_constants
+        rows = [
+            ("coordinates", ", ".join(self.coordinates)),
+            ("degrees of freedom", str(self.degrees_of_freedom)),
+            ("constraint rows", f"{self.rows}, of rank {self.rank}"),
+            ("smallest inertia", f"{self.smallest_inertia:.3g}"),
+            ("time constants", f"{fastest:.3g} … {slowest:.3g}"),
+        ]
+        lines = [f"  {name:<20}{value}" for name, value in rows]
+        return "\n".join(["Examination", *lines, *(f"  - {finding}" for finding in self.findings or ("nothing to mend",))])
+
+
+def examine(system: System, q: PyTree, qdot: PyTree, params: PyTree = None, *, t: Any = 0.0) -> Examination:
+    r"""A check-up of a system at one state: rank, redundancy, inertia, dissipation, stiffness, in numbers and in words.
+
+    $$ \text{degrees of freedom} = n - \mathrm{rank}\,G, \qquad N^T M N > 0, \qquad \dot q\cdot\frac{\partial D}{\partial\dot q} \ge 0,
+       \qquad \tau = 1/|\lambda_i| \text{ of the linearised motion} $$
+
+    N spans the null space of G: the motions that the constraints allow.
+
+    **Arguments:** as `acceleration`. Any consistent units. **Returns:** an `Examination`; print it.
+
+    **Raises:** `TypeError` or `ValueError` where an argument or a function of the system is of the wrong kind.
+
+    **Source:** Hairer & Wanner, Solving Ordinary Differential Equations II, sections IV.1 (stiffness) and VII.1.
+
+    ```python
+    import jaxlag as jl
+    from jaxlag.examples import vehicle
+    print(jl.examine(vehicle.system, vehicle.q0, vehicle.qdot0, vehicle.params))
+    ```
+    """
+    found = jax.tree.map(np.asarray, at_state(_measure, system, q, qdot, params, t))
+    q = coordinates(q, "q")
+    eps = float(jnp.finfo(found["M"].dtype).eps)
+    G, M, rows = found["G"], found["M"], found["rows"]
+    N, rank = _null_space(G, eps)
+    inertia_on_N = np.linalg.eigvalsh(N.T @ M @ N) if N.shape[1] else np.zeros(0)
+    smallest = float(inertia_on_N[0]) if inertia_on_N.size else float("inf")
+    redundant = _redundant_rows(G, rows, eps)
+    largest = lambda named: {name: float(np.max(np.abs(value), initial=0.0)) for name, value in named.items()}
+    constants = _time_constants(found, N) if np.all(np.isfinite(found["A"])) else (float("nan"), float("nan"))
+    numbers = {
+        "coordinates": leaf_names(q),
+        "degrees_of_freedom": N.shape[1],
+        "rank": rank,
+        "rows": G.shape[0],
+        "redundant": redundant,
+        "off_position": largest(found["position"]),
+        "off_velocity": largest(found["velocity"]),
+        "smallest_inertia": smallest,
+        "dissipated": {name: float(np.min(value)) for name, value in found["dissipated"].items()},
+        "time_constants": constants,
+    }
+    no_inertia = inertia_on_N.size > 0 and smallest <= 100 * M.shape[0] * eps * np.max(np.abs(M), initial=0.0)
+    return Examination(**numbers, findings=tuple(_findings(numbers, no_inertia, found["M"].dtype)))
+
+
+def _findings(numbers, no_inertia, dtype):
+    if no_inertia:
+        yield "a direction that no constraint holds has no inertia: add the missing mass, or a constraint"
+    if numbers["degrees_of_freedom"] == 0:
+        yield "no degree of freedom is left: the constraints hold every coordinate"
+    for name, count in numbers["redundant"].items():
+        yield (
+            f"constraint {name!r} has {count} row{'s' if count > 1 else ''} that follow{'' if count > 1 else 's'} from those before: "
+            "the motion is unique, λ is the one of least norm; leave the rows out if you want each reaction"
+        )
+    tolerance = float(jnp.finfo(dtype).eps) ** 0.5
+    for what, off in (("position", numbers["off_position"]), ("velocity", numbers["off_velocity"])):
+        for name, value in off.items():
+            if value > tolerance:
+                yield f"the {what} is off constraint {name!r} by {value:.2g}: `consistent_state` puts it right, `simulate` does by itself"
+    for name, least in numbers["dissipated"].items():
+        if least < 0:
+            yield f"dissipation {name!r} feeds energy in near this state (q̇·∂D/∂q̇ = {least:.2g}): right for wind or a moving belt, else look at its sign"
+    fastest, slowest = numbers["time_constants"]
+    if np.isfinite(slowest) and slowest > 1e4 * fastest:
+        yield f"the motion is stiff (time constants from {fastest:.2g} to {slowest:.2g}): take `solver=diffrax.Kvaerno5()`"
+    if jnp.finfo(dtype).bits < 64:
+        yield 'single precision: `jax.config.update("jax_enable_x64", True)` gives twice the digits'
+
+
+def _measure(flat: Flat, t, q, v):
+    """All that needs derivatives, in one compiled program."""
+    _, G, _ = constraint_rows(flat, t, q, v)
+    multipliers = constrained_acceleration(flat, t, q, v).multipliers
+    rates = lambda y: jnp.concatenate([y[q.size :], constrained_acceleration(flat, t, y[: q.size], y[q.size :]).x])
+    scale = 1 + jnp.max(jnp.abs(v))
+    near = v[None] + 0.1 * scale * jax.random.normal(jax.random.key(0), (64, v.size), v.dtype)
+    fed = {name: jax.vmap(lambda v, D=D: v @ jax.grad(D, argnums=2)(t, q, v, multipliers))(near) for name, D in flat.dissipations.items()}
+    g, _ = position_residual(flat, t, q)
+    split = rows_by_name(flat, G.shape[0])
+    psi, _, _ = constraint_rows(flat, t, q, v)
+    return {
+        "M": inertia(flat, t, q, v)[0],
+        "G": G,
+        "A": jax.jacfwd(rates)(jnp.concatenate([q, v])),
+        "rows": {name: jnp.asarray(rows) for name, rows in split.items()},
+        "position": {name: g[split[name]] for name in flat.holonomic_names},
+        "velocity": {name: psi[rows] for name, rows in split.items()},
+        "dissipated": fed,
+    }
+
+
+def _null_space(G, eps):
+    """Columns that span the motions the constraints allow, and the rank of G, with rows scaled to unit length."""
+    size = np.linalg.norm(G, axis=1, keepdims=True)
+    if not G.shape[0]:
+        return np.eye(G.shape[1]), 0
+    _, s, Vt = np.linalg.svd(G / np.where(size > 0, size, 1))
+    rank = int(np.sum(s > eps**0.3125 * max(s[0], eps)))
+    return Vt[rank:].T, rank
+
+
+def _redundant_rows(G, rows, eps):
+    """How many rows of each constraint depend on rows before them."""
+    redundant, before = {}, np.zeros((0, G.shape[1]))
+    for name, indices in rows.items():
+        of_name = np.concatenate([before, G[indices]])
+        dependent = len(indices) - (_null_space(of_name, eps)[1] - _null_space(before, eps)[1])
+        if dependent:
+            redundant[name] = dependent
+        before = of_name
+    return redundant
+
+
+def _time_constants(found, N):
+    """Of the motion linearised on what the constraints allow: 1/|λ| of the nonzero eigenvalues, the fastest and the slowest."""
+    n = N.shape[0]
+    A = found["A"]
+    reduced = np.block([[np.zeros((N.shape[1],) * 2), np.eye(N.shape[1])], [N.T @ A[n:, :n] @ N, N.T @ A[n:, n:] @ N]])
+    sizes = np.abs(np.linalg.eigvals(reduced))
+    sizes = sizes[sizes > 1e-10 * np.max(sizes, initial=0.0)]
+    return (1 / np.max(sizes), 1 / np.min(sizes)) if sizes.size else (float("inf"), float("inf"))
