@@ -72,7 +72,8 @@ def examine(system: System, q: PyTree, qdot: PyTree, params: PyTree = None, *, t
     found = jax.tree.map(np.asarray, at_state(_measure, system, q, qdot, params, t))
     q = coordinates(q, "q")
     eps = float(jnp.finfo(found["M"].dtype).eps)
-    G, M, rows = found["G"], found["M"], found["rows"]
+    G, M = found["G"], found["M"]
+    rows = {name: found["rows"][name] for name in system.constraints}  # in the order of the rows of G
     N, rank = _null_space(G, eps)
     inertia_on_N = np.linalg.eigvalsh(N.T @ M @ N) if N.shape[1] else np.zeros(0)
     smallest = float(inertia_on_N[0]) if inertia_on_N.size else float("inf")
@@ -102,8 +103,8 @@ def _findings(numbers, no_inertia, dtype):
         yield "no degree of freedom is left: the constraints hold every coordinate"
     for name, count in numbers["redundant"].items():
         yield (
-            f"constraint {name!r} has {count} row{'s' if count > 1 else ''} that follow{'' if count > 1 else 's'} from those before: "
-            "the motion is unique, λ is the one of least norm; leave the rows out if you want each reaction"
+            f"of constraint {name!r} {count} of the rows follow from those before: the motion is unique, λ is the one of least norm; "
+            "leave the rows out where each reaction matters"
         )
     tolerance = float(jnp.finfo(dtype).eps) ** 0.5
     for what, off in (("position", numbers["off_position"]), ("velocity", numbers["off_velocity"])):

@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 
 import jaxlag as jl
-from jaxlag._integrate import _Stated
 from jaxlag import plot
+from jaxlag._integrate import _Stated
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt

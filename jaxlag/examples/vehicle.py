@@ -5,6 +5,10 @@ Coordinates x, y, φ; wheels at x ± a, rolling: φ₂ = −(x − a)/r, φ₃ =
     L = ½M(ẋ² + ẏ²) + ½Θ_s φ̇² + (m + Θ_r/r²)ẋ² − M g y − ½c(y − aφ − l)² − ½c(y + aφ − l)²
     D = ½b(ẏ − aφ̇)² + ½b(ẏ + aφ̇)² + ⅓k|ẋ + v|³
     δW = −M₀ δφ₃, so Q_x = M₀/r
+
+Three ways to the same motion: `system` is that reduced form; `substituted` is the full Lagrangian in the body's x, y, φ, the
+wheels' x₂, φ₂, x₃, φ₃ and the strut ends' y₂, y₃, with six of them expressed by the others; `first_kind` keeps all nine and
+takes the six equations as constraints, whose multipliers are the forces that the parts pass to each other.
 """
 
 from pathlib import Path
@@ -38,6 +42,40 @@ def drive(M0, r):
 
 
 system = jl.System(lagrangian, dissipation={"dampers": dampers, "air": air}, force={"drive": drive})
+
+
+def full_lagrangian(q, qdot, M, m, Theta_s, Theta_r, c, l, g):
+    """T − V of each part by itself; the strut ends y₂, y₃ carry no mass."""
+    body = 0.5 * M * (qdot["x"] ** 2 + qdot["y"] ** 2) + 0.5 * Theta_s * qdot["phi"] ** 2 - M * g * q["y"]
+    rear = 0.5 * m * qdot["x2"] ** 2 + 0.5 * Theta_r * qdot["phi2"] ** 2 - 0.5 * c * (q["y2"] - l) ** 2
+    front = 0.5 * m * qdot["x3"] ** 2 + 0.5 * Theta_r * qdot["phi3"] ** 2 - 0.5 * c * (q["y3"] - l) ** 2
+    return body + rear + front
+
+
+def full_dampers(qdot, b):
+    """½b v² of both struts."""
+    return 0.5 * b * qdot["y2"] ** 2 + 0.5 * b * qdot["y3"] ** 2
+
+
+def parts(q, r, a):
+    """The full coordinates from x, y, φ: the equations that bind the parts to each other (Bindungsgleichungen), solved."""
+    x2, x3 = q["x"] - a, q["x"] + a
+    struts = {"y2": q["y"] - a * q["phi"], "y3": q["y"] + a * q["phi"]}
+    return {**q, **struts, "x2": x2, "x3": x3, "phi2": -x2 / r, "phi3": -x3 / r}
+
+
+drive_moment = jl.virtual_work(lambda q: q["phi3"], lambda M0: -M0)  # δW = −M₀ δφ₃
+bindings = {
+    "rear axle": lambda q, a: q["x2"] - q["x"] + a,
+    "front axle": lambda q, a: q["x3"] - q["x"] - a,
+    "rear strut": lambda q, a: q["y2"] - q["y"] + a * q["phi"],
+    "front strut": lambda q, a: q["y3"] - q["y"] - a * q["phi"],
+    "rear rolling": lambda q, r: q["phi2"] + q["x2"] / r,
+    "front rolling": lambda q, r: q["phi3"] + q["x3"] / r,
+}
+full_terms = {"dissipation": {"dampers": full_dampers, "air": air}, "force": {"drive": drive_moment}}
+substituted = jl.substitute(jl.System(full_lagrangian, **full_terms), parts)
+first_kind = jl.System(full_lagrangian, **full_terms, holonomic=bindings)
 
 params = {
     "M": 1000.0,  # kg, body
