@@ -9,9 +9,10 @@ import numpy as np
 from jaxtyping import PyTree
 
 from ._checks import at_state, coordinates
+from ._friction import settled
 from ._mechanics import constraint_rows, inertia, position_residual
-from ._multipliers import constrained_acceleration, rows_by_name
-from ._system import Flat, System, leaf_names
+from ._multipliers import constrained_acceleration
+from ._system import Flat, System, leaf_names, rows_by_name
 
 
 @dataclasses.dataclass(frozen=True)
@@ -124,13 +125,14 @@ def _findings(numbers, no_inertia, dtype):
 def _measure(flat: Flat, t, q, v):
     """All that needs derivatives, in one compiled program."""
     _, G, _ = constraint_rows(flat, t, q, v)
-    multipliers = constrained_acceleration(flat, t, q, v).multipliers
-    rates = lambda y: jnp.concatenate([y[q.size :], constrained_acceleration(flat, t, y[: q.size], y[q.size :]).x])
+    mode = settled(flat, t, q, v)
+    multipliers = constrained_acceleration(mode, t, q, v).multipliers
+    rates = lambda y: jnp.concatenate([y[q.size :], constrained_acceleration(mode, t, y[: q.size], y[q.size :]).x])
     scale = 1 + jnp.max(jnp.abs(v))
     near = v[None] + 0.1 * scale * jax.random.normal(jax.random.key(0), (64, v.size), v.dtype)
     fed = {name: jax.vmap(lambda v, D=D: v @ jax.grad(D, argnums=2)(t, q, v, multipliers))(near) for name, D in flat.dissipations.items()}
     g, _ = position_residual(flat, t, q)
-    split = rows_by_name(flat, G.shape[0])
+    split = rows_by_name(flat)
     psi, _, _ = constraint_rows(flat, t, q, v)
     return {
         "M": inertia(flat, t, q, v)[0],

@@ -14,8 +14,10 @@ from jaxtyping import Array, Float, PyTree
 
 from ._arguments import call
 from ._checks import is_concrete, is_vector, parameters, sample_times, state
-from ._integrate import Trajectory, reason_of, simulate
+from ._integrate import simulate
+from ._results import reason_of
 from ._system import System
+from ._trajectory import Trajectory
 
 
 class Experiment(eqx.Module):

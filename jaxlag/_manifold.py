@@ -94,6 +94,9 @@ class NoStabilisation:
     project = None
 
 
+NEWTON_STEPS = 16  # a fixed number is one loop to compile; near the constraints four do
+
+
 class Consistent(NamedTuple):
     """A state on the constraints; `reached` is false where the iteration found none, `determined` where inertia is missing."""
 
@@ -106,8 +109,7 @@ class Consistent(NamedTuple):
 def nearest_state(flat: Flat, t, q0, v0, free: Sequence[int] | None = None) -> Consistent:
     """The state on the constraints nearest to (q0, v0), in which only the `free` coordinates move.
 
-    Newton's method on  M (q − q0) = Gᵀλ,  g(t, q) = 0,  with M = M(q0). The iteration itself is not differentiated: two
-    more Newton steps after it are, which gives derivatives that are exact up to third order.
+    Newton's method on  M (q − q0) = Gᵀλ,  g(t, q) = 0,  with M = M(q0). Its derivatives converge along with it.
     """
     moving = np.arange(q0.size) if free is None else np.asarray(free, int)
     both = np.ix_(moving, moving)
@@ -117,26 +119,16 @@ def nearest_state(flat: Flat, t, q0, v0, free: Sequence[int] | None = None) -> C
     if rows == 0:  # nothing to satisfy: spares the compilation of the search
         return Consistent(q0, v0, jnp.array(True), is_determined(M, jnp.zeros((0, moving.size), M.dtype)))
 
-    def newton(q, multipliers):
+    def newton(carry, _):
+        q, multipliers = carry
         g, G = position_residual(flat, t, q)
         bend = jax.hessian(lambda q: multipliers @ flat.holonomic(t, q))(q)[both]
         curved = jnp.where(is_determined(M - bend, G[:, moving]), M - bend, M)
         step, multipliers, _ = saddle_point(curved, G[:, moving], M @ (q0 - q)[moving], -g)
-        return q.at[moving].add(step), multipliers, jnp.max(jnp.abs(step)), _off(g, G, q)
+        return (q.at[moving].add(step), multipliers), None
 
-    def unfinished(carry):
-        q, _, step, off, count = carry
-        return (count < 50) & jnp.isfinite(step) & ((step > tolerance * (1 + jnp.max(jnp.abs(q)))) | (off > tolerance))
-
-    def iterate(carry):
-        q, multipliers, _, _, count = carry
-        return *jax.lax.stop_gradient(newton(q, multipliers)), count + 1
-
-    far = jnp.asarray(jnp.finfo(q0.dtype).max, q0.dtype)
-    start = jnp.zeros(flat.holonomic(t, q0).size, q0.dtype)
-    carry = jax.lax.stop_gradient((q0, start, far, far))
-    q, multipliers, *_ = jax.lax.while_loop(unfinished, iterate, (*carry, 0))
-    (q, _), _ = jax.lax.scan(lambda carry, _: (newton(*carry)[:2], None), (q, multipliers), length=2)
+    start = q0, jnp.zeros(flat.holonomic(t, q0).size, q0.dtype)
+    (q, _), _ = jax.lax.scan(newton, start, length=NEWTON_STEPS)
 
     psi, G, _ = constraint_rows(flat, t, q, v0)
     nearest = saddle_point(inertia(flat, t, q, v0)[0][both], G[:, moving], jnp.zeros_like(v0[moving]), -psi)
@@ -162,7 +154,7 @@ def consistent_state(
     **Arguments:** the state `q`, `qdot` (one pytree structure), `params`, the time `t`; `fixed` lists coordinates whose position and
     velocity stay as given: keys where q is a mapping, indices where it is an array or a sequence. Any consistent units.
 
-    **Returns:** (q, qdot), structured like q; differentiable in every argument, up to third derivatives.
+    **Returns:** (q, qdot), structured like q; differentiable in every argument.
 
     **Raises:** `ValueError` where no such state was found, where inertia is missing, or where `fixed` names no coordinate.
     Under `jit` the state is NaN there.

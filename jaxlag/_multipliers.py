@@ -1,26 +1,13 @@
 """The constrained solve: x and λ of  M x = f + Gᵀλ,  G x = c."""
 
-import dataclasses
-from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-import numpy as np
-import optimistix as optx
-from jax.flatten_util import ravel_pytree
-from jaxtyping import Array, Bool, Float, PyTree
+from jaxtyping import Array, Bool, Float
 
-from ._checks import at_state, is_concrete
 from ._mechanics import applied_force, constraint_rows, inertia
-from ._system import Flat, System
-
-
-class Acceleration(NamedTuple):
-    """q̈, structured like q, and the multipliers λ by the constraint's name."""
-
-    qddot: PyTree
-    multipliers: dict[str, PyTree]
+from ._system import Flat
 
 
 class SaddlePoint(NamedTuple):
@@ -111,128 +98,29 @@ def constrained_acceleration(flat: Flat, t, q, v, feedback=None) -> SaddlePoint:
     _, G, gamma = constraint_rows(flat, t, q, v)
     c = -gamma if feedback is None else -gamma - feedback(flat, t, q, v)
     solved = lambda multipliers: saddle_point(M, G, inertial + applied_force(flat, t, q, v, multipliers), c)
-    free = solved(jnp.zeros(G.shape[0], v.dtype))
-    if not flat.needs_multipliers:
-        return free
-    return solved(_self_consistent(lambda multipliers: solved(multipliers).multipliers, free.multipliers))
+    multipliers = jnp.zeros(G.shape[0], v.dtype)
+    if flat.needs_multipliers:
+        multipliers = _self_consistent(lambda multipliers: solved(multipliers).multipliers, multipliers)
+    return solved(multipliers)
 
 
 def _self_consistent(reaction, start):
-    """λ = reaction(λ), where applied forces depend on the constraint forces they bring about."""
-    tolerance = jnp.finfo(start.dtype).eps ** 0.75
-    root = optx.root_find(
-        lambda multipliers, _: reaction(multipliers) - multipliers, optx.Newton(tolerance, tolerance), start, max_steps=50, throw=False
-    )
-    return root.value
+    """λ = reaction(λ) by Newton's method, where applied forces depend on the constraint forces they bring about.
 
-
-def acceleration(system: System, q: PyTree, qdot: PyTree, params: PyTree = None, *, t: Any = 0.0) -> Acceleration:
-    r"""Acceleration and multipliers of the constrained motion.
-
-    $$ M\ddot q = f + G^T\lambda, \qquad G\ddot q = -\gamma $$
-
-    λ > 0 pushes along +∇g. With redundant constraints q̈ and Gᵀλ are still unique, and λ is the one of least norm;
-    M may be singular where the constraints hold what it leaves free.
-
-    **Arguments:** the state `q`, `qdot` (one pytree structure), `params`, the time `t`. Any consistent units.
-
-    **Returns:** `Acceleration(qddot, multipliers)`: q̈ structured like q; λ by the constraint's name, structured like what g or a returns.
-
-    **Raises:** `ValueError` where a direction has no inertia and no constraint holds it. Under `jit` the result is NaN there.
-
-    **Source:** Hairer & Wanner, Solving Ordinary Differential Equations II, eqs. VII.1.46.
-
-    ```python
-    import jax.numpy as jnp
-    import jaxlag as jl
-    pendulum = jl.System(
-        lambda q, qdot, m, g: 0.5 * m * (qdot["r"] ** 2 + q["r"] ** 2 * qdot["phi"] ** 2) + m * g * q["r"] * jnp.cos(q["phi"]),
-        holonomic={"rod": lambda q, l: q["r"] - l},
-    )
-    state = {"r": 2.0, "phi": 0.0}, {"r": 0.0, "phi": 1.0}
-    jl.acceleration(pendulum, *state, {"m": 3.0, "g": 9.81, "l": 2.0}).multipliers["rod"]  # −m l φ̇² − m g cos φ = −35.43
-    ```
+    It is exact at once where the forces are linear in λ, as friction is. NaN where 1 − ∂reaction/∂λ has no positive determinant:
+    then no λ, or more than one, solves it (Painlevé's paradox; Genot & Brogliato, Eur. J. Mech. A 18 (1999) 653).
     """
-    result, determined = at_state(_acceleration, system, q, qdot, params, t)
-    if is_concrete(determined) and not determined:
-        raise ValueError(NO_INERTIA)
-    return result
+
+    def newton(multipliers, _):
+        slope = jnp.eye(start.size, dtype=start.dtype) - jax.jacfwd(reaction)(multipliers)
+        step = jnp.linalg.solve(slope, reaction(multipliers) - multipliers)
+        return jnp.where(jnp.linalg.det(slope) > 0, multipliers + step, jnp.nan), None
+
+    return jax.lax.scan(newton, start, length=NEWTON_STEPS)[0]
 
 
+NEWTON_STEPS = 3
 NO_INERTIA = (
     "`lagrangian` must give every direction inertia that no constraint holds, but the mass matrix is singular "
     "(or not positive) on the null space of the constraints. Add the missing mass, or a constraint."
 )
-
-
-def _acceleration(flat, t, q, v):
-    qddot, multipliers, determined = constrained_acceleration(flat, t, q, v)
-    multipliers = jnp.where(determined, multipliers, jnp.nan)
-    qddot = jnp.where(determined, qddot, jnp.nan)
-    return Acceleration(flat.unravel(qddot), flat.unravel_multipliers(multipliers)), determined
-
-
-def constraint_force(
-    system: System, q: PyTree, qdot: PyTree, params: PyTree = None, *, t: Any = 0.0, at: Callable | None = None
-) -> dict[str, PyTree]:
-    r"""Constraint forces by the constraint's name: generalized, λ ∂g/∂q (or λ ∂a/∂q̇), or as a force on a point.
-
-    $$ Q = \lambda\,\frac{\partial g}{\partial q}, \qquad F \cdot \delta x = Q \cdot \delta q \text{ for the point } x(t, q) $$
-
-    **Arguments:** as `acceleration`; `at`: the position map x(t, q) of a point, which receives the arguments it names.
-
-    **Returns:** Q structured like q; their sum is Gᵀλ. With `at`, F structured like x: the force at that point that does the same
-    virtual work, NaN where the constraint does not act through that point alone. With redundant constraints the sum is unique, its parts
-    are those of the λ of least norm. Any consistent units.
-
-    **Raises:** as `acceleration`.
-
-    **Source:** Goldstein, Classical Mechanics, 3rd ed., eqs. 2.24 and 1.49.
-
-    ```python
-    import jax.numpy as jnp
-    import jaxlag as jl
-    block = jl.System(
-        lambda q, qdot, m, g: 0.5 * m * qdot @ qdot - m * g * q[1], holonomic={"floor": lambda q: 2 * q[1]}
-    )
-    jl.constraint_force(block, jnp.zeros(2), jnp.zeros(2), {"m": 2.0, "g": 9.81})["floor"]  # [0, 19.62]
-    ```
-    """
-    force, determined = at_state(_ConstraintForce(at), system, q, qdot, params, t)
-    if is_concrete(determined) and not determined:
-        raise ValueError(NO_INERTIA)
-    return force
-
-
-@dataclasses.dataclass(frozen=True)
-class _ConstraintForce:
-    """The forces over flat vectors; compared by the point, so that it compiles once."""
-
-    at: Callable | None
-
-    def __call__(self, flat: Flat, t, q, v):
-        _, multipliers, determined = constrained_acceleration(flat, t, q, v)
-        _, G, _ = constraint_rows(flat, t, q, v)
-        forces = {name: multipliers[rows] @ G[rows] for name, rows in rows_by_name(flat, G.shape[0]).items()}
-        shown = flat.unravel if self.at is None else _force_on_point(flat, self.at, t, q)
-        return {name: shown(jnp.where(determined, Q, jnp.nan)) for name, Q in forces.items()}, determined
-
-
-def _force_on_point(flat, at, t, q):
-    """Q ↦ F with JᵀF = Q, J = ∂x/∂q."""
-    x, unravel = ravel_pytree(flat.position(at, t, q))
-    J = jax.jacobian(lambda q: ravel_pytree(flat.position(at, t, q))[0])(q)
-
-    def force(Q):
-        F = pseudo_inverse(J @ J.T) @ (J @ Q)
-        does_the_work = jnp.max(jnp.abs(J.T @ F - Q)) <= jnp.finfo(q.dtype).eps ** 0.5 * jnp.max(jnp.abs(Q))
-        return unravel(jnp.where(does_the_work, F, jnp.nan))
-
-    return force
-
-
-def rows_by_name(flat: Flat, m: int) -> dict[str, np.ndarray]:
-    """Which rows of G, and entries of λ, belong to which constraint."""
-    with jax.ensure_compile_time_eval():
-        rows = jax.tree.map(np.asarray, flat.unravel_multipliers(jnp.arange(m, dtype=float)))
-    return {name: np.concatenate([np.ravel(leaf) for leaf in jax.tree.leaves(rows[name])]).astype(int) for name in rows}

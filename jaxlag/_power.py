@@ -7,9 +7,10 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, PyTree
 
 from ._checks import at_state
+from ._friction import settled
 from ._mechanics import constraint_rows
-from ._multipliers import constrained_acceleration, rows_by_name
-from ._system import EXPLICIT_TIME, Flat, System
+from ._multipliers import constrained_acceleration
+from ._system import EXPLICIT_TIME, Flat, System, rows_by_name
 
 
 def powers(system: System, q: PyTree, qdot: PyTree, params: PyTree = None, *, t: Any = 0.0) -> dict[str, Float[Array, ""]]:
@@ -31,16 +32,22 @@ def powers(system: System, q: PyTree, qdot: PyTree, params: PyTree = None, *, t:
     jl.powers(car, 0.0, 2.0, {"m": 1.0, "b": 3.0, "F": 5.0})  # oil: −12, pull: 10, time: 0
     ```
     """
-    return at_state(powers_of, system, q, qdot, params, t)
+    return at_state(_powers, system, q, qdot, params, t)
+
+
+def _powers(flat, t, q, v):
+    return powers_of(settled(flat, t, q, v), t, q, v)
 
 
 def powers_of(flat: Flat, t, q, v) -> dict[str, Float[Array, ""]]:
     """The powers over flat vectors."""
     _, multipliers, _ = constrained_acceleration(flat, t, q, v)
     _, G, _ = constraint_rows(flat, t, q, v)
-    damped = {name: -v @ jax.grad(D, argnums=2)(t, q, v, multipliers) for name, D in flat.dissipations.items()}
+    does = lambda rows: multipliers[rows] @ (G[rows] @ v)
+    stuck = {name: does(rows) for name, rows in flat.held.items()}  # friction that holds on to something that moves
+    damped = {name: stuck.get(name, 0) - v @ jax.grad(D, argnums=2)(t, q, v, multipliers) for name, D in flat.dissipations.items()}
     forced = {name: v @ Q(t, q, v, multipliers) for name, Q in flat.forces.items()}
-    held = {name: multipliers[rows] @ (G[rows] @ v) for name, rows in rows_by_name(flat, G.shape[0]).items()}
+    held = {name: does(rows) for name, rows in rows_by_name(flat).items()}
     return damped | forced | held | {EXPLICIT_TIME: -jax.grad(flat.lagrangian, argnums=0)(t, q, v)}
 
 

@@ -6,6 +6,7 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, PyTree
 
@@ -135,6 +136,8 @@ class Flat(NamedTuple):
     needs_multipliers: bool
     holonomic_names: tuple[str, ...]
     terms: tuple[str, ...]
+    rows: int  # of G, those of the user's constraints
+    held: dict[str, np.ndarray] = {}  # noqa: RUF012 - rows of G beyond those, with which a dissipation term sticks
 
 
 def bind(system: System, like: PyTree, params: PyTree) -> Flat:
@@ -173,10 +176,10 @@ def bind(system: System, like: PyTree, params: PyTree) -> Flat:
         for slot in ("holonomic", "nonholonomic")
         for term in getattr(system, slot)
     ]
-    _, unravel_values = ravel_pytree([jax.tree.map(lambda s: jnp.zeros(s.shape, zero.dtype), shape) for shape in shapes])
+    no_multipliers, unravel_values = ravel_pytree([jax.tree.map(lambda s: jnp.zeros(s.shape, zero.dtype), shape) for shape in shapes])
 
     def unravel_multipliers(multipliers):
-        return dict(zip(system.constraints, unravel_values(multipliers), strict=True))
+        return dict(zip(system.constraints, unravel_values(multipliers[: no_multipliers.size]), strict=True))
 
     return Flat(
         lagrangian=lagrangian,
@@ -190,6 +193,7 @@ def bind(system: System, like: PyTree, params: PyTree) -> Flat:
         needs_multipliers=any(names(function, "multipliers") for _, function in (*system.dissipation, *system.force)),
         holonomic_names=tuple(name for name, _ in system.holonomic),
         terms=system.terms,
+        rows=no_multipliers.size,
     )
 
 
@@ -200,6 +204,13 @@ def ravel_like(zeros: PyTree, partial: PyTree) -> Float[Array, " n"]:
     for path in given:
         raise KeyError(jax.tree_util.keystr(path))
     return ravel_pytree(leaves)[0]
+
+
+def rows_by_name(flat: Flat) -> dict[str, np.ndarray]:
+    """Which rows of G, and entries of λ, belong to which constraint."""
+    with jax.ensure_compile_time_eval():
+        rows = jax.tree.map(np.asarray, flat.unravel_multipliers(jnp.arange(flat.rows, dtype=float)))
+    return {name: np.concatenate([np.ravel(leaf) for leaf in jax.tree.leaves(rows[name])]).astype(int) for name in rows}
 
 
 def leaf_names(tree: PyTree, bare: str = "q") -> tuple[str, ...]:

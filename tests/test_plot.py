@@ -12,7 +12,7 @@ import pytest
 
 import jaxlag as jl
 from jaxlag import plot
-from jaxlag._integrate import _Stated
+from jaxlag._trajectory import Stated
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
@@ -29,7 +29,7 @@ def close_figures():
 def motion(q):
     """A trajectory that was not simulated, so that the tests know every number of it."""
     samples = jax.tree.map(lambda start: jnp.stack([jnp.asarray(start + t) for t in TIMES]), q)
-    return jl.Trajectory(jnp.asarray(TIMES), samples, samples, samples, {}, jl.RESULTS.successful, {}, None, _Stated.of(None, {}))
+    return jl.Trajectory(jnp.asarray(TIMES), samples, samples, samples, {}, jl.RESULTS.successful, {}, None, {}, Stated.of(jl.System(lambda qdot: qdot), {}))
 
 
 def fitted(*residuals, of, sigma=0.5):

@@ -8,13 +8,15 @@ import re
 README = (pathlib.Path(__file__).parents[1] / "README.md").read_text()
 
 
-def test_the_example_prints_what_it_says():
-    (code, said), *others = re.findall(r"```python\n(.*?)```\n\n```text\n(.*?)```", README, re.S)
-    assert not others
-    out = io.StringIO()
-    with contextlib.redirect_stdout(out):
-        exec(code, {})
-    assert out.getvalue().strip() == said.strip()
+def test_the_examples_print_what_they_say():
+    examples = re.findall(r"```python\n(.*?)```\n\n```text\n(.*?)```", README, re.S)
+    assert len(examples) == README.count("```python")
+    names: dict = {}
+    for code, said in examples:
+        out = io.StringIO()
+        with contextlib.redirect_stdout(out):
+            exec(code, names)
+        assert out.getvalue().strip() == said.strip()
 
 
 def test_every_picture_and_notebook_it_links_to_exists():

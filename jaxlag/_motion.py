@@ -1,0 +1,217 @@
+"""The equations of motion as a first-order system, ready to be integrated.
+
+    y = (q, q̇, work of each term, σ of each slip, number of transitions, time stuck)
+
+Works are there where they were asked for, the last three where D has kinks.
+"""
+
+import dataclasses
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, PyTree
+
+from ._friction import (
+    Regularised,
+    StickSlip,
+    first_mode,
+    friction,
+    friction_by_term,
+    in_mode,
+    norms,
+    redirected,
+    settle,
+    sticking,
+)
+from ._kinks import Kinks, kinks_of
+from ._manifold import Baumgarte, NoStabilisation, Projection
+from ._multipliers import constrained_acceleration
+from ._power import energy_turnover, listed_powers
+from ._system import Flat, System, bind
+
+PROJECTION = "projection"  # how the work that projection does is named
+
+
+class Parts(NamedTuple):
+    """y, taken apart."""
+
+    q: Float[Array, " n"]
+    v: Float[Array, " n"]
+    works: Float[Array, " w"]
+    sigma: Float[Array, " r"]
+    transitions: Float[Array, " 0|1"]
+    time_stuck: Float[Array, " e"]
+
+
+class Start(NamedTuple):
+    """y at the start; whether a mode of friction agrees with its forces; whether no bound is negative."""
+
+    y: Float[Array, " y"]
+    has_mode: Bool[Array, ""]
+    has_bounds: Bool[Array, ""]
+
+
+class Sample(NamedTuple):
+    """One sample of a motion: what a `Trajectory` holds of it."""
+
+    q: PyTree
+    qdot: PyTree
+    qddot: PyTree
+    multipliers: dict[str, PyTree]
+    works: dict[str, Array] | None
+    friction: dict[str, tuple[Array, Array]]
+    counts: dict[str, Array]
+
+
+@dataclasses.dataclass(frozen=True)
+class Equations:
+    """ẏ and what else the integration asks for; `args` are (params, slack), slack the slip velocity that counts as rest at an event."""
+
+    system: System
+    like: tuple  # structure, shapes and dtype of q
+    stabilisation: Projection | Baumgarte | NoStabilisation
+    friction: StickSlip | Regularised
+    audit: bool
+    rows: int  # of slip velocities with dry friction
+    elements: int
+
+    @classmethod
+    def of(cls, system, q0, stabilisation, friction, audit, t, q, v, params) -> "Equations":
+        """Looks for dry friction at the start, in shapes alone."""
+        leaves, structure = jax.tree.flatten(q0)
+        like = structure, tuple((leaf.shape, leaf.dtype) for leaf in leaves)
+        equations = cls(system, like, stabilisation, friction, audit, 0, 0)
+        kinks = kinks_of(equations.flat(params), t, q, v) if isinstance(friction, StickSlip) else None
+        if kinks is None:
+            return equations
+        return dataclasses.replace(equations, rows=kinks.element_of_row.size, elements=kinks.elements)
+
+    def flat(self, params) -> Flat:
+        """The system over flat vectors."""
+        structure, shapes = self.like
+        return bind(self.system, jax.tree.unflatten(structure, [jax.ShapeDtypeStruct(*shape) for shape in shapes]), params)
+
+    def mode(self, t, q, v, sigma, params) -> tuple[Flat, Flat, Kinks | None]:
+        """The system, the system in the mode σ, and its kinks where there is dry friction."""
+        flat = self.flat(params)
+        if isinstance(self.friction, StickSlip) and self.rows == 0:
+            return flat, flat, None
+        kinks = kinks_of(flat, t, q, v)
+        if isinstance(self.friction, Regularised):
+            return flat, flat if kinks is None else self.friction.smooth(flat, kinks), None
+        return flat, in_mode(flat, kinks, sigma), kinks
+
+    @property
+    def works(self) -> tuple[str, ...]:
+        """Names of the works that are integrated."""
+        return (*self.system.terms, PROJECTION) if self.audit else ()
+
+    @property
+    def size(self) -> int:
+        """n, the number of coordinates."""
+        return sum(int(np.prod(shape)) for shape, _ in self.like[1])
+
+    def parts(self, y) -> Parts:
+        """y, taken apart."""
+        sizes = [self.size, self.size, len(self.works), self.rows, min(self.elements, 1)]
+        return Parts(*jnp.split(y, np.cumsum(sizes)))
+
+    @property
+    def projection(self) -> Projection | None:
+        """What puts steps back on the constraints, and on s = 0 where friction sticks, if anything has to."""
+        chosen = self.stabilisation if isinstance(self.stabilisation, Projection) else None
+        if self.rows:
+            return chosen or Projection()
+        return chosen if self.system.constraints else None
+
+    def start(self, t, q, v, params) -> Start:
+        """y at the start, on the constraints already."""
+        flat, _, kinks = self.mode(t, q, v, jnp.zeros(self.rows, q.dtype), params)
+        works = jnp.zeros(len(self.works), q.dtype)
+        if kinks is None:
+            return Start(jnp.concatenate([q, v, works]), jnp.array(True), jnp.array(True))
+        mode = first_mode(flat, kinks, t, q, v)
+        y = jnp.concatenate([q, v, works, mode.sigma, jnp.zeros(1 + self.elements, q.dtype)])
+        return Start(self.kept(t, y, (params, None)), mode.consistent, ~jnp.any(mode.bound < 0))
+
+    def rates(self, t, y, args):
+        """ẏ."""
+        return _rates(self, t, y, args[0])
+
+    def kept(self, t, y, args):
+        """y, put back on the constraints."""
+        return _kept(self, t, y, args[0])
+
+    def margins(self, t, y, args):
+        """Per element of dry friction, how far its mode is from its end; negative beyond."""
+        return _margins(self, t, y, args[0])
+
+    def changed(self, t, y, args, ended):
+        """y in the mode that follows where the modes of the elements `ended` have; whether there is one; whether slip has come to rest."""
+        params, slack = args
+        q, v, works, sigma, transitions, time_stuck = self.parts(y)
+        flat, _, kinks = self.mode(t, q, v, sigma, params)
+        stuck, slow = sticking(kinks, sigma), norms(kinks, kinks.slip(t, q, v)) <= slack
+        mode = settle(flat, kinks, t, q, v, sigma, stuck | ended | slow, ended & stuck)
+        changes = jnp.sum(norms(kinks, mode.sigma - sigma) > 0.5)
+        y = jnp.concatenate([q, v, works, mode.sigma, transitions + changes, time_stuck])
+        return self.kept(t, y, args), mode.consistent, jnp.all(~ended | stuck | slow)
+
+    def exhausted(self, y):
+        """Whether there were more transitions than allowed."""
+        return self.parts(y).transitions[0] > self.friction.max_transitions
+
+    def sample(self, t, y, params) -> Sample:
+        """One sample, from y on the constraints."""
+        q, v, works, sigma, transitions, time_stuck = self.parts(y)
+        flat, mode, kinks = self.mode(t, q, v, sigma, params)
+        feedback, rubbing, counts = self.stabilisation.feedback(), {}, {}
+        if kinks is None:
+            qddot, multipliers, _ = constrained_acceleration(mode, t, q, v, feedback)
+        else:
+            found = friction(flat, kinks, sigma, t, q, v, feedback)
+            qddot, multipliers = found.qddot, found.multipliers
+            rubbing = friction_by_term(kinks, sigma, t, q, v, found)
+            counts = {"transitions": transitions[0], "time_stuck": time_stuck}
+        named = dict(zip(self.works, works, strict=True)) if self.audit else None
+        unraveled = flat.unravel(q), flat.unravel(v), flat.unravel(qddot), flat.unravel_multipliers(multipliers)
+        return Sample(*unraveled, named, rubbing, counts)
+
+
+@eqx.filter_jit  # so that diffrax's many calls trace it once
+def _rates(equations: Equations, t, y, params):
+    q, v, works, sigma, transitions, time_stuck = equations.parts(y)
+    _, mode, kinks = equations.mode(t, q, v, sigma, params)
+    qddot = constrained_acceleration(mode, t, q, v, equations.stabilisation.feedback()).x
+    powers = listed_powers(mode, t, q, v) if equations.audit else works
+    stuck = time_stuck if kinks is None else sticking(kinks, sigma).astype(y.dtype)
+    return jnp.concatenate([v, qddot, powers, 0 * sigma, 0 * transitions, stuck])
+
+
+@eqx.filter_jit
+def _margins(equations: Equations, t, y, params):
+    q, v, _, sigma, *_ = equations.parts(y)
+    flat, _, kinks = equations.mode(t, q, v, sigma, params)
+    return friction(flat, kinks, sigma, t, q, v).margin
+
+
+@eqx.filter_jit
+def _kept(equations: Equations, t, y, params):
+    q, v, works, sigma, *counts = equations.parts(y)
+    _, mode, kinks = equations.mode(t, q, v, sigma, params)
+    on_q, on_v = equations.projection.project(mode, t, q, v)
+    if equations.audit:
+        lift = energy_turnover(mode, t, on_q, on_v)[0] - energy_turnover(mode, t, q, v)[0]
+        works = works.at[equations.works.index(PROJECTION)].add(lift)
+    if kinks is not None:
+        sigma = jax.lax.stop_gradient(redirected(kinks, sigma, kinks.slip(t, on_q, on_v)))
+    return jnp.concatenate([on_q, on_v, works, sigma, *counts])
+
+
+def slack_of(tolerances: tuple[Any, Any], v) -> Any:
+    """The slip velocity that counts as rest where another element changes its mode: ten times the tolerance of the integration."""
+    rtol, atol = tolerances
+    return 10 * (rtol * jnp.max(jnp.abs(v)) + atol)

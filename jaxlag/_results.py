@@ -1,0 +1,39 @@
+"""Why a motion ended."""
+
+from typing import Any
+
+import diffrax as dfx
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+
+from ._manifold import IMPOSSIBLE
+from ._multipliers import NO_INERTIA
+
+
+class RESULTS(dfx.RESULTS):  # pyright: ignore
+    """Why a motion ended: the reasons of diffrax, and those of mechanics."""
+
+    not_finite = "`q0`, `qdot0`, `ts` and `params` must be finite, but there is a NaN or an infinity among them. Look for missing values."
+    no_inertia = NO_INERTIA
+    impossible_start = IMPOSSIBLE
+    negative_bound = "`dissipation` must have bounds of friction that are not negative, but one is. Take `jnp.abs` of a normal force."
+    no_friction = (
+        "no sliding and no sticking agrees with the friction forces it brings about, or more than one does (Painlevé's paradox). "
+        "Lower the coefficient of friction, or give the contact its compliance."
+    )
+    chattering = (
+        "friction changed between sliding and sticking more than `max_transitions` times: it chatters. "
+        "Allow more by `friction=StickSlip(max_transitions=...)`, or smooth it by `friction=Regularised(width)`."
+    )
+
+
+OF_THE_INPUT = (RESULTS.not_finite, RESULTS.no_inertia, RESULTS.impossible_start, RESULTS.negative_bound)
+
+
+def reason_of(result: Any) -> str:
+    """What a result says; of a batch, what the first failure says."""
+    successful: Any = RESULTS.successful
+    failed = np.ravel(result._value)[np.ravel(result != successful)]
+    one = eqx.tree_at(lambda r: r._value, successful, jnp.asarray(failed[0])) if failed.size else successful
+    return RESULTS[one]  # type: ignore[misc]

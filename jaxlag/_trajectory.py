@@ -1,0 +1,119 @@
+"""A motion at sample times: its states, forces, energies and works."""
+
+import functools
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.flatten_util import ravel_pytree
+from jaxtyping import Array, Bool, Float, PyTree
+
+from ._checks import is_concrete
+from ._power import energy_turnover
+from ._results import RESULTS, reason_of
+from ._system import Flat, System, bind, leaf_names
+
+
+class Stated(eqx.Module):
+    """The system and params of a motion; what is no array in params is kept aside, so that batches of motions are arrays alone."""
+
+    numbers: list[Array]
+    system: System = eqx.field(static=True)
+    rest: tuple = eqx.field(static=True)
+
+    @classmethod
+    def of(cls, system: System, params: PyTree) -> "Stated":
+        leaves, structure = jax.tree.flatten(params)
+        numbers = [leaf for leaf in leaves if eqx.is_array(leaf)]
+        return cls(numbers, system, (structure, tuple(None if eqx.is_array(leaf) else leaf for leaf in leaves)))
+
+    def flat(self, like: PyTree) -> Flat:
+        structure, others = self.rest
+        numbers = iter(self.numbers)
+        leaves = [next(numbers) if other is None else other for other in others]
+        return bind(self.system, like, jax.tree.unflatten(structure, leaves))
+
+
+class Rubbing(eqx.Module):
+    """Dry friction along a motion: the `force` on each slip velocity, within its bound also while it sticks, and whether it is `sticking`."""
+
+    force: Float[Array, "..."]
+    sticking: Bool[Array, "..."]
+
+
+class Trajectory(eqx.Module):
+    """A motion at sample times: each field has the samples as its first axis.
+
+    - `ts`: the times; `q`, `qdot`, `qddot`: structured like q0; `multipliers`: λ by the constraint's name.
+    - `result`: `RESULTS.successful`, or the reason of failure; samples that were not reached are NaN.
+    - `friction`: by the name of the dissipation term, the `force` on its slip velocities and whether they are `sticking`.
+    - `works`: what `work()` returns, where the motion was computed with `audit=True`.
+    - `stats`: `num_steps`, `num_accepted_steps`, `num_rejected_steps`, and `start_moved`, how far the start was projected.
+    """
+
+    ts: Float[Array, " T"]
+    q: PyTree
+    qdot: PyTree
+    qddot: PyTree
+    multipliers: dict[str, PyTree]
+    result: RESULTS
+    stats: dict[str, Any]
+    works: dict[str, Float[Array, " T"]] | None
+    friction: dict[str, Rubbing]
+    stated: Stated
+
+    @property
+    def succeeded(self) -> Any:
+        """Whether the motion was computed to its end."""
+        return self.result == RESULTS.successful
+
+    def energy(self) -> Float[Array, " T"]:
+        """The energy h = q̇ · ∂L/∂q̇ − L at the samples; T + V where L = T − V with T quadratic in q̇."""
+        return self._energy_turnover()[0]
+
+    def work(self) -> dict[str, Float[Array, " T"]]:
+        """Work since the start of each dissipation term, force and constraint by its name, of explicit time in L (`"time"`), and of the
+        projection (`"projection"`). Integrated along with the motion: needs `simulate(..., audit=True)`.
+        """
+        if self.works is None:
+            raise ValueError(
+                "the motion must be computed with its works, but was computed without. Ask for them by `simulate(..., audit=True)`."
+            )
+        return self.works
+
+    def balance(self) -> Float[Array, " T"]:
+        """Residual of the energy balance, ΔE − ΣW, as a fraction of the energy turned over: the largest q̇ · ∂L/∂q̇ and all works."""
+        energy, turned = self._energy_turnover()
+        works = jnp.stack(list(self.work().values()))
+        scale = jnp.nanmax(jnp.abs(turned)) + jnp.nansum(jnp.nanmax(jnp.abs(works), axis=1))
+        return (energy - energy[0] - jnp.sum(works, axis=0)) / jnp.where(scale > 0, scale, 1)
+
+    def _energy_turnover(self):
+        q, v = (jax.vmap(lambda leaf: ravel_pytree(leaf)[0])(tree) for tree in (self.q, self.qdot))
+        flat = self.stated.flat(jax.tree.map(lambda leaf: leaf[0], self.q))
+        return jax.vmap(functools.partial(energy_turnover, flat))(self.ts, q, v)
+
+    def __repr__(self) -> str:
+        if not is_concrete(self):
+            return "Trajectory(traced)"
+        batch = self.ts.shape[:-1]
+        rows = [("coordinates", ", ".join(leaf_names(self.q)))]
+        if self.multipliers:
+            rows.append(("constraints", ", ".join(self.multipliers)))
+        steps, rejected = (np.asarray(self.stats[key]) for key in ("num_steps", "num_rejected_steps"))
+        rows.append(("steps", f"{steps.max()}, {rejected.max()} of them rejected" + (" (the most in the batch)" if batch else "")))
+        if self.multipliers:
+            rows.append(("start moved by", f"{np.max(self.stats['start_moved']):.2g}"))
+        if self.friction:
+            transitions, stuck = np.asarray(self.stats["transitions"])[..., -1], np.asarray(self.stats["time_stuck"])[..., -1, :]
+            most = " (the most in the batch)" if batch else ""
+            rows.append(("friction", f"{int(transitions.max())} transitions, stuck for {stuck.max():.4g}{most}"))
+        if self.works is not None:
+            residual = self.balance() if not batch else jax.vmap(lambda motion: motion.balance())(self)
+            rows.append(("energy balance", f"off by {np.nanmax(np.abs(residual)):.1e} of the energy turned over"))
+        rows.append(("result", "successful" if np.all(self.succeeded) else reason_of(self.result)))
+        of = f"{' × '.join(map(str, batch))} motions of " if batch else ""
+        head = f"Trajectory: {of}{self.ts.shape[-1]} samples, t = {np.min(self.ts):g} … {np.max(self.ts):g}"
+        return "\n".join([head, *(f"  {name:<15}{value}" for name, value in rows)])
