@@ -237,16 +237,16 @@ def test_two_blocks_on_a_shaken_floor():
     )
     ts = np.linspace(0, 10, 101)
     motion = jl.simulate(blocks, {"a": 0.0, "b": 0.0}, {"a": 1.0, "b": 0.0}, ts, {"F1": 3.5, "F2": 1.0}, audit=True, **SHARP)
-    steep = lambda s: s / np.sqrt(s**2 + 1e-10)
+    steep = lambda s: s / np.sqrt(s**2 + 1e-14)
 
     def rates(t, y):
         floor, between = 3.5 * steep(y[2] - np.cos(2 * t)), 1.0 * steep(y[3] - y[2])
         return [y[2], y[3], (-floor + between) / 2, -between]
 
     with np.errstate(over="ignore"):  # in trial steps of the implicit method
-        reference = solve_ivp(rates, (0, 10), [0, 0, 1, 0], method="Radau", t_eval=ts, rtol=1e-8, atol=1e-10).y
-    np.testing.assert_allclose(motion.q["a"], reference[0], atol=2e-4)
-    np.testing.assert_allclose(motion.q["b"], reference[1], atol=2e-4)
+        reference = solve_ivp(rates, (0, 10), [0, 0, 1, 0], method="Radau", t_eval=ts, rtol=1e-10, atol=1e-12).y
+    np.testing.assert_allclose(motion.q["a"], reference[0], atol=1e-5)  # it creeps: the difference is proportional to the width 1e-7
+    np.testing.assert_allclose(motion.q["b"], reference[1], atol=1e-5)  # it creeps: the difference is proportional to the width 1e-7
     assert motion.stats["transitions"][-1] >= 8
     assert np.max(np.abs(motion.balance())) < 1e-7
     for name, bound in (("floor", 3.5), ("between", 1.0)):
