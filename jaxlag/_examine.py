@@ -114,7 +114,10 @@ def _findings(numbers, no_inertia, dtype):
                 yield f"the {what} is off constraint {name!r} by {value:.2g}: `consistent_state` puts it right, `simulate` does by itself"
     for name, least in numbers["dissipated"].items():
         if least < 0:
-            yield f"dissipation {name!r} feeds energy in near this state (q̇·∂D/∂q̇ = {least:.2g}): right for wind or a moving belt, else look at its sign"
+            yield (
+                f"dissipation {name!r} feeds energy in near this state (q̇·∂D/∂q̇ = {least:.2g}): "
+                "right for wind or a moving belt, else look at its sign"
+            )
     fastest, slowest = numbers["time_constants"]
     if np.isfinite(slowest) and slowest > 1e4 * fastest:
         yield f"the motion is stiff (time constants from {fastest:.2g} to {slowest:.2g}): take `solver=diffrax.Kvaerno5()`"

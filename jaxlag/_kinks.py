@@ -32,8 +32,11 @@ class Kinks(NamedTuple):
     @property
     def own_rows(self) -> dict[str, np.ndarray]:
         """The rows of each term, those that stand in several with the first alone."""
-        seen: set[int] = set()
-        return {name: np.asarray([r for r in rows if not (r in seen or seen.add(r))], int) for name, rows in self.rows_of_term.items()}
+        own, seen = {}, np.zeros(0, int)
+        for name, rows in self.rows_of_term.items():
+            own[name] = np.setdiff1d(rows, seen)
+            seen = np.union1d(seen, rows)
+        return own
 
 
 def kinks_of(flat: Flat, t, q, v) -> Kinks | None:

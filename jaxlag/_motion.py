@@ -102,6 +102,7 @@ class Equations:
         kinks = kinks_of(flat, t, q, v)
         if isinstance(self.friction, Regularised):
             return flat, flat if kinks is None else self.friction.smooth(flat, kinks), None
+        assert kinks is not None  # rows were counted from them
         return flat, in_mode(flat, kinks, sigma), kinks
 
     @property
@@ -195,6 +196,7 @@ def _rates(equations: Equations, t, y, params):
 def _margins(equations: Equations, t, y, params):
     q, v, _, sigma, *_ = equations.parts(y)
     flat, _, kinks = equations.mode(t, q, v, sigma, params)
+    assert kinks is not None  # asked of systems with dry friction alone
     return friction(flat, kinks, sigma, t, q, v).margin
 
 
@@ -202,6 +204,7 @@ def _margins(equations: Equations, t, y, params):
 def _kept(equations: Equations, t, y, params):
     q, v, works, sigma, *counts = equations.parts(y)
     _, mode, kinks = equations.mode(t, q, v, sigma, params)
+    assert equations.projection is not None  # asked where there is something to keep
     on_q, on_v = equations.projection.project(mode, t, q, v)
     if equations.audit:
         lift = energy_turnover(mode, t, on_q, on_v)[0] - energy_turnover(mode, t, q, v)[0]

@@ -37,7 +37,7 @@ class Stated(eqx.Module):
 
 
 class Rubbing(eqx.Module):
-    """Dry friction along a motion: the `force` on each slip velocity, within its bound also while it sticks, and whether it is `sticking`."""
+    """Dry friction along a motion: the `force` on each slip velocity, also while it sticks, and whether it is `sticking`."""
 
     force: Float[Array, "..."]
     sticking: Bool[Array, "..."]

@@ -38,6 +38,9 @@ BESIDE = ["dissipation", "_entries"]  # these need nothing of the package
 PUBLIC = [name for name in vars(jaxlag) if not name.startswith("_") and callable(getattr(jaxlag, name))]
 
 
+HOMES = [("diffrax", {"_results", "_steps", "_integrate"}), ("matplotlib", {"plot"}), ("optimistix", {"_identify"})]
+
+
 def _imported(file):
     for node in ast.walk(ast.parse(file.read_text())):
         if isinstance(node, ast.ImportFrom) and node.level == 1:
@@ -53,7 +56,7 @@ def test_every_file_has_its_place():
     assert {f.stem for f in PACKAGE.glob("*.py")} - {"__init__", "__main__"} == set(ORDER + BESIDE)
 
 
-@pytest.mark.parametrize("library, home", [("diffrax", {"_results", "_steps", "_integrate"}), ("matplotlib", {"plot"}), ("optimistix", {"_identify"})])
+@pytest.mark.parametrize("library, home", HOMES)
 def test_a_library_has_one_home(library, home):
     users = {f.stem for f in PACKAGE.glob("*.py") if re.search(rf"^\s*(import|from) {library}", f.read_text(), re.M)}
     assert users <= home

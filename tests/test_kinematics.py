@@ -168,7 +168,7 @@ def test_a_reaction_as_a_force_on_a_point():
     v = {"x": -0.6 * np.sin(phi) * w, "y": 0.6 * np.cos(phi) * w, "phi": w}
     alpha = -1.5 * 9.81 / 1.2 * np.cos(phi)  # m L²/3 φ̈ = −m g L/2 cos φ
     centre = 0.6 * np.array([-alpha * np.sin(phi) - w**2 * np.cos(phi), alpha * np.cos(phi) - w**2 * np.sin(phi)])
-    expected = 2.0 * (centre + [0, 9.81])
+    expected = 2.0 * (centre + np.array([0, 9.81]))
     np.testing.assert_allclose(jl.constraint_force(rod, q, v, p, at=hinge)["hinge"], expected, rtol=1e-12)
     generalized = jl.constraint_force(rod, q, v, p)["hinge"]
     np.testing.assert_allclose([generalized["x"], generalized["y"]], expected, rtol=1e-12)

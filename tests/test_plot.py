@@ -29,7 +29,8 @@ def close_figures():
 def motion(q):
     """A trajectory that was not simulated, so that the tests know every number of it."""
     samples = jax.tree.map(lambda start: jnp.stack([jnp.asarray(start + t) for t in TIMES]), q)
-    return jl.Trajectory(jnp.asarray(TIMES), samples, samples, samples, {}, jl.RESULTS.successful, {}, None, {}, Stated.of(jl.System(lambda qdot: qdot), {}))
+    stated = Stated.of(jl.System(lambda qdot: qdot), {})
+    return jl.Trajectory(jnp.asarray(TIMES), samples, samples, samples, {}, jl.RESULTS.successful, {}, None, {}, stated)
 
 
 def fitted(*residuals, of, sigma=0.5):
