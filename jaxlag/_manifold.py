@@ -74,8 +74,6 @@ class Baumgarte:
 
         return residual
 
-    project = None
-
 
 @dataclasses.dataclass(frozen=True)
 class NoStabilisation:
@@ -90,8 +88,6 @@ class NoStabilisation:
     def feedback(self):
         """None: the accelerations stay as they are."""
         return None
-
-    project = None
 
 
 NEWTON_STEPS = 16  # a fixed number is one loop to compile; near the constraints four do

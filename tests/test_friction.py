@@ -352,3 +352,40 @@ def test_second_derivatives_of_a_stopping_point():
     stop = lambda v0, F: jl.simulate(block, 0.0, v0, [0.0, 10.0], {"F": F}, **SHARP).q[-1]
     exact = lambda v0, F: v0**2 / (2 * F)
     np.testing.assert_allclose(jax.hessian(stop, (0, 1))(2.0, 0.7), jax.hessian(exact, (0, 1))(2.0, 0.7), rtol=1e-6)
+
+
+def test_the_capstan():
+    """A rope over a rough drum, half a turn: it slides steadily where one end pulls e^{μπ} times as hard as the other.
+
+    Of N nodes, each turns the rope by δ = π/N and takes (cos δ/2 + μ sin δ/2) / (cos δ/2 − μ sin δ/2) of the pull, which tends to e^{μδ}.
+    """
+    N, mu, m2 = 6, 0.35, 1.3
+    angles = np.pi * (np.arange(N) + 0.5) / N
+    ring = np.stack([np.cos(angles), np.sin(angles)], axis=1)
+    nodes = np.concatenate([ring[:1] - [[0, 2.0]], ring, ring[-1:] - [[0, 2.0]]])
+    along = np.stack([np.sin(angles), -np.cos(angles)], axis=1)  # the rope runs to the heavy end, at angle 0
+
+    def drum(q):
+        return jnp.sqrt(jnp.sum(q[1:-1] ** 2, axis=1)) - 1
+
+    def rope(q):
+        return jnp.sqrt(jnp.sum((q[1:] - q[:-1]) ** 2, axis=1)) - np.sqrt(np.sum((nodes[1:] - nodes[:-1]) ** 2, axis=1))
+
+    def rubbing(q, qdot, multipliers, mu):
+        across = jnp.stack([q[1:-1, 1], -q[1:-1, 0]], axis=1)
+        return mu * jnp.sum(jnp.abs(multipliers["drum"]) * jnp.abs(jnp.sum(across * qdot[1:-1], axis=1)))
+
+    system = jl.System(
+        lambda q, qdot, m: jnp.sum(m[:, None] * (0.5 * qdot**2 - G * q * jnp.array([[0.0, 1.0]]))),
+        dissipation={"drum friction": rubbing},
+        holonomic={"drum": drum, "rope": rope},
+    )
+    pulls = lambda N: ((1 + mu * np.tan(np.pi / N / 2)) / (1 - mu * np.tan(np.pi / N / 2))) ** N
+    np.testing.assert_allclose(pulls(10_000), np.exp(mu * np.pi), rtol=1e-7)
+    half, ratio = np.pi / N / 2, pulls(N)
+    crawl = 1e-8 * np.concatenate([[[0, -np.cos(half)]], along, [[0, np.cos(half)]]])
+    run = lambda m1: jl.acceleration(system, nodes, crawl, {"m": np.r_[m1, np.full(N, 1e-9), m2], "mu": mu})
+    steady = run(m2 * ratio)
+    np.testing.assert_allclose(steady.qddot[:, 1], 0, atol=1e-6)
+    np.testing.assert_allclose(np.asarray(steady.multipliers["rope"])[[0, -1]], [-m2 * ratio * G, -m2 * G], rtol=1e-6)
+    assert run(1.1 * m2 * ratio).qddot[0, 1] < -0.1  # heavier, it runs down
