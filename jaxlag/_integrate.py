@@ -119,7 +119,7 @@ def _simulate(system, how, q0, qdot0, ts, params, tolerances):
     ys, (result, stats) = run((t0, q, v, params, tolerances), ts)
     q, qdot, qddot, multipliers, works, rubbing, counts = jax.vmap(lambda t, y: equations.sample(t, y, params))(ts, ys)
     rubbing = {name: Rubbing(*of_term) for name, of_term in rubbing.items()}
-    return Trajectory(ts, q, qdot, qddot, multipliers, result, stats | counts, works, rubbing, Stated.of(system, params))
+    return Trajectory(ts, q, qdot, qddot, multipliers, result, stats | counts, works, rubbing, Stated.of(system, params, how.friction))
 
 
 def _motion(equations, how, adjoint, inputs, ts):

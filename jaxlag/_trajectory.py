@@ -11,23 +11,27 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float, PyTree
 
 from ._checks import is_concrete
+from ._friction import Regularised, StickSlip
 from ._power import energy_turnover
 from ._results import RESULTS, reason_of
 from ._system import Flat, System, bind, leaf_names
 
 
 class Stated(eqx.Module):
-    """The system and params of a motion; what is no array in params is kept aside, so that batches of motions are arrays alone."""
+    """The system and params of a motion, and how friction was taken. What is no array in params is kept aside, so that batches of
+    motions are arrays alone.
+    """
 
     numbers: list[Array]
     system: System = eqx.field(static=True)
     rest: tuple = eqx.field(static=True)
+    friction: StickSlip | Regularised = eqx.field(static=True)
 
     @classmethod
-    def of(cls, system: System, params: PyTree) -> "Stated":
+    def of(cls, system: System, params: PyTree, friction: StickSlip | Regularised = StickSlip()) -> "Stated":
         leaves, structure = jax.tree.flatten(params)
         numbers = [leaf for leaf in leaves if eqx.is_array(leaf)]
-        return cls(numbers, system, (structure, tuple(None if eqx.is_array(leaf) else leaf for leaf in leaves)))
+        return cls(numbers, system, (structure, tuple(None if eqx.is_array(leaf) else leaf for leaf in leaves)), friction)
 
     def flat(self, like: PyTree) -> Flat:
         structure, others = self.rest
@@ -110,6 +114,8 @@ class Trajectory(eqx.Module):
             transitions, stuck = np.asarray(self.stats["transitions"])[..., -1], np.asarray(self.stats["time_stuck"])[..., -1, :]
             most = " (the most in the batch)" if batch else ""
             rows.append(("friction", f"{int(transitions.max())} transitions, stuck for {stuck.max():.4g}{most}"))
+        if isinstance(self.stated.friction, Regularised):
+            rows.append(("friction", f"made smooth below a slip velocity of {self.stated.friction.width:g}, where it creeps"))
         if self.works is not None:
             residual = self.balance() if not batch else jax.vmap(lambda motion: motion.balance())(self)
             rows.append(("energy balance", f"off by {np.nanmax(np.abs(residual)):.1e} of the energy turned over"))
