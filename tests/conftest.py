@@ -11,6 +11,13 @@ with install_import_hook("jaxlag", "beartype.beartype"):
     import jaxlag  # noqa: F401
 
 
+@pytest.fixture(autouse=True, scope="module")
+def fresh_caches():
+    """Lets go of what a file has compiled: each program holds memory maps, of which a process may have some 65 000 only."""
+    yield
+    jax.clear_caches()
+
+
 @pytest.fixture
 def single_precision():
     jax.config.update("jax_enable_x64", False)

@@ -34,7 +34,7 @@ ORDER = [
     "_identify",
     "plot",
 ]
-BESIDE = ["dissipation", "_entries"]  # these need nothing of the package
+BESIDE = ["dissipation"]  # needs nothing of the package
 PUBLIC = [name for name in vars(jaxlag) if not name.startswith("_") and callable(getattr(jaxlag, name))]
 
 
