@@ -4,6 +4,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from ._mechanics import applied_force, constraint_rows, inertia
@@ -18,6 +19,7 @@ class SaddlePoint(NamedTuple):
     determined: Bool[Array, ""]
 
 
+@jax.custom_jvp
 def saddle_point(M: Float[Array, "n n"], G: Float[Array, "m n"], f, c) -> SaddlePoint:
     """The unique x and the λ of least norm with M x = f + Gᵀλ and G x = c.
 
@@ -26,12 +28,43 @@ def saddle_point(M: Float[Array, "n n"], G: Float[Array, "m n"], f, c) -> Saddle
     factorisation and the pseudo-inverse of the small matrix S = G (M + GᵀWG)⁻¹ Gᵀ serve every case.
     Source: Benzi, Golub & Liesen, Numerical solution of saddle point problems, Acta Numerica 2005, sections 5 and 6.
     """
+    solve, _, determined = _solver(M, G)
+    return SaddlePoint(*solve(f, c), determined)
+
+
+@saddle_point.defjvp
+def _saddle_point_jvp(primals, tangents):
+    """One more solve:  M dx = df − dM x + dGᵀλ + Gᵀdλ,  G dx = dc − dG x.
+
+    Through the formula, the derivative of the pseudo-inverse would cancel where a mechanism passes a singular position.
+    """
+    (M, G, f, c), (dM, dG, df, dc) = primals, tangents
+    x, multipliers, determined = saddle_point(M, G, f, c)
+    solve, turned, _ = _solver(M, G)
+    dx, d_multipliers = solve(df + dG.T @ multipliers - dM @ x, dc - dG @ x)
+    return SaddlePoint(x, multipliers, determined), SaddlePoint(
+        dx, d_multipliers + turned(dG, multipliers), np.zeros(jnp.shape(determined), jax.dtypes.float0)
+    )
+
+
+def _solver(M, G):
+    """(f, c) ↦ (x, λ); (dG, λ) ↦ how λ turns with the null space of Gᵀ to stay of least norm; whether M is positive there."""
     augmented, W = _augmented(M, G)
     factor = jnp.linalg.cholesky(jax.lax.stop_gradient(augmented))
-    X = _solve(augmented, factor, jnp.column_stack([f + G.T @ (W * c), G.T]))
-    free, mobility = X[:, 0], X[:, 1:]
-    multipliers = pseudo_inverse(G @ mobility) @ (c - G @ free)
-    return SaddlePoint(free + mobility @ multipliers, multipliers, _is_positive(factor, augmented))
+    mobility = _solve(augmented, factor, G.T)
+    S = G @ mobility
+    inverse = pseudo_inverse(S)
+
+    def solve(f, c):
+        free = _solve(augmented, factor, (f + G.T @ (W * c))[:, None])[:, 0]
+        multipliers = inverse @ (c - G @ free)
+        return free + mobility @ multipliers, multipliers
+
+    def turned(dG, multipliers):
+        change = dG @ (mobility @ (inverse @ multipliers))
+        return change - S @ (inverse @ change)
+
+    return solve, turned, _is_positive(factor, augmented)
 
 
 def is_determined(M: Float[Array, "n n"], G: Float[Array, "m n"]) -> Bool[Array, ""]:
