@@ -29,7 +29,8 @@ def saddle_point(M: Float[Array, "n n"], G: Float[Array, "m n"], f, c) -> Saddle
     Source: Benzi, Golub & Liesen, Numerical solution of saddle point problems, Acta Numerica 2005, sections 5 and 6.
     """
     solve, _, determined = _solver(M, G)
-    return SaddlePoint(*solve(f, c), determined)
+    x, multipliers = solve(f, c)
+    return SaddlePoint(x, multipliers, determined)
 
 
 @saddle_point.defjvp
