@@ -93,7 +93,6 @@ class StickSlipSolver(Kept):
 
     The end of the mode is bracketed on the dense output, located by bisection, and made exact by Newton's step on the step itself,
     so that it is differentiated. From there the step goes on in the new mode. A step with a second end is rejected.
-
     """
 
     equations: Equations = eqx.field(static=True)
