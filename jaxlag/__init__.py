@@ -1,10 +1,23 @@
 """Differentiable mechanics: from energies, dissipation functions and constraints to motions and identified machines."""
 
-from . import dissipation as dissipation
+from . import dissipation as dissipation, learnt as learnt
 from ._acceleration import Acceleration as Acceleration, acceleration as acceleration, constraint_force as constraint_force
 from ._examine import Examination as Examination, examine as examine
 from ._friction import Regularised as Regularised, StickSlip as StickSlip
-from ._identify import Experiment as Experiment, Fit as Fit, fit as fit
+from ._assess import (
+    Comparison as Comparison,
+    Information as Information,
+    Validation as Validation,
+    compare as compare,
+    information as information,
+    validate as validate,
+)
+from ._experiment import Experiment as Experiment
+from ._fit import Fit as Fit, Interval as Interval, Prediction as Prediction
+from ._identify import fit as fit, fit_each as fit_each
+from ._prediction import Huber as Huber
+from ._quality import Channel as Channel
+from ._regress import Regression as Regression, regress as regress
 from ._integrate import simulate as simulate
 from ._kinematics import rate as rate, substitute as substitute, virtual_work as virtual_work
 from ._manifold import (
@@ -23,5 +36,6 @@ from ._mechanics import (
 )
 from ._power import powers as powers
 from ._results import RESULTS as RESULTS
+from ._signal import Signal as Signal
 from ._system import System as System
 from ._trajectory import Rubbing as Rubbing, Trajectory as Trajectory

@@ -1,177 +1,76 @@
 """Identification: parameters of a real machine from recordings of its motion, with standard errors."""
 
-import sys
-from collections.abc import Callable, Mapping, Sequence
+import dataclasses
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-import optimistix as optx
-from jax.flatten_util import ravel_pytree
-from jaxtyping import Array, Float, PyTree
+import optax
+from jaxtyping import PyTree
 
-from ._arguments import call
-from ._checks import is_concrete, is_vector, parameters, sample_times, state
-from ._integrate import simulate
-from ._results import reason_of
+from ._checks import parameters
+from ._experiment import Experiment
+from ._fit import Fit
+from ._free import Free
+from ._least_squares import INTERRUPTED, MAX_STEPS, Iterate, Line, Outcome, levenberg_marquardt
+from ._prediction import Huber, Model
+from ._problem import Problem, check_observations, failure_of, linearise, linearise_each, linearise_starts, look
+from ._regress import regress
+from ._report import report, robust_scale
+from ._sensitivities import FORWARD_LIMIT
+from ._shooting import Pieces, cut, join
 from ._system import System
-from ._trajectory import Trajectory
-
-
-class Experiment(eqx.Module):
-    """A recording of the system's motion, and how it was measured.
-
-    **Arguments:**
-
-    - `ts`: the times of the samples, increasing; the start of the motion is at ts[0].
-    - `values`: what was measured, any pytree of arrays with the samples as first axis, e.g. `{"y": ..., "phi": ...}`.
-    - `q0`, `qdot0`: the state at ts[0], as for `simulate`.
-    - `observe`: what the sensors see of one state, structured like one sample of `values`; it receives the arguments it names, of
-      `t`, `q`, `qdot`, `qddot`, `multipliers`, `params` and the entries of `params`.
-    - `sigma`: standard deviation of the noise, a number or a pytree like `values` with one for each channel or sample. Where it is
-      left out, one common sigma is estimated from the residuals.
-
-    Any consistent units. **Raises:** `ValueError` where times, values and sigma do not fit each other.
-
-    **Source:** Ljung, System Identification, 2nd ed., section 7.2.
-
-    ```python
-    import jax.numpy as jnp
-    import jaxlag as jl
-    ts = jnp.linspace(0.0, 1.0, 5)
-    jl.Experiment(ts, {"position": jnp.cos(ts)}, q0=1.0, qdot0=0.0, observe=lambda q: {"position": q}, sigma=1e-3)
-    ```
-    """
-
-    ts: Float[Array, " T"]
-    values: PyTree[Float[Array, "T ..."]]
-    q0: PyTree
-    qdot0: PyTree
-    sigma: PyTree | None
-    observe: Callable = eqx.field(static=True)
-
-    def __init__(self, ts: Any, values: PyTree, q0: PyTree, qdot0: PyTree, *, observe: Callable, sigma: PyTree | None = None):
-        self.q0, self.qdot0 = state(q0, qdot0, ("q0", "qdot0"))
-        dtype = jax.tree.leaves(self.q0)[0].dtype
-        self.ts = sample_times(ts, dtype)
-        self.values = jax.tree.map(lambda value: jnp.asarray(value, dtype), values, is_leaf=is_vector)
-        self.observe = observe
-        for path, value in jax.tree_util.tree_flatten_with_path(self.values)[0]:
-            at = f"`values{jax.tree_util.keystr(path)}`"
-            if value.shape[:1] != self.ts.shape:
-                raise ValueError(
-                    f"{at} must have one row for each of the {self.ts.size} times, but has shape {value.shape}. Put the samples first."
-                )
-            if is_concrete(value) and not np.all(np.isfinite(value)):
-                raise ValueError(f"{at} must be finite, but has {int(np.sum(~np.isfinite(value)))} missing samples. Leave these times out.")
-        self.sigma = None if sigma is None else _like_values(sigma, self.values)
-
-
-def _like_values(sigma, values):
-    try:
-        sigma = jax.tree.map(lambda s, v: jax.tree.map(lambda v: jnp.broadcast_to(jnp.asarray(s, v.dtype), v.shape), v), sigma, values)
-    except ValueError as error:
-        raise ValueError(
-            f"`sigma` must be a number or structured like `values`, but does not fit: {error}. Give one for each channel."
-        ) from None
-    if any(is_concrete(s) and not np.all(np.asarray(s) > 0) for s in jax.tree.leaves(sigma)):
-        raise ValueError("`sigma` must be positive, but has an entry that is not. Give the standard deviation of the noise.")
-    return sigma
-
-
-class Fit(eqx.Module):
-    """Identified parameters with their quality; printed, a table.
-
-    - `experiments`: what was fitted. `params`: all parameters, the free ones at their estimate. `estimates`: the free ones alone.
-    - `standard_errors`: like `estimates`; infinite where the measurements do not determine a parameter.
-    - `covariance`, `correlation`: in the flat order of `estimates`, whose entries `names` names.
-    - `residuals`: measured minus predicted, per experiment, structured like its values. `sigma`: estimated noise, in
-      units of the sigma given, which is 1 where none was.
-    - `converged`, `steps`, `cost` (half the sum of squares), `predictions`: the fitted motions as `Trajectory`.
-    """
-
-    experiments: tuple[Experiment, ...]
-    params: PyTree
-    estimates: dict[str, Array]
-    standard_errors: dict[str, Array]
-    covariance: Float[Array, "p p"]
-    correlation: Float[Array, "p p"]
-    residuals: list[PyTree]
-    predictions: list[Trajectory]
-    sigma: Float[Array, ""]
-    cost: Float[Array, ""]
-    names: tuple[str, ...] = eqx.field(static=True)
-    converged: bool = eqx.field(static=True)
-    steps: int = eqx.field(static=True)
-
-    def __repr__(self) -> str:
-        count = sum(leaf.size for leaf in jax.tree.leaves(self.residuals))
-        outcome = "converged" if self.converged else "not converged"
-        values, errors = (np.asarray(ravel_pytree(tree)[0]) for tree in (self.estimates, self.standard_errors))
-        parameters = f"{len(self.names)} parameter{'s' if len(self.names) > 1 else ''}"
-        rows = [f"Fit: {parameters}, {count} measurements, {outcome} after {self.steps} steps"]
-        width = max(map(len, self.names))
-        for name, value, error in zip(self.names, values, errors, strict=True):
-            if np.isfinite(error):
-                rows.append(f"  {name:<{width}}  {plus_minus(value, error)}")
-            else:
-                rows.append(f"  {name:<{width}}  not determined by these measurements")
-        strong = [
-            f"{self.names[i]}, {self.names[j]}: {self.correlation[i, j]:+.2f}"
-            for i in range(len(values))
-            for j in range(i)
-            if abs(self.correlation[i, j]) > 0.5
-        ]
-        if strong:
-            rows.append(f"  correlation  {'; '.join(strong)}")
-        rows.append(f"  residual sigma  {self.sigma:.4g}")
-        return "\n".join(rows)
-
-
-def plus_minus(value: float, error: float) -> str:
-    """`value ± error` with two digits of the error."""
-    if error == 0:
-        return f"{value:.6g} ± 0"
-    digits = 1 - int(np.floor(np.log10(error)))
-    if digits > 8 or (value and abs(value) >= 1e7):
-        return f"{value:.8g} ± {error:.2g}"
-    return f"{round(value, digits):.{max(digits, 0)}f} ± {round(error, digits):.{max(digits, 0)}f}"
 
 
 def fit(
     system: System,
     experiments: Experiment | Sequence[Experiment],
-    params: Mapping[str, Any],
+    params: PyTree,
     *,
     free: Sequence[str],
-    max_steps: int = 100,
-    tolerance: float = 1e-6,
+    bounds: Mapping[str, Any] | None = None,
+    priors: Mapping[str, Any] | None = None,
+    loss: Huber | None = None,
+    method: optax.GradientTransformation | None = None,
+    starts: int = 1,
+    pieces: int = 1,
+    max_steps: int | None = None,
+    tolerance: float = 1e-3,
     progress: bool = False,
     **numerics: Any,
 ) -> Fit:
     r"""Identifies parameters from recorded motions, by weighted least squares over the whole motion.
 
-    $$ \min_\theta \tfrac12 \sum_i \left(\frac{z_i - h(t_i, q(t_i; \theta), \dot q(t_i; \theta))}{\sigma_i}\right)^2,
-       \qquad \mathrm{cov}\,\hat\theta = \hat\sigma^2 (J^T J)^{-1} $$
+    $$ \min_{\theta, s} \tfrac12 \sum_{e, i} \left(\frac{z_{ei} - h(t_i, q(t_i; \theta, s_e), \dots)}{\sigma_{ei}}\right)^2
+       + \tfrac12 \sum_j \left(\frac{\theta_j - \mu_j}{\varsigma_j}\right)^2 $$
 
-    Levenberg–Marquardt with exact Jacobians, in parameters scaled by their starting values. σ̂² is the residual sum of squares
-    over the degrees of freedom where `sigma` was left out of the experiments, and 1 where it was given.
+    with the unknown starts s of the experiments; Levenberg–Marquardt with exact Jacobians.
 
     **Arguments:**
 
-    - `experiments`: one `Experiment` or several.
-    - `params`: a mapping with all parameters; those in `free` are starting values.
-    - `free`: names of the entries of `params` to be identified.
-    - `max_steps`, `tolerance`: the iteration ends when a step changes cost and scaled parameters by less than `tolerance`.
-    - `progress`: prints a line with step and cost while it runs, on standard error.
-    - `**numerics`: handed on to `simulate`: `solver`, `rtol`, `atol`, `stabilisation`.
+    - `experiments`: one `Experiment` or several, of any lengths.
+    - `params`: a mapping with all parameters; those in `free` are starting values. `jaxlag.regress` finds such.
+    - `free`: names of the entries of `params` to be identified, or paths to parts of them, `"arm.length"`, `"joints[0]"`.
+    - `bounds`: (lower, upper) by name, None for none: `{"b": (0, None)}` keeps b positive. Kept by a change of variables.
+    - `priors`: (mean, standard deviation) by name, of what is known beforehand.
+    - `loss`: `Huber()` where there are outliers.
+    - `method`: an optimiser of optax in place of Levenberg–Marquardt, for thousands of parameters; it takes `max_steps` steps.
+    - `starts`: how many starts are tried in one batch, the others at random within bounds, or within a factor of some two.
+    - `pieces`: into how many pieces each record is cut, each with a start of its own (multiple shooting): for long or chaotic records.
+    - `max_steps`: default 100, with `method` 1000. `tolerance`: the iteration ends when the next step would change no parameter by more
+      than this part of its standard error.
+    - `progress`: prints a line with step, cost and time left while it runs, on standard error.
+    - `**numerics`: handed on to `simulate`: `solver`, `rtol`, `atol`, `stabilisation`, `friction`.
+
+    Stopped by the keyboard, it returns the best so far and says so. Experiments run side by side, over several devices where there are.
 
     **Returns:** a `Fit`. Any consistent units.
 
-    **Raises:** `ValueError` where `free` names no parameter, `observe` does not fit the measurements, or the motion at the start
-    cannot be computed.
+    **Raises:** `ValueError` where `free` names no parameter, `observe` does not fit the measurements, a start is outside its bounds, or
+    the motion at the start cannot be computed.
 
     **Source:** Ljung, System Identification, 2nd ed., sections 7.2 and 9.4; Nocedal & Wright, Numerical Optimization, section 10.3.
 
@@ -184,168 +83,190 @@ def fit(
     jl.fit(oscillator, record, {"c": 3.0}, free=("c",)).estimates["c"]  # 4.0
     ```
     """
+    problem, experiments = _stated(system, experiments, params, free, bounds, priors, loss, method is None, numerics)
+    steps = max_steps or (100 if method is None else 1000)
+    line = Line(steps) if progress else None
+    more = {"freedom": _freedom(problem, experiments), "max_steps": steps, "tolerance": tolerance, "progress": line}
+    whole = cut(problem, experiments, pieces) if pieces > 1 else Pieces(problem, tuple(range(len(experiments))), ())
+    try:
+        outcome, problem = _minimised(whole.problem, method, starts, more)
+        for _ in range(SCALE_ROUNDS if loss is not None and not _absolute(experiments) else 0):
+            problem = dataclasses.replace(problem, scale=robust_scale(outcome.best.rest, problem))
+            outcome, problem = _minimised(problem, method, 1, more, outcome.best.y)
+    finally:
+        if line:
+            line.end()
+    return report(problem, experiments, outcome, whole)
+
+
+SCALE_ROUNDS = 3  # of a robust loss whose sigma is not known
+
+
+def fit_each(
+    system: System,
+    experiments: Sequence[Experiment],
+    params: PyTree,
+    *,
+    free: Sequence[str],
+    bounds: Mapping[str, Any] | None = None,
+    priors: Mapping[str, Any] | None = None,
+    max_steps: int = 100,
+    tolerance: float = 1e-3,
+    progress: bool = False,
+    **numerics: Any,
+) -> list[Fit]:
+    """A fit of its own for each experiment, all in one batch: a fleet of machines, or one machine measured again and again.
+
+    **Arguments:** as `fit`; the experiments are of one kind: the same sensors and unknowns. Any consistent units.
+
+    **Returns:** a list of `Fit`, one for each experiment.
+
+    **Raises:** `ValueError` where the experiments are of different kinds, and as `fit`.
+
+    ```python
+    import jax.numpy as jnp
+    import jaxlag as jl
+    oscillator = jl.System(lambda q, qdot, c: 0.5 * qdot**2 - 0.5 * c * q**2)
+    ts = jnp.linspace(0.0, 3.0, 50)
+    records = [jl.Experiment(ts, jnp.cos(w * ts), 1.0, 0.0) for w in (2.0, 2.1)]
+    [fit.estimates["c"] for fit in jl.fit_each(oscillator, records, {"c": 3.0}, free=("c",))]  # 4.0 and 4.41
+    ```
+    """
+    problem, experiments = _stated(system, experiments, params, free, bounds, priors, None, True, numerics, apart=True)
+    if len(problem.stacks) > 1:
+        raise ValueError("`experiments` must be of one kind, but differ in sensors, unknowns or shapes. Fit each kind by itself.")
+    xs = jnp.zeros((len(experiments), problem.free.size + problem.stacks[0].unknowns))
+
+    def seen(xs):
+        rows = linearise_each(problem, xs)
+        return rows.residuals, rows.jacobian, rows
+
+    line = Line(max_steps) if progress else None
+    freedom = max(min(map(_measurements, experiments)) - xs.shape[1], 1)
+    outcome = levenberg_marquardt(seen, xs, freedom=freedom, max_steps=max_steps, tolerance=tolerance, progress=line)
+    if line:
+        line.end()
+    best, stack = jax.tree.map(np.asarray, (outcome.best, problem.stacks[0]))  # slices of NumPy arrays cost nothing
+    stack = dataclasses.replace(stack, members=(0,), mesh=None)
+    fits = []
+    for i, e in enumerate(experiments):
+        alone = jax.tree.map(lambda leaf, i=i: leaf[i : i + 1] if eqx.is_array(leaf) else leaf, stack)
+        mine = outcome._replace(best=jax.tree.map(lambda leaf, i=i: leaf[i], best), costs=outcome.costs[:, i])
+        fits.append(report(dataclasses.replace(problem, stacks=(alone,)), (e,), mine, Pieces(problem, (0,), ())))
+    return fits
+
+
+def _stated(system, experiments, params, free, bounds, priors, loss, relative, numerics, apart=False):
+    """The problem, checked; starting values that are NaN come from `regress`."""
     experiments = (experiments,) if isinstance(experiments, Experiment) else tuple(experiments)
-    params = parameters(params, experiments[0].q0)
-    start = _free_entries(params, free)
-    residuals = _Residuals(system, tuple(sorted(numerics.items())))
-    args = (experiments, params, start)
-    _check_observations(residuals, jax.tree.map(jnp.zeros_like, start), args)
-    solver = optx.LevenbergMarquardt(rtol=tolerance, atol=tolerance, norm=optx.max_norm)
-    y, steps, converged = _iterate(solver, residuals, jax.tree.map(jnp.zeros_like, start), args, max_steps, progress)
-    return _report(residuals, y, args, steps, converged)
-
-
-class _Residuals(eqx.Module):
-    """(predicted − measured) / σ as a function of the scaled free parameters; compared by its fields, so it compiles once."""
-
-    system: System = eqx.field(static=True)
-    numerics: tuple[tuple[str, Any], ...] = eqx.field(static=True)
-
-    def __call__(self, y, args):
-        experiments, _, _ = args
-        predictions = [self.predicted(y, args, i)[0] for i in range(len(experiments))]
-        return [
-            jax.tree.map(lambda p, v, s: (p - v) / s, prediction, e.values, _sigma(e))
-            for prediction, e in zip(predictions, experiments, strict=True)
-        ], None
-
-    def predicted(self, y, args, i):
-        experiments, params, start = args
-        e = experiments[i]
-        params = dict(params) | jax.tree.map(_unscaled, start, y)
-        motion = simulate(self.system, e.q0, e.qdot0, e.ts, params, **{"throw": False, **dict(self.numerics)})
-
-        def seen(t, q, qdot, qddot, multipliers):
-            return call(e.observe, "`observe`", params, t=t, q=q, qdot=qdot, qddot=qddot, multipliers=multipliers)
-
-        return jax.vmap(seen)(motion.ts, motion.q, motion.qdot, motion.qddot, motion.multipliers), motion
-
-
-def _sigma(experiment):
-    return experiment.sigma if experiment.sigma is not None else jax.tree.map(jnp.ones_like, experiment.values)
-
-
-def _scale(start):
-    return jnp.where(start == 0, 1, jnp.abs(start))
-
-
-def _unscaled(start, y):
-    return start + _scale(start) * y
-
-
-def _free_entries(params, free):
-    if isinstance(free, str):
-        raise ValueError(f"`free` must be a list of names, but is the string {free!r}. Write `free=({free!r},)`.")
+    if not experiments or not all(isinstance(e, Experiment) for e in experiments):
+        raise ValueError("`experiments` must be an `Experiment` or a list of them, but is not. Make one by `jl.Experiment(...)`.")
+    for i, e in enumerate(experiments):
+        if e.values is None:
+            raise ValueError(f"`experiments` must have been measured, but number {i} has no values. Use `information` to plan one.")
     if not isinstance(params, Mapping):
         raise ValueError(f"`params` must be a mapping, so that `free` can name its entries, but is a {type(params).__name__}. Use a dict.")
-    for name in free:
-        if name not in params:
-            raise ValueError(f"`free` must name entries of params, but holds {name!r}. There are {', '.join(sorted(params))}.")
-    if not free:
+    params = parameters(params, experiments[0].q0)
+    named = Free.of(params, free, bounds, priors, relative)
+    if np.any(np.isnan(named.start)):
+        params = regress(system, experiments, params, free=free, bounds=bounds).params
+        named = Free.of(params, free, bounds, priors, relative)
+    problem = Problem.of(Model(system, tuple(sorted(numerics.items())), loss), named, experiments)
+    if problem.size == 0:
         raise ValueError("`free` must name at least one entry of params, but is empty. Say which parameters to identify.")
-    return {name: jax.tree.map(jnp.asarray, params[name]) for name in free}
+    check_observations(problem, experiments)
+    known = int(np.sum(np.isfinite(named.spread)))
+    most = min(map(_measurements, experiments)) if apart else sum(map(_measurements, experiments))
+    unknown = named.size + problem.stacks[0].unknowns if apart else problem.size
+    if most + known < unknown:
+        raise ValueError(
+            f"`free` must name no more than was measured, but {unknown} unknowns stand against {most} measurements. Free fewer."
+        )
+    return problem, experiments
 
 
-def _check_observations(residuals, y, args):
-    for i, e in enumerate(args[0]):
-        seen = eqx.filter_eval_shape(lambda y, args, i=i: residuals.predicted(y, args, i)[0], y, args)
-        of = f" of experiment {i}" if len(args[0]) > 1 else ""
-        if jax.tree.structure(seen) != jax.tree.structure(e.values):
-            raise ValueError(
-                f"`observe`{of} must return what `values` holds, {jax.tree.structure(e.values)}, but returns {jax.tree.structure(seen)}. "
-                "Give both the same names."
-            )
-        for (path, s), v in zip(jax.tree_util.tree_flatten_with_path(seen)[0], jax.tree.leaves(e.values), strict=True):
-            if s.shape != v.shape or not jnp.issubdtype(s.dtype, jnp.floating):
-                raise ValueError(
-                    f"`observe`{of} must return real numbers of shape {v.shape[1:]} for `values{jax.tree_util.keystr(path)}`, "
-                    f"but returns shape {s.shape[1:]} and dtype {s.dtype}. Compare what was measured with what is seen."
-                )
+def _measurements(e):
+    return sum(int(np.sum(np.isfinite(leaf))) for leaf in jax.tree.leaves(e.values))
+
+
+def _absolute(experiments):
+    return all(e.sigma is not None for e in experiments)
+
+
+def _freedom(problem, experiments):
+    return max(sum(map(_measurements, experiments)) - problem.size, 1)
+
+
+def _minimised(problem, method, starts, more, x=None):
+    """The outcome of the method that was asked for, and the problem it belongs to."""
+    x = jnp.zeros(problem.size) if x is None else x
+    if method is not None:
+        return _by_optax(problem, method, x, more), problem
+    if problem.links is not None:
+        return join(problem, x, **more)
+    if starts > 1:
+        return _from_many(problem, starts, more), problem
+    return _from_one(problem, x, more), problem
+
+
+def _from_one(problem, x, more):
+    def seen(x):
+        rows = linearise(problem, x)
+        return rows.residuals, rows.jacobian, rows
+
+    outcome = levenberg_marquardt(seen, x, **more)
+    reason = failure_of(outcome.best.rest)
+    if reason:
+        raise ValueError(f"{AT_THE_START}, but ended with: {reason} Start from other parameters.")
+    return outcome
+
+
+AT_THE_START = "the motion at the start must be computable"
+
+
+def _from_many(problem, starts, more):
+    """The best of several starts, of which the first is the one given."""
+    ys = problem.free.anywhere(jax.random.key(0), starts).at[0].set(0)
+    xs = jnp.concatenate([ys, jnp.zeros((starts, problem.size - problem.free.size))], axis=1)
+
+    def seen(xs):
+        rows = linearise_starts(problem, xs)
+        return rows.residuals, rows.jacobian, rows
+
+    outcome = levenberg_marquardt(seen, xs, **more)
+    cost = np.nan_to_num(outcome.costs[-1], nan=np.inf)
+    if not np.isfinite(cost).any():
+        raise ValueError("`starts` must have one whose motion can be computed, but none has. Narrow the bounds.")
+    best = int(np.argmin(cost))
+    return outcome._replace(best=jax.tree.map(lambda leaf: leaf[best], outcome.best), costs=outcome.costs[:, best])
+
+
+def _by_optax(problem, method, x, more):
+    """Steps of an optimiser of optax; the best x is kept."""
+    method = optax.with_extra_args_support(method)
+    state = method.init(x)
+    lowest, best, costs, ended = np.inf, x, [], MAX_STEPS
+    try:
+        for step in range(1, more["max_steps"] + 1):
+            cost, x_next, state = _optax_step(problem, method, x, state)
+            costs.append(float(cost))
+            if costs[-1] < lowest:
+                lowest, best = costs[-1], x
+            x = x_next
+            if more["progress"]:
+                more["progress"](step, costs[-1])
+    except KeyboardInterrupt:
+        ended = INTERRUPTED
+    if not np.isfinite(lowest):
+        raise ValueError(f"{AT_THE_START}, but was not. Start from other parameters.")
+    rows = linearise(problem, best) if problem.size <= FORWARD_LIMIT else look(problem, best)
+    none = jnp.zeros(0)
+    return Outcome(Iterate(best, rows.residuals, rows.jacobian, rows, none, none, jnp.asarray(ended)), len(costs), np.array(costs))
 
 
 @eqx.filter_jit
-def _start(solver, residuals, y, args):
-    shape, aux = eqx.filter_eval_shape(residuals, y, args)
-    return solver.init(residuals, y, args, {}, shape, aux, frozenset())
-
-
-@eqx.filter_jit
-def _step(solver, residuals, y, args, state):
-    y, state, _ = solver.step(residuals, y, args, {}, state, frozenset())
-    done, result = solver.terminate(residuals, y, args, {}, state, frozenset())
-    return y, state, done, result == optx.RESULTS.successful
-
-
-def _iterate(solver, residuals, y, args, max_steps, progress):
-    """The steps of the solver, driven from Python so that it can say how it gets on."""
-    state = _start(solver, residuals, y, args)
-    for step in range(1, max_steps + 1):
-        y, state, done, well = _step(solver, residuals, y, args, state)
-        if progress:
-            print(f"\rstep {step:3d}   cost {float(state.f_info.as_min()):.6g}", end="", file=sys.stderr, flush=True)
-        if done:
-            break
-    if progress:
-        print(file=sys.stderr)
-    return y, step, bool(done) and bool(well)
-
-
-@eqx.filter_jit
-def _final(residuals, y, args):
-    flat, unravel = ravel_pytree(y)
-    flattened = lambda flat: ravel_pytree(residuals(unravel(flat), args)[0])[0]
-    r, J = flattened(flat), jax.jacfwd(flattened)(flat)
-    motions = [residuals.predicted(y, args, i)[1] for i in range(len(args[0]))]
-    left = [jax.tree.map(lambda r, s: -r * s, r, _sigma(e)) for r, e in zip(residuals(y, args)[0], args[0], strict=True)]
-    return r, J, motions, left
-
-
-def _report(residuals, y, args, steps, converged):
-    experiments, params, start = args
-    r, J, motions, left = _final(residuals, y, args)
-    for motion in motions:
-        if not motion.succeeded:
-            raise ValueError(
-                f"the fitted motion must be computable, but ended with: {reason_of(motion.result)} Start from other parameters."
-            )
-    estimates = jax.tree.map(_unscaled, start, y)
-    scale, unravel = ravel_pytree(jax.tree.map(_scale, start))
-    freedom = r.size - scale.size
-    spread = jnp.sqrt(r @ r / freedom) if freedom > 0 else jnp.asarray(jnp.nan)
-    absolute = all(e.sigma is not None for e in experiments)
-    covariance = _inverse_information(J) * jnp.outer(scale, scale) * (1.0 if absolute else spread**2)
-    errors = jnp.sqrt(jnp.diagonal(covariance))
-    return Fit(
-        experiments=experiments,
-        params=dict(params) | estimates,
-        estimates=estimates,
-        standard_errors=unravel(errors),
-        covariance=covariance,
-        correlation=covariance / jnp.outer(errors, errors),
-        residuals=left,
-        predictions=motions,
-        sigma=spread,
-        cost=r @ r / 2,
-        names=_entry_names(estimates),
-        converged=converged,
-        steps=steps,
-    )
-
-
-def _inverse_information(J):
-    """(JᵀJ)⁻¹, with infinite variance for what J does not determine."""
-    size = jnp.linalg.norm(J, axis=0)
-    scale = jnp.where(size > 0, 1 / jnp.where(size > 0, size, 1), 1)
-    _, s, Vt = jnp.linalg.svd(J * scale[None, :], full_matrices=False)
-    weak = s <= s[0] * 1e3 * jnp.finfo(J.dtype).eps * J.shape[1]
-    inverse = Vt.T @ (jnp.where(weak, 0, 1 / jnp.where(weak, 1, s) ** 2)[:, None] * Vt)
-    undetermined = jnp.any(weak[:, None] & (jnp.abs(Vt) > 1e-3), axis=0) | (size == 0)
-    return inverse * jnp.outer(scale, scale) + jnp.diag(jnp.where(undetermined, jnp.inf, 0))
-
-
-def _entry_names(tree):
-    names = []
-    for path, leaf in jax.tree_util.tree_flatten_with_path(tree)[0]:
-        name = jax.tree_util.keystr(path, simple=True, separator=".")
-        names += [name] if leaf.ndim == 0 else [f"{name}[{', '.join(map(str, i))}]" for i in np.ndindex(leaf.shape)]
-    return tuple(names)
+def _optax_step(problem, method, x, state):
+    cost, slope = jax.value_and_grad(problem.cost)(x)
+    slope = jnp.where(jnp.isfinite(slope), slope, 0)
+    updates, state = method.update(slope, state, x, value=cost, grad=slope, value_fn=problem.cost)
+    return cost, optax.apply_updates(x, updates), state

@@ -17,7 +17,8 @@ from ._manifold import Baumgarte, NoStabilisation, Projection, nearest_state
 from ._motion import Equations, slack_of
 from ._results import OF_THE_INPUT, RESULTS, reason_of
 from ._sensitivities import differentiable
-from ._steps import Kept, StickSlipSolver
+from ._signal import jump_times, solved
+from ._steps import Kept, Resuming, StickSlipSolver, behind_a_jump
 from ._system import System
 from ._trajectory import Rubbing, Stated, Trajectory
 
@@ -51,7 +52,7 @@ def simulate(
 
     - `q0`, `qdot0`: the state at ts[0]; pytrees of one structure. Any consistent units.
     - `ts`: sample times, increasing, at least two.
-    - `params`: what the functions of the system name.
+    - `params`: what the functions of the system name; measured inputs among them are `Signal`s.
     - `solver`: any explicit or diagonally implicit Runge–Kutta solver of diffrax. Default `diffrax.Tsit5()`; stiff systems
       want `diffrax.Kvaerno5()`, high accuracy `diffrax.Dopri8()`.
     - `rtol`, `atol`: tolerances of the step size control. Defaults 1e-8 and 1e-10 in double, 1e-4 and 1e-6 in single precision.
@@ -125,6 +126,7 @@ def _simulate(system, how, q0, qdot0, ts, params, tolerances):
 def _motion(equations, how, adjoint, inputs, ts):
     """y at the samples; and, not differentiated, the reason it ended and the counts."""
     t0, q, v, params, tolerances = inputs
+    params = solved(params)
     nearest = nearest_state(equations.flat(params), t0, q, v)
     start = equations.start(t0, nearest.q, nearest.v, params)
     ys, result, stats = _solve(equations, how, adjoint, t0, start.y, ts, (params, slack_of(tolerances, nearest.v)), tolerances)
@@ -146,23 +148,29 @@ def _motion(equations, how, adjoint, inputs, ts):
 def _solve(equations, how, adjoint, t0, y0, ts, args, tolerances):
     """States at the samples, by diffrax, and the reason it stopped."""
     rtol, atol = tolerances
-    smallest = 4 * jnp.finfo(y0.dtype).eps * jnp.maximum(jnp.abs(ts[0]), jnp.abs(ts[-1]))
+    rounding = jnp.finfo(y0.dtype).eps * jnp.maximum(jnp.abs(ts[0]), jnp.abs(ts[-1]))
+    controller = dfx.PIDController(rtol, atol, dtmin=4 * rounding, force_dtmin=False)
+    end, jumps, behind = ts[-1], jump_times(args[0], ts.dtype), None
+    if jumps is not None:
+        controller = dfx.ClipStepSizeController(Resuming(rtol, atol, smallest=4 * rounding), jump_ts=jumps)
+        end = end + 256 * rounding  # a jump at the last sample is stepped on too: diffrax rounds what is within 100 ulp of the end
+        behind = functools.partial(behind_a_jump, equations)
     kept = equations.kept if equations.projection else None
     solver = how.solver
     if equations.rows:
-        solver = StickSlipSolver(how.solver, kept, 2 * equations.size, equations)
-    elif kept is not None or how.audit:
-        solver = Kept(how.solver, kept, 2 * equations.size)
+        solver = StickSlipSolver(how.solver, kept, 2 * equations.size, behind, equations)
+    elif kept is not None or behind is not None or how.audit:
+        solver = Kept(how.solver, kept, 2 * equations.size, behind)
     solution = dfx.diffeqsolve(
         dfx.ODETerm(equations.rates),
         solver,
         t0,
-        ts[-1],
+        end,
         None,
         y0,
         args,
         saveat=dfx.SaveAt(ts=ts),
-        stepsize_controller=dfx.PIDController(rtol, atol, dtmin=smallest, force_dtmin=False),
+        stepsize_controller=controller,
         adjoint=adjoint,
         max_steps=how.max_steps,
         throw=False,

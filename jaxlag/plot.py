@@ -8,7 +8,7 @@ import jax
 import numpy as np
 from jaxtyping import PyTree
 
-from ._identify import Fit
+from ._fit import Fit
 from ._integrate import Trajectory
 
 # Okabe & Ito, Color Universal Design (2008): told apart with every kind of colour vision. Their yellow is too pale for a thin line.

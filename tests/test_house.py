@@ -16,6 +16,7 @@ ORDER = [
     "_arguments",
     "_system",
     "_checks",
+    "_signal",
     "_kinematics",
     "_mechanics",
     "_multipliers",
@@ -31,14 +32,32 @@ ORDER = [
     "_sensitivities",
     "_steps",
     "_integrate",
+    "_experiment",
+    "_free",
+    "_prediction",
+    "_problem",
+    "_least_squares",
+    "_quality",
+    "_smoothing",
+    "_shooting",
+    "_fit",
+    "_report",
+    "_regress",
     "_identify",
+    "_assess",
     "plot",
 ]
-BESIDE = ["dissipation"]  # needs nothing of the package
+BESIDE = ["dissipation", "learnt"]  # need nothing of the package
 PUBLIC = [name for name in vars(jaxlag) if not name.startswith("_") and callable(getattr(jaxlag, name))]
 
 
-HOMES = [("diffrax", {"_results", "_steps", "_integrate"}), ("matplotlib", {"plot"}), ("optimistix", {"_identify"})]
+HOMES = [
+    ("diffrax", {"_results", "_steps", "_integrate"}),
+    ("matplotlib", {"plot"}),
+    ("optimistix", {"_least_squares"}),
+    ("optax", {"_identify"}),
+    ("scipy", {"_quality", "_smoothing", "_fit", "_regress"}),
+]
 
 
 def _imported(file):

@@ -1,0 +1,255 @@
+"""The answer of an identification, with its quality."""
+
+import dataclasses
+import itertools
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.flatten_util import ravel_pytree
+from jaxtyping import PyTree
+from scipy import special  # comes with JAX
+
+from ._experiment import Experiment, entry_names
+from ._least_squares import levenberg_marquardt
+from ._problem import Problem, blank, linearise
+from ._quality import Channel
+from ._trajectory import Trajectory
+
+
+class Interval(NamedTuple):
+    """A confidence interval; an end is infinite where the measurements set no limit."""
+
+    lower: float
+    upper: float
+
+
+class Prediction(NamedTuple):
+    """What an experiment should show.
+
+    - `values`: structured like the experiment's; `standard_errors` of them, from the uncertainty of the parameters.
+    - `lower`, `upper`: the confidence band. `motion`: the `Trajectory` behind it.
+    """
+
+    values: PyTree
+    standard_errors: PyTree
+    lower: PyTree
+    upper: PyTree
+    motion: Trajectory
+
+
+@dataclasses.dataclass(frozen=True, eq=False, repr=False)
+class Fit:
+    r"""Identified parameters with their quality; printed, a table for a report.
+
+    $$ \mathrm{cov}\,\hat\theta = \hat\sigma^2 (J^T J)^{-1}, \qquad \hat\sigma^2 = \frac{\sum r_i^2}{N - p} $$
+
+    σ̂ is 1 where every experiment came with its sigma.
+
+    - `params`: all parameters, the free ones at their estimate; `estimates`: the free ones alone, by name.
+    - `standard_errors`: like `estimates`; infinite where the measurements do not determine a parameter; `remarks` then say in words
+      what they do determine. `covariance`, `correlation`: in the flat order whose entries `names` names.
+    - `experiments`: what was fitted, with estimated starts put in; `unknowns` and `unknown_errors`: for each experiment its own
+      estimates, `"q0"`, `"qdot0"` and parameters, with standard errors.
+    - `predictions`, `residuals` (measured minus predicted): per experiment, structured like its values. `channels`: how well each is
+      predicted. `sigma`: σ̂, in units of the sigma given, which is 1 where none was.
+    - `converged`, `reason`, `steps`, `costs` (after each step), `cost` (half the sum of squares).
+
+    **Source:** Ljung, System Identification, 2nd ed., sections 7.2, 9.4 and 16; Seber & Wild, Nonlinear Regression (1989), chapter 5.
+    """
+
+    experiments: tuple[Experiment, ...]
+    params: PyTree
+    estimates: dict[str, PyTree]
+    standard_errors: dict[str, PyTree]
+    covariance: np.ndarray
+    correlation: np.ndarray
+    unknowns: list[dict[str, PyTree]]
+    unknown_errors: list[dict[str, PyTree]]
+    residuals: list[PyTree]
+    predictions: list[PyTree]
+    channels: list[Channel]
+    sigma: float
+    cost: float
+    names: tuple[str, ...]
+    remarks: list[str]
+    converged: bool
+    reason: str
+    steps: int
+    costs: np.ndarray
+    measurements: int
+    absolute: bool  # whether sigma was given
+    problem: Problem
+    unknown_count: int
+    x: np.ndarray  # the unknowns at the minimum, as the problem takes them
+    x_covariance: np.ndarray  # over σ̂²
+
+    @property
+    def freedom(self) -> int:
+        """Measurements less determined unknowns."""
+        return max(self.measurements - self.unknown_count, 0)
+
+    @property
+    def misfit(self) -> float:
+        """−2 log likelihood, up to a constant that the data alone set."""
+        squares = 2 * self.cost
+        return squares if self.absolute else self.measurements * float(np.log(squares / self.measurements))
+
+    @property
+    def aic(self) -> float:
+        """Akaike's criterion; of two models of the same data the smaller is the better one."""
+        return self.misfit + 2 * (self.unknown_count + (not self.absolute))
+
+    @property
+    def bic(self) -> float:
+        """Schwarz's criterion, stricter with parameters than Akaike's."""
+        return self.misfit + float(np.log(self.measurements)) * (self.unknown_count + (not self.absolute))
+
+    def interval(self, name: str, level: float = 0.95, *, profile: bool = False) -> Interval:
+        """The confidence interval of one parameter, an entry of `names`.
+
+        Linearised: θ̂ ± t · standard error, with Student's t. With `profile=True` by the likelihood: the other parameters are fitted
+        anew along the way, to where the cost says no; it need not be symmetric.
+
+        **Source:** Bates & Watts, Nonlinear Regression Analysis and Its Applications (1988), section 6.1.
+        """
+        if name not in self.names:
+            raise ValueError(f"`name` must be a fitted parameter, but is {name!r}. There are {', '.join(self.names)}.")
+        i, t = self.names.index(name), self._quantile(level)
+        theta = float(self.problem.free.theta(jnp.asarray(self.x[: len(self.names)]))[i])
+        error = float(np.sqrt(self.covariance[i, i]))
+        if not profile:
+            return Interval(theta - t * error, theta + t * error)
+        return Interval(*(self._profile_end(i, side, t) for side in (-1, 1)))
+
+    def predict(self, experiment: Experiment, *, level: float = 0.95) -> Prediction:
+        """What an experiment should show at the estimates, with the confidence band that their uncertainty makes.
+
+        The experiment starts where it says; its `values` may be None.
+        """
+        free = self.problem.free
+        model = dataclasses.replace(self.problem.model, loss=None)
+        aside = Problem.of(model, free, [blank(model, free, experiment)])
+        y = jnp.asarray(self.x[: free.size])
+        rows = linearise(aside, jnp.concatenate([y, jnp.zeros(aside.size - free.size)]))
+        part = rows.of_stacks[0]
+        J = np.asarray(part.jacobian[0][:, : free.size])
+        spread = self.sigma_scale * np.sqrt(np.maximum(np.einsum("ij,jk,ik->i", J, self.x_covariance[: free.size, : free.size], J), 0))
+        values = jax.tree.map(lambda x: x[0], part.channels)
+        errors = ravel_pytree(values)[1](jnp.asarray(spread))
+        t = self._quantile(level)
+        lower, upper = (jax.tree.map(lambda v, e, s=s: v + s * t * e, values, errors) for s in (-1, 1))
+        one = jax.tree.map(lambda x: x[0] if eqx.is_array(x) else x, aside.stacks[0])
+        motion = aside.model.predicted(free.insert(free.theta(y)), one, jnp.zeros(aside.stacks[0].unknowns))[1]
+        return Prediction(values, errors, lower, upper, motion)
+
+    @property
+    def sigma_scale(self) -> float:
+        """What standard errors are multiplied with: σ̂, or 1 where sigma was given."""
+        return 1.0 if self.absolute else self.sigma
+
+    def _quantile(self, level):
+        if not 0 < level < 1:
+            raise ValueError(f"`level` must lie between 0 and 1, but is {level:g}. Take 0.95.")
+        return float(special.ndtri(0.5 + level / 2) if self.absolute else special.stdtrit(max(self.freedom, 1), 0.5 + level / 2))
+
+    def _profile_end(self, i, side, t):
+        """Where the root of the cost, refitted with θ_i held, has risen by t."""
+        spread = self.sigma_scale
+        y_error = np.sqrt(self.x_covariance[i, i]) * spread
+        if not np.isfinite(y_error):
+            return side * np.inf
+        kept = np.delete(np.arange(self.x.size), i)
+
+        def refitted(y_i, x):
+            def reduced(rest):
+                rows = linearise(self.problem, jnp.zeros(self.x.size).at[kept].set(rest).at[i].set(y_i))
+                return rows.residuals, rows.jacobian[:, kept], rows
+
+            outcome = levenberg_marquardt(reduced, jnp.asarray(x[kept]), freedom=self.freedom, max_steps=50, tolerance=1e-4)
+            x = np.insert(np.asarray(outcome.best.y), i, y_i)
+            rise = 0.5 * float(np.sum(np.asarray(outcome.best.residuals) ** 2)) - self.cost
+            return np.sqrt(max(2 * rise, 0)) / spread, x
+
+        at, x, reached = 0.0, self.x, 0.0
+        step = side * t * y_error
+        for _ in range(12):  # the root of the cost is nearly a straight line
+            y_i = self.x[i] + at + step
+            rise, x_new = refitted(y_i, x)
+            if not np.isfinite(rise):
+                step /= 2
+                continue
+            slope = (rise - reached) / step if step else np.inf
+            at, reached, x = at + step, rise, x_new
+            if abs(rise - t) < 1e-3 * t:
+                break
+            if abs(at) > 50 * t * y_error:
+                return side * np.inf
+            step = np.clip((t - rise) / slope if slope * side > 0 else side * t * y_error, -5 * t * y_error, 5 * t * y_error)
+        return float(self.problem.free.theta(jnp.asarray(np.insert(x[kept], i, self.x[i] + at)[: len(self.names)]))[i])
+
+    def __repr__(self) -> str:
+        count = len(self.names)
+        outcome = f"converged after {self.steps} steps" if self.converged else f"not converged after {self.steps} steps: {self.reason}"
+        rows = [f"Fit: {count} parameter{'s' if count != 1 else ''}, {self.measurements} measurements, {outcome}"]
+        rows += [*self._parameter_rows(), *self._correlation_rows(), *(f"  ! {remark}" for remark in self.remarks)]
+        rows += channel_rows(self.channels)
+        return "\n".join([*rows, f"  residual sigma  {self.sigma:.4g}{'  (1 where the noise is as said)' if self.absolute else ''}"])
+
+    def _parameter_rows(self):
+        own = [
+            (f"experiment {k}: {which}", tree, self.unknown_errors[k][which])
+            for k, unknowns in enumerate(self.unknowns)
+            for which, tree in unknowns.items()
+        ]
+        theta = np.asarray(self.problem.free.theta(jnp.asarray(self.x[: len(self.names)])))
+        triples = list(zip(self.names, theta, np.sqrt(np.diag(self.covariance)), strict=True))
+        for label, tree, errors in own:
+            entries = [f"{label}{'.' if name[:1].isalpha() else ''}{name}" for name in entry_names(tree)]
+            triples += zip(entries, np.asarray(ravel_pytree(tree)[0]), np.asarray(ravel_pytree(errors)[0]), strict=True)
+        more = [f"  … and {len(triples) - SHOWN} more"] if len(triples) > SHOWN else []
+        triples = triples[:SHOWN]
+        width = max((len(name) for name, _, _ in triples), default=0)
+        t = self._quantile(0.95)
+        rows = []
+        for name, value, error in triples:
+            if not np.isfinite(error):
+                rows.append(f"  {name:<{width}}  not determined by these measurements")
+            else:
+                rows.append(f"  {name:<{width}}  {plus_minus(value, error):<24} 95 %: {value - t * error:.6g} … {value + t * error:.6g}")
+        return rows + more
+
+    def _correlation_rows(self):
+        pairs = itertools.combinations(range(min(len(self.names), SHOWN)), 2)
+        strong = [f"{self.names[i]}, {self.names[j]}: {self.correlation[i, j]:+.2f}" for i, j in pairs if abs(self.correlation[i, j]) > 0.5]
+        return [f"  correlation  {'; '.join(strong)}"] if strong else []
+
+
+SHOWN = 40  # rows of a table at most
+
+
+def channel_rows(channels: Sequence[Channel]) -> list[str]:
+    """The table of channels."""
+    several = len({channel.experiment for channel in channels}) > 1
+    label = lambda c: f"{c.experiment}: {c.name}" if several else c.name
+    shown = channels[:SHOWN]
+    width = max((len(label(c)) for c in shown), default=0)
+    rows = [
+        f"  {label(c):<{width}}  fit {c.fit_percent:6.2f} %   R² {c.r_squared:.5f}   rms {c.rms:.3g}   "
+        + ("white" if not c.whiteness < 0.01 else f"not white (p = {c.whiteness:.1g})")
+        for c in shown
+    ]
+    return rows + ([f"  … and {len(channels) - SHOWN} more channels"] if len(channels) > SHOWN else [])
+
+
+def plus_minus(value: float, error: float) -> str:
+    """`value ± error` with two digits of the error."""
+    if error == 0:
+        return f"{value:.6g} ± 0"
+    digits = 1 - int(np.floor(np.log10(error)))
+    if digits > 8 or (value and abs(value) >= 1e7):
+        return f"{value:.8g} ± {error:.2g}"
+    return f"{round(value, digits):.{max(digits, 0)}f} ± {round(error, digits):.{max(digits, 0)}f}"

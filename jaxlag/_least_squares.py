@@ -1,0 +1,146 @@
+"""Nonlinear least squares, from residuals and Jacobians that come together, one problem or a batch of them."""
+
+import sys
+import time
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import lineax as lx
+import numpy as np
+import optimistix as optx
+
+RUNNING, CONVERGED, STALLED, MAX_STEPS, INTERRUPTED = range(5)
+REASONS = (
+    "still running",
+    "converged",
+    "no step lowers the cost any more, though it is not flat",
+    "`max_steps` was reached",
+    "interrupted by the keyboard; these are the best parameters so far",
+)
+
+
+class Iterate(NamedTuple):
+    """Where the iteration stands; with a batch, each array has it as its first axis."""
+
+    y: Any
+    residuals: Any
+    jacobian: Any
+    rest: Any
+    damping: Any
+    scale: Any  # largest norm each column of the Jacobian has had
+    status: Any
+
+
+class Outcome(NamedTuple):
+    """The best iterate, the steps it took, and the cost after each of them."""
+
+    best: Iterate
+    steps: int
+    costs: np.ndarray
+
+
+def levenberg_marquardt(
+    linearise: Callable[[Any], tuple[Any, Any, Any]],
+    y: Any,
+    *,
+    freedom: int,
+    max_steps: int,
+    tolerance: float,
+    progress: Callable[[int, float], None] | None = None,
+) -> Outcome:
+    """Minimises ½|r(y)|². `linearise(y)` returns r, its Jacobian, and whatever else is wanted of the best y.
+
+    Ends where the next step would change no parameter by more than `tolerance` of its standard error: |J Δy| ≤ tolerance · σ̂, with
+    σ̂² = |r|² / `freedom`. Where y has a batch axis, `linearise` and all that is returned have it too.
+
+    **Source:** Moré, The Levenberg-Marquardt algorithm, Lecture Notes in Mathematics 630 (1978); Madsen, Nielsen & Tingleff,
+    Methods for Non-Linear Least Squares Problems (2004), section 3.2.
+    """
+    begin, propose, judge = ONE if y.ndim == 1 else MANY
+    now = begin(y, linearise(y))
+    costs = [np.asarray(_cost(now.residuals))]
+    step, limits = 0, (jnp.full(y.shape[:-1], tolerance, y.dtype), jnp.full(y.shape[:-1], freedom, y.dtype))
+    try:
+        for step in range(1, max_steps + 1):
+            trial, predicted = propose(now)
+            now = judge(now, trial, predicted, linearise(trial), *limits)
+            costs.append(np.asarray(_cost(now.residuals)))
+            if progress:
+                progress(step, float(np.min(costs[-1])))
+            if np.all(np.asarray(now.status) != RUNNING):
+                break
+        ended = MAX_STEPS
+    except KeyboardInterrupt:
+        ended = INTERRUPTED
+    return Outcome(now._replace(status=jnp.where(now.status == RUNNING, ended, now.status)), step, np.array(costs))
+
+
+def _cost(r):
+    return 0.5 * jnp.sum(r**2, axis=-1)
+
+
+def _norms(J):
+    return jnp.linalg.norm(J, axis=0)
+
+
+def _begin(y, first):
+    r, J, rest = first
+    return Iterate(y, r, J, rest, jnp.asarray(1e-2, y.dtype), _norms(J), jnp.asarray(RUNNING))
+
+
+def _propose(now):
+    """The damped Gauss–Newton step, in columns of norm one."""
+    scale = jnp.where(now.scale > 0, now.scale, 1)
+    J = lx.MatrixLinearOperator(now.jacobian / scale[None, :])
+    info = optx.FunctionInfo.ResidualJac(now.residuals, J)
+    descent = optx.DampedNewtonDescent()
+    step, _ = descent.step(1 / now.damping, descent.query(now.y, info, None))  # type: ignore[arg-type]
+    return now.y + step / scale, J.mv(step)
+
+
+def _judge(now, trial, predicted, seen, tolerance, freedom):
+    """Takes the trial where it is better, and sets the damping by how much it is."""
+    r, J, rest = seen
+    before, after = _cost(now.residuals), _cost(r)
+    better = after <= before
+    took = lambda new, old: jax.tree.map(lambda a, b: jnp.where(better, a, b), new, old)
+    # What was expected of the step: ½|r|² − ½|r + J step|²; and its length in terms of the noise.
+    expected = -predicted @ now.residuals - 0.5 * predicted @ predicted
+    well = (before - after) > 0.25 * expected
+    damping = now.damping * jnp.where(better, jnp.where(well, 0.1, 1.0), 10.0)
+    damping = jnp.clip(damping, 1e-14, 1e14)
+    least = jnp.finfo(r.dtype).eps ** 0.625 * jnp.max(now.scale)  # below the rounding of what is integrated
+    short = predicted @ predicted <= jnp.maximum(tolerance**2 * 2 * before / jnp.maximum(freedom, 1), least**2)
+    newton_like = now.damping < 0.5
+    flat = jnp.linalg.norm(jnp.where(now.scale > 0, now.residuals @ now.jacobian / now.scale, 0)) <= 1e-4 * jnp.sqrt(2 * before)
+    status = jnp.where((short & newton_like) | (before == 0), CONVERGED, RUNNING)
+    status = jnp.where(~better & (now.damping >= 1e8), jnp.where(flat, CONVERGED, STALLED), status)
+    status = jnp.where(now.status == RUNNING, status, now.status)
+    done = now.status != RUNNING
+    chosen = Iterate(*took((trial, r, J, rest), now[:4]), damping, jnp.maximum(now.scale, _norms(jnp.where(better, J, 0))), status)
+    return jax.tree.map(lambda a, b: jnp.where(done, b, a), chosen, now)
+
+
+ONE = tuple(eqx.filter_jit(f) for f in (_begin, _propose, _judge))
+MANY = tuple(eqx.filter_jit(jax.vmap(f)) for f in (_begin, _propose, _judge))
+
+
+class Line:
+    """A line on standard error that says how the fit gets on, rewritten in place."""
+
+    def __init__(self, max_steps: int):
+        self.max_steps, self.first = max_steps, 0.0
+
+    def __call__(self, step: int, cost: float) -> None:
+        """Writes step, cost, and how long the rest may take at most; the first step is not counted, for it may compile."""
+        now = time.perf_counter()
+        self.first = now if step == 1 else self.first
+        left = f"   at most {(now - self.first) / (step - 1) * (self.max_steps - step):.0f} s more" if step > 1 else ""
+        print(f"\rstep {step:3d}   cost {cost:.6g}{left}   ", end="", file=sys.stderr, flush=True)
+
+    def end(self) -> None:
+        """Leaves the line."""
+        print(file=sys.stderr)

@@ -1,0 +1,171 @@
+"""From the minimum to the answer: estimates, their errors, and what is left of the measurements."""
+
+from collections.abc import Sequence
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.flatten_util import ravel_pytree
+
+from ._experiment import Experiment, is_within
+from ._fit import Fit
+from ._least_squares import CONVERGED, REASONS, Outcome
+from ._problem import Problem, failure_of, linearise
+from ._quality import Determined, channels_of, correlation_of, determined_by, in_words
+from ._shooting import Pieces
+
+
+def robust_scale(rows, problem):
+    """The standard deviation of normal noise with these residuals, by their median: outliers do not move it."""
+    r = np.concatenate([np.ravel(r)[np.isfinite(np.ravel(r))] for r in _weighted(problem, rows)])
+    return jnp.asarray(1.4826 * np.median(np.abs(r)), problem.scale.dtype)
+
+
+def _weighted(problem, rows):
+    """(measured − predicted) / sigma for each stack, flat per experiment; NaN where nothing was measured."""
+    for stack, part in zip(problem.stacks, rows.of_stacks, strict=True):
+        count = len(stack.members)  # there may be copies behind them
+        values, sigma = jax.tree.map(lambda x, count=count: np.asarray(x)[:count], (stack.values, stack.sigma))
+        r = jax.tree.map(lambda z, p, s: (z - p) / s, values, part.channels, sigma)
+        yield np.concatenate([np.reshape(leaf, (count, -1)) for leaf in jax.tree.leaves(r)], axis=1)
+
+
+def report(problem: Problem, experiments: Sequence[Experiment], outcome: Outcome, whole: Pieces) -> Fit:
+    """The answer that an outcome of the iteration means."""
+    x, rows, free = np.asarray(outcome.best.y), outcome.best.rest, problem.free
+    p, y = free.size, jnp.asarray(outcome.best.y[: free.size])
+    theta, slope = np.asarray(free.theta(y)), np.asarray(free.slope(y))
+    weighted = np.concatenate([np.ravel(r) for r in _weighted(problem, rows)])
+    there = np.isfinite(weighted)
+    count, absolute = int(there.sum()), all(e.sigma is not None for e in experiments)
+
+    gaps_J = np.asarray(rows.gaps_jacobian)
+    if rows.jacobian is None:
+        known, remarks = Determined(np.full((x.size, x.size), np.nan), np.ones(x.size, bool), np.zeros((x.size, 0))), [NO_ERRORS]
+    else:
+        J = np.asarray(rows.jacobian)[: p + weighted.size].copy()
+        if problem.model.loss is not None:
+            J[p:] /= problem.model.loss.slope(np.where(there, weighted, 0) / problem.scale)[:, None]
+        known = determined_by(J, gaps_J)
+        remarks = _not_determined(problem, x, known, theta, slope) if np.any(known.null[:p]) else []
+    unknown_count = x.size - known.null.shape[1] - len(gaps_J)
+    sigma = _noise(weighted[there], problem, max(count - unknown_count, 0))
+    scale = 1.0 if absolute and problem.model.loss is None else sigma
+
+    covariance = known.covariance[:p, :p] * np.outer(slope, slope) * scale**2
+    covariance[np.diag_indices(p)] = np.where(known.determined[:p], np.diag(covariance), np.inf)
+    errors = np.sqrt(np.diag(covariance))
+    first = [whole.of.index(i) for i in range(len(experiments))]
+    own = [_own_of(problem, x, rows, k, e, known, scale) for k, e in zip(first, experiments, strict=True)]
+    residuals, predictions = _whole(problem, rows, experiments, whole)
+    status = int(outcome.best.status)
+    return Fit(
+        experiments=tuple(_as_found(e, found) for e, (found, _) in zip(experiments, own, strict=True)),
+        params=free.insert(jnp.asarray(theta)),
+        estimates=free.by_name(jnp.asarray(theta)),
+        standard_errors=free.by_name(jnp.asarray(errors)),
+        covariance=covariance,
+        correlation=correlation_of(covariance),
+        unknowns=[found for found, _ in own],
+        unknown_errors=[errors for _, errors in own],
+        residuals=residuals,
+        predictions=predictions,
+        channels=[c for k, (e, r) in enumerate(zip(experiments, residuals, strict=True)) for c in channels_of(k, e.values, r)],
+        sigma=sigma,
+        cost=float(np.sum(np.asarray(rows.residuals)[: p + weighted.size] ** 2) / 2),
+        names=free.entries,
+        remarks=remarks,
+        converged=status == CONVERGED,
+        reason=REASONS[status],
+        steps=outcome.steps,
+        costs=outcome.costs,
+        measurements=count,
+        absolute=absolute,
+        problem=problem,
+        unknown_count=unknown_count,
+        x=x,
+        x_covariance=known.covariance,
+    )
+
+
+NO_ERRORS = "standard errors are not computed for so many parameters"
+
+
+def _noise(r, problem, freedom):
+    """σ̂ in units of the sigma given; with a robust loss by Huber's formula."""
+    if freedom == 0:
+        return np.nan
+    loss = problem.model.loss
+    if loss is None:
+        return float(np.sqrt(r @ r / freedom))
+    s = float(problem.scale)
+    influence = np.asarray(loss.influence(r / s))
+    return float(s * np.sqrt(influence @ influence / freedom) / np.mean(np.abs(r / s) <= loss.delta))
+
+
+def _not_determined(problem, x, known, theta, slope):
+    """In words; a second place tells whether it is a factor or a sum that does not show."""
+    free, p = problem.free, problem.free.size
+    nulls, thetas = [slope[:, None] * known.null[:p]], [theta]
+    elsewhere = jnp.asarray(x).at[:p].add(0.1 * jnp.cos(jnp.arange(p)))
+    rows = linearise(problem, elsewhere)
+    if failure_of(rows) is None:
+        there = determined_by(np.asarray(rows.jacobian)[: len(rows.residuals) - len(rows.gaps)], np.asarray(rows.gaps_jacobian))
+        nulls.append(np.asarray(free.slope(elsewhere[:p]))[:, None] * there.null[:p])
+        thetas.append(np.asarray(free.theta(elsewhere[:p])))
+    return in_words(free.entries, theta, nulls, thetas)
+
+
+def _place(problem, i):
+    return next((k, stack.members.index(i)) for k, stack in enumerate(problem.stacks) if i in stack.members)
+
+
+def _own_of(problem, x, rows, i, e, known, scale):
+    """The unknowns of an experiment's own, and their standard errors, by name."""
+    if not e.unknown:
+        return {}, {}
+    k, row = _place(problem, i)
+    stack, part, p = problem.stacks[k], rows.of_stacks[k], problem.free.size
+    at = p + sum(len(s.members) * s.unknowns for s in problem.stacks[:k]) + row * stack.unknowns
+    z, columns = x[at : at + stack.unknowns], np.r_[0:p, at : at + stack.unknowns]
+
+    def errors(J):
+        variance = np.einsum("ij,jk,ik->i", J, known.covariance[np.ix_(columns, columns)], J)
+        loose = np.any(np.abs(J @ known.null[columns]) > 1e-6 * np.max(np.abs(J), initial=1e-300), axis=1)
+        return np.where(loose, np.inf, scale * np.sqrt(np.maximum(variance, 0)))
+
+    one = jax.tree.map(lambda leaf: leaf[row] if eqx.is_array(leaf) else leaf, stack)
+    own, unravel_own = ravel_pytree({name: one.started(jnp.asarray(z))[2][name] for name in stack.own})
+    own_J = jax.jacfwd(lambda z: ravel_pytree({name: one.started(z)[2][name] for name in stack.own})[0])(jnp.asarray(z))
+    values, spreads = unravel_own(own), unravel_own(jnp.asarray(errors(np.hstack([np.zeros((own.size, p)), own_J]))))
+
+    unravel = ravel_pytree((e.q0, e.qdot0))[1]
+    half = rows.of_stacks[k].ends.shape[1] // 2
+    start = unravel(jnp.asarray(part.ends[row, :half]))
+    start_errors = unravel(jnp.asarray(errors(np.asarray(part.ends_jacobian[row, :half]))))
+    for which, value, error in zip(("q0", "qdot0"), start, start_errors, strict=True):
+        if any(is_within(name, which) for name in e.unknown):
+            values[which], spreads[which] = value, error
+    return values, spreads
+
+
+def _as_found(e, own):
+    """The experiment with its estimates put in."""
+    params = e.params | {name: value for name, value in own.items() if name in e.params}
+    return eqx.tree_at(lambda e: (e.q0, e.qdot0, e.params), e, (own.get("q0", e.q0), own.get("qdot0", e.qdot0), params))
+
+
+def _whole(problem, rows, experiments, whole):
+    """Residuals and predictions of each experiment, its pieces put together."""
+    residuals, predictions = [], []
+    samples = whole.samples or [e.ts.size for e in experiments]
+    for i, e in enumerate(experiments):
+        mine = [(j, n) for j, (of, n) in enumerate(zip(whole.of, samples, strict=True)) if of == i]
+        parts = []
+        for j, n in mine:
+            k, row = _place(problem, j)
+            parts.append(jax.tree.map(lambda x, row=row, n=n: np.asarray(x[row, :n]), rows.of_stacks[k].channels))
+        predictions.append(jax.tree.map(lambda *pieces: np.concatenate(pieces), *parts))
+        residuals.append(jax.tree.map(lambda z, p: np.asarray(z) - p, e.values, predictions[-1]))
+    return residuals, predictions

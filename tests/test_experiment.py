@@ -1,0 +1,130 @@
+"""Experiments as they come from a laboratory: gaps, tables, and data that cannot be right."""
+
+import numpy as np
+import oscillator as osc
+import pytest
+
+import jaxlag as jl
+
+T = np.linspace(0.0, 1.0, 5)
+X = np.cos(T)
+
+
+def experiment(ts=T, values=X, **more):
+    return jl.Experiment(ts, values, 1.0, 0.0, **more)
+
+
+BAD = {
+    "times that are not sorted": (lambda: experiment(ts=[0.0, 0.2, 0.1, 0.3, 0.4]), "`ts` must increase, but ts[1] = 0.2 is followed"),
+    "a time twice": (lambda: experiment(ts=[0.0, 0.1, 0.1, 0.3, 0.4]), "drop repeated ones"),
+    "one time": (lambda: experiment(ts=[0.0], values=[1.0]), "at least two times"),
+    "a channel of another length": (lambda: experiment(values={"x": X[:3]}), "`values['x']` must have one row for each of the 5 times"),
+    "a channel without a sample": (lambda: experiment(values={"x": X, "y": X * np.nan}), "every sample of a channel is missing"),
+    "an infinite sample": (lambda: experiment(values=np.where(T == 0.5, np.inf, X)), "Mark missing samples by NaN"),
+    "complex samples": (lambda: experiment(values=X * 1j), "must be an array of real numbers"),
+    "one number for a channel": (lambda: experiment(values=3.0), "must be an array of real numbers"),
+    "a sigma of zero": (lambda: experiment(sigma=0.0), "`sigma` must be positive"),
+    "a negative sigma at one sample": (lambda: experiment(sigma=[1.0, 1.0, -1.0, 1.0, 1.0]), "`sigma` must be positive"),
+    "sigma for another channel": (lambda: experiment(values={"x": X}, sigma={"y": 1.0}), "`sigma` must be a number or structured like"),
+    "an unknown that is not there": (lambda: experiment(unknown=("q0.y",)), "`unknown` must name q0, qdot0, entries of them"),
+    "a parameter that hides the state": (lambda: experiment(params={"q": 1.0}), "must not have an entry named 'q'"),
+    "channels that name no coordinate": (lambda: experiment(values={"x": X}), "`observe` must say what the sensors see"),
+    "q0 and qdot0 that differ": (lambda: jl.Experiment(T, X, {"x": 1.0}, 0.0), "`qdot0` must be structured like `q0`"),
+    "an unknown column": (lambda: jl.Experiment.from_dataframe(Frame(t=T, x=X), 1.0, 0.0, time="s"), "must have a column 's'"),
+}
+
+
+class Frame(dict):
+    """What data frames have in common."""
+
+    @property
+    def columns(self):
+        return list(self)
+
+    def __getitem__(self, name):
+        return Column(dict.__getitem__(self, name))
+
+
+class Column(np.ndarray):
+    def __new__(cls, values):
+        return np.asarray(values).view(cls)
+
+    def to_numpy(self):
+        return np.asarray(self)
+
+
+@pytest.mark.parametrize("case", BAD)
+def test_bad_data_are_refused_with_the_cure(case):
+    make, said = BAD[case]
+    with pytest.raises((ValueError, TypeError)) as error:
+        make()
+    assert said in str(error.value) and str(error.value).endswith(".")
+
+
+FREE = ("c", "b")
+BAD_FITS = {
+    "an unknown name": (lambda: fit(free=("d",)), "`free` must name entries of params, but holds 'd'. There are b, c, m."),
+    "a string": (lambda: fit(free="c"), "`free` must be a list of names"),
+    "a name twice": (lambda: fit(free=("c", "c")), "must name each parameter once"),
+    "nothing free": (lambda: fit(free=()), "must name at least one entry"),
+    "more unknowns than measurements": (
+        lambda: fit(experiments=jl.Experiment([0.0, 1.0], [1.0, np.nan], 1.0, 0.0)),
+        "2 unknowns stand against 1 measurements",
+    ),
+    "a start outside its bounds": (
+        lambda: fit(bounds={"c": (5.0, None)}),
+        "must start 'c' within its bounds, but 3 is not inside (5, inf)",
+    ),
+    "bounds in the wrong order": (lambda: fit(bounds={"c": (5.0, 1.0)}), "`bounds` of 'c' must be in order"),
+    "bounds of what is not free": (lambda: fit(bounds={"m": (0, 1)}), "`bounds` must name free parameters, but holds 'm'"),
+    "one bound": (lambda: fit(bounds={"c": 5.0}), "`bounds` must give two numbers for 'c'"),
+    "a prior without spread": (lambda: fit(priors={"c": (4.0, 0.0)}), "`priors` of 'c' must have a positive standard deviation"),
+    "no experiment": (lambda: fit(experiments=[]), "`experiments` must be an `Experiment` or a list of them"),
+    "a plan": (lambda: fit(experiments=jl.Experiment(T, None, 1.0, 0.0)), "must have been measured, but number 0 has no values"),
+    "params that are no mapping": (lambda: fit(params=[1.0]), "params"),
+    "an integer to be fitted": (lambda: fit(params=osc.START | {"c": np.array(3)}), "must name real numbers, but 'c' holds none"),
+    "sensors that see something else": (lambda: fit(observe=lambda q: {"y": q}), "`observe` must return what `values` holds"),
+    "sensors of another shape": (lambda: fit(observe=lambda q: {"x": q * np.ones(2)}), "must return real numbers of shape ()"),
+}
+
+
+def fit(experiments=None, params=osc.START, free=FREE, observe=lambda q: {"x": q}, **more):
+    if experiments is None:
+        experiments = jl.Experiment(T, {"x": X}, 1.0, 0.0, observe=observe)
+    return jl.fit(osc.SYSTEM, experiments, params, free=free, **more)
+
+
+@pytest.mark.parametrize("case", BAD_FITS)
+def test_what_cannot_be_fitted_is_refused_with_the_cure(case):
+    make, said = BAD_FITS[case]
+    with pytest.raises((ValueError, TypeError)) as error:
+        make()
+    assert said in str(error.value) and str(error.value).endswith(".")
+
+
+def test_a_table_in_a_file(tmp_path):
+    file = tmp_path / "drive.csv"
+    file.write_text("time [s]; x [m]; note\n0; 1.0; 7\n0.5; ; 7\n1; 0.5; 7\n")
+    e = jl.Experiment.from_csv(file, 1.0, 0.0, time="time [s]", channels={"x": "x [m]"}, delimiter=";", observe=lambda q: {"x": q})
+    np.testing.assert_array_equal(e.ts, [0, 0.5, 1])
+    np.testing.assert_array_equal(e.values["x"], [1.0, np.nan, 0.5])
+    assert set(e.values) == {"x"}
+    file.write_text("t,x\n0,1\n1,one\n")
+    with pytest.raises(ValueError, match="line 3, column 'x' must be a number, but is 'one'"):
+        jl.Experiment.from_csv(file, 1.0, 0.0, time="t", observe=lambda q: {"x": q})
+
+
+def test_a_data_frame():
+    e = jl.Experiment.from_dataframe(Frame(t=T, x=X, y=2 * X), {"x": 1.0, "y": 2.0}, {"x": 0.0, "y": 0.0}, time="t")
+    np.testing.assert_allclose(e.values["y"], 2 * X)
+    assert e.observe({"x": 3.0, "y": 4.0}) == {"x": 3.0, "y": 4.0}  # the coordinates that the columns are named after
+
+
+def test_times_are_irregular_and_samples_missing():
+    """Without noise the truth comes back whatever is missing."""
+    rng = np.random.default_rng(0)
+    ts = np.concatenate([[0.0], np.sort(rng.uniform(0, 10, 59))])
+    values = osc.with_nan(osc.position(ts), *rng.choice(60, 20, replace=False))
+    found = jl.fit(osc.SYSTEM, jl.Experiment(ts, values, 1.0, 0.0), osc.START, free=FREE)
+    np.testing.assert_allclose([found.estimates[name] for name in FREE], [4.0, 0.3], rtol=1e-6)
+    assert found.measurements == 40

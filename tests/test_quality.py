@@ -1,0 +1,283 @@
+"""The answer with its quality: errors that hold, what is not determined in words, prediction, comparison, robust and other methods."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+import oscillator as osc
+import pytest
+from scipy import optimize, stats
+
+import jaxlag as jl
+from jaxlag import _least_squares
+
+FREE = ("c", "b")
+
+
+def fit(experiments, params=osc.START, free=FREE, **more):
+    return jl.fit(osc.SYSTEM, experiments, params, free=free, **more)
+
+
+@pytest.fixture(scope="module")
+def plain():
+    return fit(osc.record(0))
+
+
+def by_scipy(z, ts=osc.TIMES, **more):
+    return optimize.least_squares(lambda p: osc.position(ts, *p) - z, [3.0, 0.6], xtol=1e-15, ftol=1e-15, gtol=1e-15, **more)
+
+
+def test_estimates_and_errors_are_those_of_scipy(plain):
+    found = by_scipy(osc.noisy(0), jac="3-point")
+    np.testing.assert_allclose([plain.estimates[name] for name in FREE], found.x, rtol=1e-6)
+    covariance = np.linalg.inv(found.jac.T @ found.jac) * 2 * found.cost / 58
+    np.testing.assert_allclose(plain.covariance, covariance, rtol=1e-4)
+    np.testing.assert_allclose(plain.cost, found.cost, rtol=1e-6)
+    t = stats.t.ppf(0.95, 58)
+    low, high = plain.interval("c", 0.9)
+    np.testing.assert_allclose([low, high], found.x[0] + t * np.sqrt(covariance[0, 0]) * np.array([-1, 1]), rtol=1e-5)
+
+
+def test_the_95_percent_intervals_hold_the_truth_in_95_percent():
+    """400 recordings with new noise, fitted in one batch; also σ̂ is right."""
+    fits = jl.fit_each(osc.SYSTEM, [osc.record(seed) for seed in range(400)], osc.START, free=FREE)
+    assert all(f.converged for f in fits)
+    for name in FREE:
+        inside = [f.interval(name).lower < osc.TRUE[name] < f.interval(name).upper for f in fits]
+        assert 0.92 <= np.mean(inside) <= 0.98
+    np.testing.assert_allclose(np.mean([f.sigma for f in fits]), 0.01, rtol=0.02)
+
+
+def test_a_fit_of_each_is_the_fit_of_each(plain):
+    pair = jl.fit_each(osc.SYSTEM, [osc.record(0), osc.record(1)], osc.START, free=FREE)
+    np.testing.assert_allclose(pair[0].covariance, plain.covariance, rtol=1e-5)
+    np.testing.assert_allclose(pair[0].residuals[0], plain.residuals[0], atol=1e-7)
+    assert pair[0].estimates["c"] != pair[1].estimates["c"]
+
+
+def test_profile_likelihood_against_scipy():
+    """Few samples and much noise: the interval is not symmetric."""
+    ts = osc.TIMES[::4]
+    z = osc.noisy(3, ts, sigma=0.3)
+    found = fit(jl.Experiment(ts, z, 1.0, 0.0), bounds={"b": (0, None)})
+    best, t = by_scipy(z, ts), stats.t.ppf(0.975, len(ts) - 2)
+    limit = best.cost + t**2 * best.cost / (len(ts) - 2)
+
+    def rise(b):
+        return (
+            optimize.minimize_scalar(lambda c: 0.5 * np.sum((osc.position(ts, c, b) - z) ** 2), bounds=(2, 6), method="bounded").fun - limit
+        )
+
+    upper = optimize.brentq(rise, best.x[1], 3.0)
+    profile, linear = found.interval("b", profile=True), found.interval("b")
+    np.testing.assert_allclose(profile.upper, upper, rtol=2e-2)
+    assert abs(profile.upper - linear.upper) > 0.02 * (linear.upper - linear.lower)  # linearised is something else here
+
+
+def test_ratios_are_named_where_only_they_are_determined():
+    found = fit(osc.record(0), osc.START | {"m": 1.3}, free=("b", "c", "m"))
+    assert found.remarks == ["only b/m and c/m are determined; their common factor is not"]
+    assert all(np.isinf(found.standard_errors[name]) for name in ("b", "c", "m"))
+    np.testing.assert_allclose(found.estimates["c"] / found.estimates["m"], by_scipy(osc.noisy(0)).x[0], rtol=1e-4)
+    assert "! only b/m and c/m are determined" in repr(found) and repr(found).count("not determined by these measurements") == 3
+
+
+def test_sums_and_idle_parameters_are_named():
+    system = jl.System(
+        lambda q, qdot, c: 0.5 * qdot**2 - 0.5 * c * q**2, dissipation=lambda qdot, b1, b2, idle: 0.5 * (b1 + 2 * b2) * qdot**2 + 0 * idle
+    )
+    found = jl.fit(system, osc.record(0), {"c": 3.0, "b1": 0.2, "b2": 0.1, "idle": 2.0}, free=("c", "b1", "b2", "idle"))
+    assert found.remarks[0] == "idle has no influence on these measurements"
+    assert found.remarks[1] in ("only b1 + 2 b2 is determined; b1 and b2 one by one are not",)
+    assert np.isfinite(found.standard_errors["c"]) and np.isinf(found.standard_errors["b1"])
+
+
+@pytest.mark.parametrize(
+    "change, said",
+    [
+        (lambda a, b, c: (a**2 / b) + 0 * c, "only a/b^(1/2) is determined"),
+        (lambda a, b, c: (a - b / 2) * c, None),
+    ],
+)
+def test_other_combinations(change, said):
+    """In closed form: what does not show are the changes along which a function of the parameters is constant."""
+    from jaxlag._quality import in_words
+
+    def null(theta):
+        slope = np.array(jax.grad(lambda t: change(*t))(jnp.asarray(theta)))[None, :]
+        return np.linalg.svd(slope)[2][1:].T
+
+    places = [np.array([2.0, 3.0, 5.0]), np.array([2.2, 2.5, 5.5])]
+    words = in_words(("a", "b", "c"), places[0], [null(p) for p in places], places)
+    if said:
+        assert words == ["c has no influence on these measurements", f"{said}; a and b one by one are not"]
+    else:
+        assert "a, b and c are not determined one by one: they can change together without showing" in words[0]
+
+
+def test_bounds_hold_and_the_inside_is_unchanged(plain):
+    inside = fit(osc.record(0), bounds={"c": (0, 100), "b": (0, None)})
+    np.testing.assert_allclose(inside.covariance, plain.covariance, rtol=1e-4)
+    np.testing.assert_allclose(inside.estimates["b"], plain.estimates["b"], rtol=1e-6)
+    held = fit(osc.record(0), bounds={"c": (None, 3.9)}, max_steps=30)
+    assert 3.85 < held.estimates["c"] < 3.9
+
+
+def test_a_prior_is_one_more_measurement(plain):
+    """Linear theory: the precision adds up, the estimate is the weighted mean."""
+    sigma = 0.01
+    weak = fit(osc.record(0, sigma=sigma))
+    prior = fit(osc.record(0, sigma=sigma), priors={"b": (0.303, 0.003)})
+    information = np.linalg.inv(weak.covariance) + np.diag([0, 0.003**-2])
+    np.testing.assert_allclose(prior.covariance, np.linalg.inv(information), rtol=0.05)
+    step = np.linalg.solve(information, [0, (0.303 - float(weak.estimates["b"])) / 0.003**2])
+    np.testing.assert_allclose(float(prior.estimates["b"] - weak.estimates["b"]), step[1], rtol=0.05)
+
+
+def test_outliers_do_not_rule_a_robust_fit():
+    z = osc.noisy(2)
+    z[::7] += 0.5
+    robust = fit(jl.Experiment(osc.TIMES, z, 1.0, 0.0, sigma=0.01), loss=jl.Huber(1.345))
+    found = optimize.least_squares(
+        lambda p: (osc.position(osc.TIMES, *p) - z) / 0.01, [3.9, 0.35], loss="huber", f_scale=1.345, xtol=1e-14, ftol=1e-14, gtol=1e-14
+    )
+    np.testing.assert_allclose([robust.estimates[name] for name in FREE], found.x, rtol=1e-5)
+    by_itself = fit(jl.Experiment(osc.TIMES, z, 1.0, 0.0), loss=jl.Huber())
+    for name in FREE:
+        assert abs(by_itself.estimates[name] - osc.TRUE[name]) < 4 * by_itself.standard_errors[name]
+    assert 0.005 < by_itself.sigma < 0.03 < fit(jl.Experiment(osc.TIMES, z, 1.0, 0.0)).sigma
+
+
+def test_prediction_with_a_band_and_validation(plain):
+    """The band against the closed form of the derivatives, the new start against exact data."""
+    ts = np.linspace(0, 5, 30)
+    plan = jl.Experiment(ts, None, 0.0, 1.0)
+    seen = plain.predict(plan)
+    theta = np.array([plain.estimates[name] for name in FREE])
+    at = lambda c, b: osc.position(ts, c, b, 0.0, 1.0)
+    J = np.stack([(at(*(theta + d)) - at(*(theta - d))) / 2e-6 for d in 1e-6 * np.eye(2)], axis=1)
+    np.testing.assert_allclose(seen.values, at(*theta), atol=1e-7)
+    np.testing.assert_allclose(seen.standard_errors, np.sqrt(np.diag(J @ plain.covariance @ J.T)), atol=1e-8)
+    assert np.all((seen.lower <= seen.values) & (seen.values <= seen.upper)) and seen.motion.succeeded
+
+    other = jl.Experiment(ts, osc.position(ts, x0=0.4, v0=-1.0), 0.3, 0.0, unknown=("q0", "qdot0"))
+    checked = jl.validate(plain, other)
+    assert checked.channels[0].fit_percent > 98 and "Validation" in repr(checked)
+    wrong = jl.validate(plain, jl.Experiment(ts, osc.position(ts, c=9.0), 1.0, 0.0))
+    assert wrong.channels[0].fit_percent < 50 and wrong.channels[0].whiteness < 1e-6
+
+
+def test_is_there_really_a_damper():
+    undamped, damped = osc.noisy(5, b=1e-12), osc.noisy(5)
+    for z, best in ((undamped, "without"), (damped, "with")):
+        e = jl.Experiment(osc.TIMES, z, 1.0, 0.0)
+        models = {"with": fit(e), "without": fit(e, osc.START | {"b": 0.0}, free=("c",))}
+        table = jl.compare(models)
+        assert table.names[0] == best
+    squares = [2 * models[name].cost for name in ("without", "with")]
+    np.testing.assert_allclose(table.aic["without"], 60 * np.log(squares[0] / squares[1]) - 2, rtol=1e-8)
+    np.testing.assert_allclose(table.bic["without"], 60 * np.log(squares[0] / squares[1]) - np.log(60), rtol=1e-8)
+    assert "very strong" in repr(table)
+    with pytest.raises(ValueError, match="must be of the same measurements"):
+        jl.compare({"a": models["with"], "b": fit(osc.record(6))})
+
+
+def test_information_is_what_a_fit_then_has():
+    plan = jl.Experiment(osc.TIMES, None, 1.0, 0.0, sigma=0.01)
+    expected = jl.information(osc.SYSTEM, plan, osc.TRUE, FREE)
+    h = 1e-6
+    J = np.stack(
+        [
+            (osc.position(osc.TIMES, 4 + h) - osc.position(osc.TIMES, 4 - h)),
+            (osc.position(osc.TIMES, b=0.3 + h) - osc.position(osc.TIMES, b=0.3 - h)),
+        ],
+        axis=1,
+    )
+    J /= 2 * h * 0.01
+    np.testing.assert_allclose(expected.matrix, J.T @ J, rtol=1e-5)
+    np.testing.assert_allclose([expected.standard_errors[name] for name in FREE], np.sqrt(np.diag(np.linalg.inv(J.T @ J))), rtol=1e-5)
+    unsure = jl.information(osc.SYSTEM, jl.Experiment(osc.TIMES, None, 1.0, 0.0, sigma=0.01, unknown=("q0", "qdot0")), osc.TRUE, FREE)
+    assert unsure.standard_errors["b"] > expected.standard_errors["b"]
+    np.testing.assert_allclose(np.linalg.inv(unsure.matrix), unsure.covariance, rtol=1e-6)
+    assert "not determined" in repr(jl.information(osc.SYSTEM, plan, osc.TRUE, ("b", "c", "m")))
+    with pytest.raises(ValueError, match="has no `sigma`"):
+        jl.information(osc.SYSTEM, jl.Experiment(osc.TIMES, None, 1.0, 0.0), osc.TRUE, FREE)
+
+
+def test_many_starts_find_what_one_does_not():
+    """A frequency four times off has minima of its own."""
+    far = osc.START | {"c": 40.0}
+    bounds = {"c": (1.0, 60.0), "b": (0.01, 2.0)}
+    alone, many = (fit(osc.record(0), far, bounds=bounds, starts=n) for n in (1, 24))
+    assert abs(alone.estimates["c"] - 4) > 1
+    np.testing.assert_allclose(many.estimates["c"], by_scipy(osc.noisy(0)).x[0], rtol=1e-5)
+
+
+def test_starts_that_cannot_be_simulated_do_no_harm():
+    """Without a bound on c some of the motions explode within the steps allowed."""
+    found = fit(osc.record(0), osc.START | {"c": 0.5}, starts=8, max_steps=60)
+    np.testing.assert_allclose(found.estimates["c"], by_scipy(osc.noisy(0)).x[0], rtol=1e-4)
+
+
+def test_optimisers_of_optax(plain):
+    found = fit(osc.record(0), method=optax.lbfgs(), max_steps=40)
+    np.testing.assert_allclose([found.estimates[name] for name in FREE], [plain.estimates[name] for name in FREE], rtol=1e-5)
+    np.testing.assert_allclose(found.covariance, plain.covariance, rtol=1e-3)
+    assert found.costs[-1] < found.costs[0] and found.steps == 40
+
+
+def test_an_interrupted_fit_returns_the_best_so_far(monkeypatch):
+    calls = []
+    original = _least_squares.ONE[1]
+
+    def interrupting(*args):
+        calls.append(1)
+        if len(calls) == 3:
+            raise KeyboardInterrupt
+        return original(*args)
+
+    monkeypatch.setattr(_least_squares, "ONE", (_least_squares.ONE[0], interrupting, _least_squares.ONE[2]))
+    found = fit(osc.record(0))
+    assert not found.converged and "interrupted by the keyboard" in found.reason and "interrupted" in repr(found)
+    assert found.cost < found.costs[0]
+
+
+def test_a_start_without_a_motion_is_refused():
+    system = jl.System(lambda q, qdot, c: 0.5 * qdot**2 + 0.25 * c * q**4)
+    e = jl.Experiment(osc.TIMES, osc.position(osc.TIMES), 1.0, 0.0)
+    with pytest.raises(ValueError, match="the motion at the start must be computable, but ended with"):
+        jl.fit(system, e, {"c": 5.0}, free=("c",), max_steps=5)
+
+
+def test_paths_vectors_and_payloads():
+    """A parameter deep in the tree; two machines of one spring with payloads of their own, one of them unknown."""
+    system = jl.System(lambda q, qdot, body, load: 0.5 * (body["m"] + load) * qdot**2 - 0.5 * body["c"] @ jnp.ones(2) * q**2)
+    ts = osc.TIMES
+    e1, e2 = (
+        jl.Experiment(ts, np.cos(np.sqrt(4 / m) * ts), 1.0, 0.0, params={"load": load}, unknown=unknown)
+        for m, load, unknown in ((1.0, 0.0, ()), (1.5, 0.4, ("load",)))
+    )
+    params = {"body": {"m": 1.0, "c": np.array([1.5, 2.0])}}
+    found = jl.fit(system, [e1, e2], params, free=("body.c",), priors={"body.c[0]": (1.6, 1e-6)})
+    np.testing.assert_allclose(found.estimates["body.c"], [1.6, 2.4], rtol=1e-5)
+    np.testing.assert_allclose(found.unknowns[1]["load"], 0.5, rtol=1e-5)
+    assert found.names == ("body.c[0]", "body.c[1]") and found.unknowns[0] == {}
+    assert np.isfinite(found.unknown_errors[1]["load"]) and "experiment 1: load" in repr(found)
+    np.testing.assert_allclose(found.experiments[1].params["load"], 0.5, rtol=1e-5)
+
+
+def test_gain_offset_and_delay_of_a_sensor():
+    ts = osc.TIMES + 0.0
+    true = {"gain": 2.5, "offset": -0.3, "lag": 0.05}
+    seen = true["gain"] * np.where(ts > true["lag"], osc.position(np.maximum(ts - true["lag"], 0)), 1.0) + true["offset"]
+    e = jl.Experiment(ts, seen, 1.0, 0.0, observe=lambda q, gain, offset: gain * q + offset, delay=lambda lag: lag)
+    found = fit(e, osc.START | {"gain": 2.0, "offset": 0.0, "lag": 0.02}, free=(*FREE, "gain", "offset", "lag"))
+    np.testing.assert_allclose([found.estimates[name] for name in ("c", "b", *true)], [4.0, 0.3, *true.values()], rtol=1e-5)
+    fixed = fit(jl.Experiment(ts, seen, 1.0, 0.0, observe=lambda q: 2.5 * q - 0.3, delay=0.05))
+    np.testing.assert_allclose(fixed.estimates["c"], 4.0, rtol=1e-6)
+
+
+def test_single_precision(single_precision):
+    found = fit(osc.record(0))
+    assert found.estimates["c"].dtype == jnp.float32
+    np.testing.assert_allclose([found.estimates[name] for name in FREE], by_scipy(osc.noisy(0)).x, rtol=2e-3)

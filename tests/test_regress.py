@@ -1,0 +1,126 @@
+"""Inverse-dynamics identification, and the friction of a drive axis by both methods."""
+
+import jax.numpy as jnp
+import numpy as np
+import oscillator as osc
+import pytest
+
+import jaxlag as jl
+
+AXIS = jl.System(
+    lambda qdot, M: 0.5 * M * qdot**2,
+    dissipation=lambda qdot, Fv, Fc: 0.5 * Fv * qdot**2 + Fc * jnp.abs(qdot),
+    force=lambda t, u, offset: u(t) - offset,
+)
+TRUE = {"M": 2.0, "Fv": 3.0, "Fc": 4.0, "offset": 0.5}
+
+
+def held(q, v, u, left, M, Fv, Fc, offset):
+    """Position and velocity after a time under a constant force: piecewise exponentials, in closed form."""
+    u = u - offset
+    while left > 0:
+        if v == 0 and abs(u) <= Fc:
+            return q, 0.0
+        final = (u - Fc * (np.sign(v) if v else np.sign(u))) / Fv
+        share = final / (final - v) if v and final != v else -1
+        until = min(left, -np.log(share) * M / Fv if 0 < share < 1 else np.inf)
+        decayed = np.exp(-Fv * until / M)
+        q, v = q + final * until + (v - final) * (1 - decayed) * M / Fv, final + (v - final) * decayed if until == left else 0.0
+        left -= until
+    return q, v
+
+
+def closed_loop(noise, seed=0, T=8.0, dt=0.01):
+    """The axis led along a path by a controller that holds its force for 10 ms."""
+    ts = np.arange(int(T / dt) + 1) * dt
+    path, speed = 0.3 * np.sin(1.3 * ts) + 0.1 * np.sin(3.1 * ts), 0.39 * np.cos(1.3 * ts) + 0.31 * np.cos(3.1 * ts)
+    states, forces = [(0.0, 0.0)], []
+    for goal, goal_speed in zip(path, speed, strict=True):
+        q, v = states[-1]
+        forces.append(400 * (goal - q) + 40 * (goal_speed - v))
+        states.append(held(q, v, forces[-1], dt, **TRUE))
+    q, v = np.array(states[:-1]).T
+    return ts, q + noise * np.random.default_rng(seed).standard_normal(q.size), v, np.array(forces)
+
+
+@pytest.fixture(scope="module")
+def axis():
+    ts, q, v, u = closed_loop(noise=2e-6)
+    assert np.sum(v == 0) > 20  # it sticks at times
+    return jl.Experiment(ts, q, 0.0, 0.0, params={"u": jl.Signal(ts, u, "hold")})
+
+
+FREE = tuple(TRUE)
+
+
+def test_the_friction_of_a_drive_axis_by_regression(axis):
+    found = jl.regress(AXIS, axis, dict.fromkeys(FREE, np.nan), free=FREE)
+    assert found.linear and "linear, solved in one step" in repr(found)
+    for name in FREE:
+        assert abs(found.estimates[name] / TRUE[name] - 1) < 0.01, name
+
+
+def test_the_friction_of_a_drive_axis_by_fit_with_exact_stick_slip(axis):
+    """Started by regression, where no start is given."""
+    found = jl.fit(AXIS, axis, dict.fromkeys(FREE, np.nan), free=FREE)
+    assert found.converged
+    for name in FREE:
+        assert abs(found.estimates[name] / TRUE[name] - 1) < 0.005, name
+
+
+def test_a_linear_regression_needs_no_start_and_is_exact_on_exact_data():
+    """What is left is the error of the splines."""
+    found = jl.regress(osc.SYSTEM, jl.Experiment(osc.TIMES, osc.position(osc.TIMES), 1.0, 0.0), osc.START | {"c": np.nan}, free=("c", "b"))
+    assert found.linear
+    np.testing.assert_allclose([found.estimates["c"], found.estimates["b"]], [4.0, 0.3], rtol=1e-4)
+
+
+def test_velocities_or_accelerations_are_enough():
+    ts = np.linspace(0, 10, 200)
+    h = 1e-4
+    v = (osc.position(ts + h) - osc.position(ts - h)) / (2 * h)
+    for values, observe in ((v, lambda qdot: qdot), (-4 * osc.position(ts) - 0.3 * v, lambda qddot: qddot)):
+        e = jl.Experiment(ts, values, 1.0, 0.0, observe=observe)
+        found = jl.regress(osc.SYSTEM, e, osc.START, free=("c", "b"))
+        np.testing.assert_allclose([found.estimates["c"], found.estimates["b"]], [4.0, 0.3], rtol=1e-3)
+
+
+def test_equations_in_which_everything_is_free_have_no_scale():
+    with pytest.raises(ValueError, match="only their ratios are determined. Hold one of them."):
+        jl.regress(osc.SYSTEM, osc.record(0), osc.START, free=("m", "c", "b"))
+
+
+def test_a_nonlinear_parameter_with_bounds():
+    """The exponent of a drag is not linear; SciPy made the data."""
+    from scipy.integrate import solve_ivp
+
+    ts = np.linspace(0, 3, 150)
+    data = solve_ivp(lambda t, s: [s[1], -0.8 * s[1] ** 1.6], (0, 3), [0, 4.0], t_eval=ts, rtol=1e-11, atol=1e-12).y[0]
+    system = jl.System(lambda qdot: 0.5 * qdot**2, dissipation=lambda qdot, k, n: k * jnp.abs(qdot) ** (n + 1) / (n + 1))
+    e = jl.Experiment(ts, data, 0.0, 4.0)
+    found = jl.regress(system, e, {"k": 0.3, "n": 1.2}, free=("k", "n"), bounds={"k": (0, None), "n": (0.5, 3)})
+    assert not found.linear
+    np.testing.assert_allclose([found.estimates["k"], found.estimates["n"]], [0.8, 1.6], rtol=5e-3)
+
+
+def test_what_no_sensor_sees_is_refused():
+    e = jl.Experiment(osc.TIMES, osc.position(osc.TIMES), 1.0, 0.0, observe=lambda multipliers: multipliers["rod"])
+    with pytest.raises(ValueError, match="must see positions, velocities or accelerations, but sees none"):
+        jl.regress(jl.System(lambda qdot, m: 0.5 * m * qdot**2), e, {"m": 1.0}, free=("m",))
+
+
+def test_an_unknown_multiplier_is_eliminated():
+    """The pendulum in Cartesian coordinates: gravity, damping and length, with the rod's force unknown."""
+    from scipy.integrate import solve_ivp
+
+    ts = np.linspace(0, 4, 200)
+    l, d = 0.7, 0.4
+    phi = solve_ivp(lambda t, s: [s[1], -9.81 / l * np.sin(s[0]) - d * s[1]], (0, 4), [1.2, 0], t_eval=ts, rtol=1e-11, atol=1e-12).y[0]
+    values = np.stack([l * np.sin(phi), -l * np.cos(phi)], axis=1)
+    system = jl.System(
+        lambda q, qdot, g: 0.5 * qdot @ qdot - g * q[1],
+        dissipation=lambda qdot, d: 0.5 * d * qdot @ qdot,
+        holonomic={"rod": lambda q, l: q @ q - l**2},
+    )
+    found = jl.regress(system, jl.Experiment(ts, values, values[0], np.zeros(2)), {"g": 8.0, "d": 1.0, "l": 1.0}, free=("g", "d", "l"))
+    np.testing.assert_allclose([found.estimates[name] for name in ("g", "d", "l")], [9.81, d, l], rtol=2e-3)
