@@ -12,8 +12,9 @@ What a dissipation function has to be is built in, not asked of the data:
     Potential             V any smooth bounded function
     ConvexPotential       V convex, with its minimum 0 at a given position
 
-Their one activation is σ(x) = ½(x + √(1 + x²)), convex and increasing (Barron, Squareplus, arXiv:2112.11687), for what σ has beyond its
-tangent has a closed form, δ² over a positive number: zero and flat at δ = 0 to the last bit, without a difference of equal numbers.
+The promises rest on weights made positive by softplus and on σ(x) = ½(x + √(1 + x²)), convex and increasing (Barron, Squareplus,
+arXiv:2112.11687): what σ has beyond its tangent is δ² over a positive number, zero and flat at δ = 0 to the last bit, where softplus
+would leave a difference of equal numbers.
 """
 
 import math
@@ -152,8 +153,8 @@ class Potential(eqx.Module):
 
     $$ V(q) = E\,w\cdot z_K, \qquad z_{k+1} = \tanh(W_k z_k + b_k), \qquad z_0 = q/\text{scale} $$
 
-    Smooth, and bounded by E Σ|w| on both sides: its force conserves energy for any weights, and draws no more than that from it. For what
-    holds far out add what grows there, `net(q) + 0.5 * c * q**2`. A constant in V does nothing, so there is none.
+    Its force conserves energy for any weights, and |V| ≤ E Σ|w|: what can be drawn from it is bounded. It does not hold a body back far
+    out; add what does, `net(q) + 0.5 * c * q**2`. A constant in V does nothing, so there is none.
 
     **Arguments:** as `ConvexDissipation`, of `q`: `scale` positions over which the force changes, `energy` the size of V. An angle that
     turns over goes in as `[sin, cos]`.
@@ -244,8 +245,8 @@ def _beyond(c, d):
     root = jnp.sqrt(1 + c**2)
     p = 1 + c * (c + d)
     same_sign = p > 0
-    sum_ = root * jnp.sqrt(1 + (c + d) ** 2) + jnp.where(same_sign, p, -p)
-    return 0.5 * jnp.where(same_sign, d**2 / sum_, sum_) / root
+    both = root * jnp.sqrt(1 + (c + d) ** 2) + jnp.where(same_sign, p, -p)
+    return 0.5 * jnp.where(same_sign, d**2 / both, both) / root
 
 
 def _rise(c, y):

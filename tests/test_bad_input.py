@@ -104,7 +104,6 @@ def test_under_jit_a_failure_is_a_result():
 
 EXPERIMENT = {
     "values without a row a time": (lambda: jl.Experiment(TS, np.ones(4), 1.0, 0.0, observe=lambda q: q), r"`values` must have one row for each of the 5 times, but has shape \(4,\)"),
-    "missing samples": (lambda: jl.Experiment(TS, {"y": [1, 2, np.nan, 4, 5]}, 1.0, 0.0, observe=lambda q: q), r"`values\['y'\]` must be finite, but has 1 missing"),
     "sigma of zero": (lambda: jl.Experiment(TS, np.ones(5), 1.0, 0.0, observe=lambda q: q, sigma=0.0), "`sigma` must be positive"),
     "sigma of a wrong kind": (lambda: jl.Experiment(TS, {"y": np.ones(5)}, 1.0, 0.0, observe=lambda q: q, sigma={"z": 1.0}), "`sigma` must be a number or structured like `values`"),
     "times that go back": (lambda: jl.Experiment(TS[::-1], np.ones(5), 1.0, 0.0, observe=lambda q: q), "`ts` must increase"),
