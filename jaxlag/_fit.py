@@ -13,7 +13,7 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import PyTree
 from scipy import special  # comes with JAX
 
-from ._experiment import Experiment, entry_names
+from ._experiment import Experiment, entry_names, is_within
 from ._least_squares import levenberg_marquardt
 from ._problem import Problem, blank, linearise
 from ._quality import Channel
@@ -200,27 +200,27 @@ class Fit:
         return "\n".join([*rows, f"  residual sigma  {self.sigma:.4g}{'  (1 where the noise is as said)' if self.absolute else ''}"])
 
     def _parameter_rows(self):
-        own = [
-            (f"experiment {k}: {which}", tree, self.unknown_errors[k][which])
-            for k, unknowns in enumerate(self.unknowns)
-            for which, tree in unknowns.items()
-        ]
+        """Estimates, errors and intervals; many numbers of one name in one row."""
         theta = np.asarray(self.problem.free.theta(jnp.asarray(self.x[: len(self.names)])))
         triples = list(zip(self.names, theta, np.sqrt(np.diag(self.covariance)), strict=True))
-        for label, tree, errors in own:
-            entries = [f"{label}{'.' if name[:1].isalpha() else ''}{name}" for name in entry_names(tree)]
-            triples += zip(entries, np.asarray(ravel_pytree(tree)[0]), np.asarray(ravel_pytree(errors)[0]), strict=True)
-        more = [f"  … and {len(triples) - SHOWN} more"] if len(triples) > SHOWN else []
-        triples = triples[:SHOWN]
-        width = max((len(name) for name, _, _ in triples), default=0)
+        groups = [(name, [triple for triple in triples if is_within(triple[0], name)]) for name in self.estimates]
+        for k, unknowns in enumerate(self.unknowns):
+            for which, tree in unknowns.items():
+                label = f"experiment {k}: {which}"
+                entries = [f"{label}{'.' if name[:1].isalpha() else ''}{name}" for name in entry_names(tree)]
+                values, errors = (np.asarray(ravel_pytree(x)[0]) for x in (tree, self.unknown_errors[k][which]))
+                groups.append((label, list(zip(entries, values, errors, strict=True))))
+        named = [(name, self._spoken(v, e)) for _, group in groups if len(group) <= MANY for name, v, e in group]
+        named += [(name, _counted(group)) for name, group in groups if len(group) > MANY]
+        width = max((len(name) for name, _ in named[:SHOWN]), default=0)
+        rows = [f"  {name:<{width}}  {said}" for name, said in named[:SHOWN]]
+        return rows + ([f"  … and {len(named) - SHOWN} more"] if len(named) > SHOWN else [])
+
+    def _spoken(self, value, error):
+        if not np.isfinite(error):
+            return "not determined by these measurements" if np.isinf(error) else f"{value:.6g}"
         t = self._quantile(0.95)
-        rows = []
-        for name, value, error in triples:
-            if not np.isfinite(error):
-                rows.append(f"  {name:<{width}}  not determined by these measurements")
-            else:
-                rows.append(f"  {name:<{width}}  {plus_minus(value, error):<24} 95 %: {value - t * error:.6g} … {value + t * error:.6g}")
-        return rows + more
+        return f"{plus_minus(value, error):<24} 95 %: {value - t * error:.6g} … {value + t * error:.6g}"
 
     def _correlation_rows(self):
         pairs = itertools.combinations(range(min(len(self.names), SHOWN)), 2)
@@ -229,6 +229,13 @@ class Fit:
 
 
 SHOWN = 40  # rows of a table at most
+MANY = 16  # numbers of one name, beyond which they are counted only
+
+
+def _counted(group):
+    errors = np.array([error for _, _, error in group])
+    known = "" if np.all(np.isnan(errors)) else f", {np.count_nonzero(np.isfinite(errors))} of them determined one by one"
+    return f"{len(group)} numbers{known}"
 
 
 def channel_rows(channels: Sequence[Channel]) -> list[str]:

@@ -68,17 +68,15 @@ class Problem(eqx.Module):
         """All residuals and their Jacobian."""
         y, zs = self.split(x)
         parts = tuple(linearised(self.model, self.free, stack, y, z, self.scale) for stack, z in zip(self.stacks, zs, strict=True))
-        blocks = [(self.free.surprise(y), self._widened(jnp.diag(self.free.slope(y) / self.free.spread)))]
-        at = self.free.size
-        for stack, part in zip(self.stacks, parts, strict=True):
-            count, d = len(stack.members), stack.unknowns
-            blocks.append((part.residuals.ravel(), self._placed(part.jacobian, at, d)))
-            at += count * d
+        prior = jnp.zeros((self.free.size, self.size), x.dtype).at[:, : self.free.size].set(jnp.diag(self.free.slope(y) / self.free.spread))
+        blocks = [(self.free.surprise(y), prior)]
+        for k, part in enumerate(parts):
+            blocks.append((part.residuals, self._over_all(k, np.arange(len(part.residuals)), part.jacobian)))
         gaps, gaps_J = jnp.zeros(0), jnp.zeros((0, self.size))
         if self.links is not None:
             gaps, gaps_J = self._gaps(parts)
             blocks.append((self.links.weight * (gaps + self.links.dual), self.links.weight * gaps_J))
-        residuals, jacobians = zip(*blocks, strict=True)
+        residuals, jacobians = zip(*((r.ravel(), J.reshape(-1, self.size)) for r, J in blocks), strict=True)
         return Rows(jnp.concatenate(residuals), jnp.concatenate(jacobians), parts, gaps, gaps_J)
 
     def cost(self, x: Array) -> Array:
@@ -89,16 +87,12 @@ class Problem(eqx.Module):
             total = total + jnp.sum(members(self.model, self.free, stack, y, z, self.scale).residuals ** 2)
         return total / 2
 
-    def _widened(self, J):
-        return jnp.concatenate([J, jnp.zeros((J.shape[0], self.size - J.shape[1]), J.dtype)], axis=1)
-
-    def _placed(self, J, at, d):
-        """Rows of the experiments in one matrix: the free parameters are common, the other columns each experiment's own."""
-        count, rows, _ = J.shape
+    def _over_all(self, k, members, J):
+        """Rows of some experiments of stack k, over (y, z), as rows over all unknowns."""
         p = self.free.size
-        own = jnp.zeros((count, rows, count, d), J.dtype).at[jnp.arange(count), :, jnp.arange(count), :].set(J[:, :, p:])
-        left = jnp.zeros((count * rows, at - p), J.dtype)
-        return self._widened(jnp.concatenate([J[:, :, :p].reshape(count * rows, p), left, own.reshape(count * rows, count * d)], axis=1))
+        wide = jnp.zeros((*J.shape[:2], self.size), J.dtype).at[:, :, :p].set(J[:, :, :p])
+        at = np.arange(len(members))[:, None, None], np.arange(J.shape[1])[:, None], self.own_columns(k, members)[:, None]
+        return wide.at[at].set(J[:, :, p:])
 
     def _gaps(self, parts):
         """c and its Jacobian; the links between one pair of stacks together."""
@@ -110,15 +104,12 @@ class Problem(eqx.Module):
         return jnp.concatenate(gaps), jnp.concatenate(jacobians)
 
     def _gaps_between(self, parts, a, b, rows):
-        p, (of_a, of_b) = self.free.size, rows
+        of_a, of_b = rows
         ends = self.links.size.size
         W = self.stacks[b].ways[of_b].swapaxes(1, 2) / self.links.size[None, None, :]
         gap = parts[a].ends[of_a, ends:] - parts[b].ends[of_b, :ends]
         end, start = W @ parts[a].ends_jacobian[of_a, ends:], W @ parts[b].ends_jacobian[of_b, :ends]
-        J = jnp.zeros((*end.shape[:2], self.size), end.dtype).at[:, :, :p].set(end[:, :, :p] - start[:, :, :p])
-        which = np.arange(len(of_a))[:, None, None], np.arange(end.shape[1])[:, None]
-        J = J.at[*which, self.own_columns(a, of_a)[:, None]].add(end[:, :, p:])
-        J = J.at[*which, self.own_columns(b, of_b)[:, None]].add(-start[:, :, p:])
+        J = self._over_all(a, of_a, end) - self._over_all(b, of_b, start)
         return jnp.einsum("lij,lj->li", W, gap).ravel(), J.reshape(-1, self.size)
 
     def own_columns(self, k: int, rows: np.ndarray) -> np.ndarray:

@@ -13,6 +13,7 @@ from scipy import special  # comes with JAX
 from ._experiment import entry_names
 
 LAGS = 20
+MANY = 12  # parameters that are looked at for what they determine together
 NOTHING = 1e-9  # singular values below this part of the largest are zero: columns have norm one, and are as exact as the integration
 
 
@@ -112,6 +113,8 @@ def in_words(names: Sequence[str], theta: np.ndarray, nulls: Sequence[np.ndarray
     if not involved:
         return said
     shown = [names[i] for i in involved]
+    if len(shown) > MANY:
+        return [*said, f"{shown[0]}, … {shown[-1]}, {len(shown)} numbers, are not determined one by one"]
     for relative in (True, False):
         per = [t if relative else np.ones_like(t) for t in thetas]
         if any(np.any(t[involved] == 0) for t in per):
