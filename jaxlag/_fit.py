@@ -11,7 +11,6 @@ import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import PyTree
-from scipy import special  # comes with JAX
 
 from ._experiment import Experiment, entry_names, is_within
 from ._least_squares import levenberg_marquardt
@@ -123,7 +122,7 @@ class Fit:
         error = float(np.sqrt(self.covariance[i, i]))
         if not profile:
             return Interval(theta - t * error, theta + t * error)
-        return Interval(*(self._profile_end(i, side, t) for side in (-1, 1)))
+        return Interval(*(self._profile_end(i, side, t) if np.isfinite(error) else side * np.inf for side in (-1, 1)))
 
     def predict(self, experiment: Experiment, *, level: float = 0.95) -> Prediction:
         """What an experiment should show at the estimates, with the confidence band that their uncertainty makes.
@@ -149,47 +148,40 @@ class Fit:
     @property
     def sigma_scale(self) -> float:
         """What standard errors are multiplied with: σ̂, or 1 where sigma was given."""
-        return 1.0 if self.absolute else self.sigma
+        return 1.0 if self.absolute and self.problem.model.loss is None else self.sigma
 
     def _quantile(self, level):
         if not 0 < level < 1:
             raise ValueError(f"`level` must lie between 0 and 1, but is {level:g}. Take 0.95.")
+        from scipy import special
+
         return float(special.ndtri(0.5 + level / 2) if self.absolute else special.stdtrit(max(self.freedom, 1), 0.5 + level / 2))
 
     def _profile_end(self, i, side, t):
-        """Where the root of the cost, refitted with θ_i held, has risen by t."""
-        spread = self.sigma_scale
-        y_error = np.sqrt(self.x_covariance[i, i]) * spread
-        if not np.isfinite(y_error):
-            return side * np.inf
-        kept = np.delete(np.arange(self.x.size), i)
+        """Where the root of twice the rise of the cost, refitted with y_i held, is t: nearly a straight line."""
+        from scipy import optimize
 
-        def refitted(y_i, x):
-            def reduced(rest):
-                rows = linearise(self.problem, jnp.zeros(self.x.size).at[kept].set(rest).at[i].set(y_i))
+        free, kept = self.problem.free, np.delete(np.arange(self.x.size), i)
+        others = self.x[kept]
+
+        def excess(away):
+            nonlocal others
+            held = jnp.asarray(self.x).at[i].add(away)
+
+            def seen(rest):
+                rows = linearise(self.problem, held.at[kept].set(rest))
                 return rows.residuals, rows.jacobian[:, kept], rows
 
-            outcome = levenberg_marquardt(reduced, jnp.asarray(x[kept]), freedom=self.freedom, max_steps=50, tolerance=1e-4)
-            x = np.insert(np.asarray(outcome.best.y), i, y_i)
-            rise = 0.5 * float(np.sum(np.asarray(outcome.best.residuals) ** 2)) - self.cost
-            return np.sqrt(max(2 * rise, 0)) / spread, x
+            best = levenberg_marquardt(seen, jnp.asarray(others), freedom=self.freedom, max_steps=50, tolerance=1e-4).best
+            rise = float(jnp.sum(best.residuals**2) / 2) - self.cost
+            others = np.asarray(best.y) if np.isfinite(rise) else others
+            return np.sqrt(max(2 * rise, 0)) / self.sigma_scale - t
 
-        at, x, reached = 0.0, self.x, 0.0
-        step = side * t * y_error
-        for _ in range(12):  # the root of the cost is nearly a straight line
-            y_i = self.x[i] + at + step
-            rise, x_new = refitted(y_i, x)
-            if not np.isfinite(rise):
-                step /= 2
-                continue
-            slope = (rise - reached) / step if step else np.inf
-            at, reached, x = at + step, rise, x_new
-            if abs(rise - t) < 1e-3 * t:
-                break
-            if abs(at) > 50 * t * y_error:
-                return side * np.inf
-            step = np.clip((t - rise) / slope if slope * side > 0 else side * t * y_error, -5 * t * y_error, 5 * t * y_error)
-        return float(self.problem.free.theta(jnp.asarray(np.insert(x[kept], i, self.x[i] + at)[: len(self.names)]))[i])
+        first = side * t * self.sigma_scale * float(np.sqrt(self.x_covariance[i, i]))
+        found = optimize.root_scalar(excess, x0=0.0, x1=first, method="secant", rtol=1e-4, maxiter=20)
+        if not (found.converged and 0 < found.root * side < FAR * abs(first)):  # no rise that says no, as far as one can see
+            return float((free.lower if side < 0 else free.upper)[i])
+        return float(free.theta(jnp.asarray(self.x).at[i].add(found.root)[: free.size])[i])
 
     def __repr__(self) -> str:
         count = len(self.names)
@@ -228,6 +220,7 @@ class Fit:
         return [f"  correlation  {'; '.join(strong)}"] if strong else []
 
 
+FAR = 50  # times the linearised interval, within which an end is looked for
 SHOWN = 40  # rows of a table at most
 MANY = 16  # numbers of one name, beyond which they are counted only
 

@@ -8,7 +8,6 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-import optax
 from jaxtyping import PyTree
 
 from ._checks import parameters
@@ -34,7 +33,7 @@ def fit(
     bounds: Mapping[str, Any] | None = None,
     priors: Mapping[str, Any] | None = None,
     loss: Huber | None = None,
-    method: optax.GradientTransformation | None = None,
+    method: Any = None,
     starts: int = 1,
     pieces: int = 1,
     max_steps: int | None = None,
@@ -243,6 +242,8 @@ def _from_many(problem, starts, more):
 
 def _by_optax(problem, method, x, more):
     """Steps of an optimiser of optax; the best x is kept."""
+    import optax  # where it is needed, for that takes a while
+
     method = optax.with_extra_args_support(method)
     state = method.init(x)
     lowest, best, costs, ended = np.inf, x, [], MAX_STEPS
@@ -266,6 +267,8 @@ def _by_optax(problem, method, x, more):
 
 @eqx.filter_jit
 def _optax_step(problem, method, x, state):
+    import optax
+
     cost, slope = jax.value_and_grad(problem.cost)(x)
     slope = jnp.where(jnp.isfinite(slope), slope, 0)
     updates, state = method.update(slope, state, x, value=cost, grad=slope, value_fn=problem.cost)

@@ -8,7 +8,6 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 from jaxtyping import PyTree
-from scipy import special  # comes with JAX
 
 from ._experiment import entry_names
 
@@ -52,6 +51,8 @@ def _channel(number, name, z, r):
 
 def whiteness(residuals: np.ndarray) -> float:
     """The probability of autocorrelations this large in white noise."""
+    from scipy import special  # comes with JAX; imported where it is needed, for that takes a while
+
     n = residuals.size
     lags = min(LAGS, n // 5)
     r = residuals - np.mean(residuals) if n else residuals

@@ -9,7 +9,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import PyTree
-from scipy import ndimage  # SciPy comes with JAX
 
 from ._checks import parameters
 from ._experiment import Experiment
@@ -133,7 +132,7 @@ class _Equations(eqx.Module):
         if kinks is not None:
             slip = np.abs(np.asarray(jax.vmap(kinks.slip)(ts, jnp.asarray(motion.q), jnp.asarray(motion.v))))
             slides = np.all(slip > SLOW * np.max(slip[used], axis=0), axis=1)
-            used &= ndimage.binary_erosion(slides, iterations=ASIDE, border_value=1)
+            used &= np.convolve(~slides, np.ones(2 * ASIDE + 1), mode="same") < 0.5
         rows = motion.q.shape[1] + _extra(flat, e.ts[0], *point).size
         return cls(system, e.q0, e.params, ts, tuple(map(jnp.asarray, motion[1:])), used[:, None] * np.ones(rows))
 

@@ -6,9 +6,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-import scipy.sparse as sparse  # SciPy comes with JAX
 from jax.flatten_util import ravel_pytree
-from scipy.interpolate import BSpline
 
 from ._arguments import call
 from ._experiment import Experiment, is_within, start_entries
@@ -88,6 +86,8 @@ class _Unseen(dict):
 
 def _fitted(seen, ts, pieces):
     """Knots and coefficients of the motion with so many pieces, its sum of squares, and the number of coefficients."""
+    from scipy import sparse  # SciPy comes with JAX; imported where it is needed, for that takes a while
+
     knots = np.quantile(ts, np.linspace(0, 1, pieces + 1))
     knots = np.concatenate([np.full(DEGREE, knots[0]), knots, np.full(DEGREE, knots[-1])])
     count = len(knots) - DEGREE - 1
@@ -130,12 +130,16 @@ def _fitted(seen, ts, pieces):
 
 def _basis(knots, ts, derivative):
     """Values of the splines, or of their derivatives, at the times."""
+    from scipy.interpolate import BSpline
+
     spline = BSpline(knots, np.eye(len(knots) - DEGREE - 1), DEGREE)
     return (spline.derivative(derivative) if derivative else spline)(ts)
 
 
 def _rows(knots, ts, Js, bases):
     """Σ J_d ⊗ B_d, a row for each sample and channel, over coefficients (piece, coordinate): of each only the six that are not zero."""
+    from scipy import sparse
+
     (T, channels, n), count = Js[0].shape, bases[0].shape[1]
     first = np.clip(np.searchsorted(knots, ts, side="right") - 1 - DEGREE, 0, count - DEGREE - 1)
     near = first[:, None] + np.arange(DEGREE + 1)

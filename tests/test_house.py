@@ -56,7 +56,7 @@ HOMES = [
     ("matplotlib", {"plot"}),
     ("optimistix", {"_least_squares"}),
     ("optax", {"_identify"}),
-    ("scipy", {"_quality", "_smoothing", "_fit", "_regress"}),
+    ("scipy", {"_quality", "_smoothing", "_fit"}),
 ]
 
 
