@@ -79,7 +79,8 @@ def determined_by(J: np.ndarray, gaps_J: np.ndarray) -> Determined:
     if len(gaps_J):
         _, s, Vt = np.linalg.svd(gaps_J * scale)
         basis = Vt[int(np.sum(s > NOTHING * s[0])) :].T
-    _, s, Vt = np.linalg.svd(np.asarray(J) * scale @ basis, full_matrices=True)
+    R = np.linalg.qr(np.asarray(J) * scale @ basis, mode="r")  # has the singular values of all the rows
+    _, s, Vt = np.linalg.svd(R)
     s = np.concatenate([s, np.zeros(basis.shape[1] - s.size)])
     weak = s <= NOTHING * max(s[0], 1e-300)
     ways = basis @ Vt.T
