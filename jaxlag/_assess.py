@@ -8,8 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ._checks import parameters
-from ._experiment import Experiment
+from ._experiment import Experiment, measured
 from ._fit import Fit, Prediction, channel_rows
 from ._free import Free
 from ._identify import fit
@@ -71,11 +70,10 @@ def information(
     jl.information(oscillator, plan, {"c": 4.0}, free=("c",)).standard_errors["c"]
     ```
     """
-    experiments = (experiments,) if isinstance(experiments, Experiment) else tuple(experiments)
+    experiments, params = measured(experiments, params, planned=True)
     for e in experiments:
         if e.sigma is None:
             raise ValueError("`experiments` must say how well they measure, but one has no `sigma`. Give that of the noise.")
-    params = parameters(params, experiments[0].q0)
     named = Free.of(params, free)
     model = Model(system, tuple(sorted(numerics.items())), None)
     planned = [_planned(model, named, e) for e in experiments]
@@ -200,7 +198,7 @@ def compare(fits: Mapping[str, Fit]) -> Comparison:
         raise ValueError(f"`fits` must be at least two, but there are {len(fits)}. Fit another model to the same data.")
     of = {name: (f.measurements, f.absolute, _fingerprint(f)) for name, f in fits.items()}
     if len(set(of.values())) > 1:
-        raise ValueError("`fits` must be of the same measurements, with or without the same sigma, but differ. Fit all models to one set.")
+        raise ValueError("`fits` must be of the same measurements with the same sigma and loss, but differ. Fit all models to one set.")
     names = tuple(sorted(fits, key=lambda name: fits[name].bic))
     least = {which: min(getattr(f, which) for f in fits.values()) for which in ("aic", "bic")}
     off = lambda which: {name: getattr(fits[name], which) - least[which] for name in names}
@@ -208,4 +206,5 @@ def compare(fits: Mapping[str, Fit]) -> Comparison:
 
 
 def _fingerprint(f):
-    return float(sum(np.nansum(np.asarray(leaf)) for e in f.experiments for leaf in jax.tree.leaves(e.values)))
+    total = lambda which: float(sum(np.nansum(np.asarray(leaf)) for e in f.experiments for leaf in jax.tree.leaves(getattr(e, which))))
+    return total("values"), total("sigma"), f.problem.model.loss

@@ -73,6 +73,8 @@ def sample_times(ts: Any, dtype: Any) -> Array:
     if ts.ndim != 1 or ts.size < 2:
         raise ValueError(f"`ts` must be a list of at least two times, but has shape {ts.shape}. Start it with the time of q0.")
     if is_concrete(ts):
+        if not np.all(np.isfinite(ts)):
+            raise ValueError("`ts` must be finite, but has a NaN or an infinity. Drop the rows without a time.")
         steps = np.diff(np.asarray(ts))
         if (steps <= 0).any():
             i = int(np.argmax(steps <= 0))

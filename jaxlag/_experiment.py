@@ -29,14 +29,15 @@ class Experiment(eqx.Module):
     - `q0`, `qdot0`: the state at ts[0], as for `simulate`; where it is unknown, a guess.
     - `observe`: what the sensors see of one state, structured like one sample of `values`; it receives the arguments it names, of
       `t`, `q`, `qdot`, `qddot`, `multipliers`, `params` and the entries of `params`: so gains and offsets of sensors are parameters
-      like others. Left out: the coordinates that `values` names, or q as a whole.
+      like others. Left out: the coordinates that `values` names, or q as a whole. One function for all experiments of a kind: they
+      are computed side by side, and a function made anew is compiled anew.
     - `sigma`: standard deviation of the noise, a number or a pytree like `values` with one for each channel or sample. Where it is
       left out, one common sigma is estimated from the residuals.
     - `params`: parameters of this experiment alone, which override those of the fit: a payload, a measured input (`Signal`).
     - `unknown`: what is to be estimated of this experiment alone: `"q0"`, `"qdot0"`, coordinates of them (`"qdot0.x"`), or entries of
       its own `params`. An unknown start is sought on the constraints.
-    - `delay`: how much later than the motion the sensors show it, a number, or a function that names parameters. Before ts[0] the
-      system is taken to rest at its start.
+    - `delay`: how much later than the motion the sensors show it, a number, or a function that names parameters. Until the delay
+      is over they show the state at ts[0].
 
     Any consistent units. **Raises:** `ValueError` where times, values and sigma do not fit each other.
 
@@ -74,6 +75,9 @@ class Experiment(eqx.Module):
         delay: Callable | float | None = None,
     ):
         self.q0, self.qdot0 = state(q0, qdot0, ("q0", "qdot0"))
+        for which, tree in (("q0", self.q0), ("qdot0", self.qdot0)):
+            if is_concrete(tree) and not all(np.all(np.isfinite(leaf)) for leaf in jax.tree.leaves(tree)):
+                raise ValueError(f"`{which}` must be finite, but has a missing value. Give a guess, and say that it is `unknown`.")
         dtype = jax.tree.leaves(self.q0)[0].dtype
         self.ts = sample_times(ts, dtype)
         self.values = _measured(values, self.ts, dtype)
@@ -108,9 +112,8 @@ class Experiment(eqx.Module):
         with open(file, newline="", encoding="utf-8-sig") as lines:
             reader = csv.DictReader(lines, delimiter=delimiter, skipinitialspace=True)
             rows = list(reader)
-        names = [name for name in reader.fieldnames or () if name]
-        columns = {name: np.array([_number(row[name], name, i + 2) for i, row in enumerate(rows)]) for name in names}
-        ts, values = _from_columns(columns, time, channels)
+        column = lambda name: np.array([_number(row[name], name, i + 2) for i, row in enumerate(rows)])
+        ts, values = _from_columns([name for name in reader.fieldnames or () if name], column, time, channels)
         return cls(ts, values, q0, qdot0, **more)
 
     @classmethod
@@ -119,9 +122,21 @@ class Experiment(eqx.Module):
 
         **Arguments, raises:** as `from_csv`.
         """
-        columns = {name: np.asarray(frame[name].to_numpy(), float) for name in frame.columns}
-        ts, values = _from_columns(columns, time, channels)
+        ts, values = _from_columns(list(frame.columns), lambda name: np.asarray(frame[name].to_numpy(), float), time, channels)
         return cls(ts, values, q0, qdot0, **more)
+
+
+def measured(experiments: Any, params: PyTree, *, planned: bool = False) -> tuple[tuple[Experiment, ...], PyTree]:
+    """One experiment or several as a tuple, and `params` as arrays, after the checks that all who take them need."""
+    experiments = (experiments,) if isinstance(experiments, Experiment) else tuple(experiments)
+    if not experiments or not all(isinstance(e, Experiment) for e in experiments):
+        raise ValueError("`experiments` must be an `Experiment` or a list of them, but is not. Make one by `jl.Experiment(...)`.")
+    for i, e in enumerate(experiments):
+        if e.values is None and not planned:
+            raise ValueError(f"`experiments` must have been measured, but number {i} has no values. Use `information` to plan one.")
+    if not isinstance(params, Mapping):
+        raise ValueError(f"`params` must be a mapping, so that `free` can name its entries, but is a {type(params).__name__}. Use a dict.")
+    return experiments, parameters(params, experiments[0].q0)
 
 
 def _measured(values, ts, dtype):
@@ -199,14 +214,15 @@ def entry_names(tree: PyTree) -> tuple[str, ...]:
     return tuple(names)
 
 
-def _from_columns(columns, time, channels):
+def _from_columns(columns, column, time, channels):
+    channels = [channels] if isinstance(channels, str) else channels
     if channels is None:
         channels = [name for name in columns if name != time]
     chosen = dict(channels) if isinstance(channels, Mapping) else {name: name for name in channels}
     for name in (time, *chosen.values()):
         if name not in columns:
             raise ValueError(f"the table must have a column {name!r}, but has {', '.join(map(repr, columns))}. Name it in the first line.")
-    return columns[time], {channel: columns[column] for channel, column in chosen.items()}
+    return column(time), {channel: column(name) for channel, name in chosen.items()}
 
 
 def _number(text, column, line):

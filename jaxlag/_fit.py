@@ -14,7 +14,7 @@ from jaxtyping import PyTree
 
 from ._experiment import Experiment, entry_names, is_within
 from ._least_squares import levenberg_marquardt
-from ._problem import Problem, blank, linearise
+from ._problem import Problem, blank, failure_of, linearise
 from ._quality import Channel
 from ._trajectory import Trajectory
 
@@ -121,19 +121,26 @@ class Fit:
         theta = float(self.problem.free.theta(jnp.asarray(self.x[: len(self.names)]))[i])
         error = float(np.sqrt(self.covariance[i, i]))
         if not profile:
-            return Interval(theta - t * error, theta + t * error)
+            lower, upper = (float(bound[i]) for bound in (self.problem.free.lower, self.problem.free.upper))
+            return Interval(max(theta - t * error, lower), min(theta + t * error, upper))
+        if self.problem.model.loss is not None:
+            raise ValueError("`profile` must be of a plain least-squares fit, but this one has a loss of its own. Take `profile=False`.")
         return Interval(*(self._profile_end(i, side, t) if np.isfinite(error) else side * np.inf for side in (-1, 1)))
 
     def predict(self, experiment: Experiment, *, level: float = 0.95) -> Prediction:
         """What an experiment should show at the estimates, with the confidence band that their uncertainty makes.
 
-        The experiment starts where it says; its `values` may be None.
+        The experiment starts where it says, without error; its `values` may be None. Where its sensors are late, `motion` has one more
+        sample, the first at the start.
         """
         free = self.problem.free
         model = dataclasses.replace(self.problem.model, loss=None)
         aside = Problem.of(model, free, [blank(model, free, experiment)])
         y = jnp.asarray(self.x[: free.size])
         rows = linearise(aside, jnp.concatenate([y, jnp.zeros(aside.size - free.size)]))
+        reason = failure_of(rows)
+        if reason:
+            raise ValueError(f"`experiment` must have a motion at the estimates, but it ended with: {reason}")
         part = rows.of_stacks[0]
         J = np.asarray(part.jacobian[0][:, : free.size])
         spread = self.sigma_scale * np.sqrt(np.maximum(np.einsum("ij,jk,ik->i", J, self.x_covariance[: free.size, : free.size], J), 0))
@@ -142,7 +149,7 @@ class Fit:
         t = self._quantile(level)
         lower, upper = (jax.tree.map(lambda v, e, s=s: v + s * t * e, values, errors) for s in (-1, 1))
         one = jax.tree.map(lambda x: x[0] if eqx.is_array(x) else x, aside.stacks[0])
-        motion = aside.model.predicted(free.insert(free.theta(y)), one, jnp.zeros(aside.stacks[0].unknowns))[1]
+        motion = _motion(aside.model, free.insert(free.theta(y)), one)
         return Prediction(values, errors, lower, upper, motion)
 
     @property
@@ -162,7 +169,7 @@ class Fit:
         from scipy import optimize
 
         free, kept = self.problem.free, np.delete(np.arange(self.x.size), i)
-        others = self.x[kept]
+        others, least = self.x[kept], float(jnp.sum(linearise(self.problem, jnp.asarray(self.x)).residuals ** 2) / 2)
 
         def excess(away):
             nonlocal others
@@ -173,7 +180,7 @@ class Fit:
                 return rows.residuals, rows.jacobian[:, kept], rows
 
             best = levenberg_marquardt(seen, jnp.asarray(others), freedom=self.freedom, max_steps=50, tolerance=1e-4).best
-            rise = float(jnp.sum(best.residuals**2) / 2) - self.cost
+            rise = float(jnp.sum(best.residuals**2) / 2) - least
             others = np.asarray(best.y) if np.isfinite(rise) else others
             return np.sqrt(max(2 * rise, 0)) / self.sigma_scale - t
 
@@ -220,6 +227,11 @@ class Fit:
         return [f"  correlation  {'; '.join(strong)}"] if strong else []
 
 
+@eqx.filter_jit
+def _motion(model, params, e):
+    return model.predicted(params, e, jnp.zeros(e.unknowns))[1]
+
+
 FAR = 50  # times the linearised interval, within which an end is looked for
 SHOWN = 40  # rows of a table at most
 MANY = 16  # numbers of one name, beyond which they are counted only
@@ -231,6 +243,12 @@ def _counted(group):
     return f"{len(group)} numbers{known}"
 
 
+def _colour(p):
+    if np.isnan(p):
+        return ""
+    return "white" if p >= 0.01 else f"not white (p = {p:.1g})"
+
+
 def channel_rows(channels: Sequence[Channel]) -> list[str]:
     """The table of channels."""
     several = len({channel.experiment for channel in channels}) > 1
@@ -238,8 +256,7 @@ def channel_rows(channels: Sequence[Channel]) -> list[str]:
     shown = channels[:SHOWN]
     width = max((len(label(c)) for c in shown), default=0)
     rows = [
-        f"  {label(c):<{width}}  fit {c.fit_percent:6.2f} %   R² {c.r_squared:.5f}   rms {c.rms:.3g}   "
-        + ("white" if not c.whiteness < 0.01 else f"not white (p = {c.whiteness:.1g})")
+        f"  {label(c):<{width}}  fit {c.fit_percent:6.2f} %   R² {c.r_squared:.5f}   rms {c.rms:.3g}   " + _colour(c.whiteness)
         for c in shown
     ]
     return rows + ([f"  … and {len(channels) - SHOWN} more channels"] if len(channels) > SHOWN else [])
@@ -247,6 +264,8 @@ def channel_rows(channels: Sequence[Channel]) -> list[str]:
 
 def plus_minus(value: float, error: float) -> str:
     """`value ± error` with two digits of the error."""
+    if error > 1e3 * abs(value):
+        return f"{value:.3g} ± {error:.2g}"
     if error == 0:
         return f"{value:.6g} ± 0"
     digits = 1 - int(np.floor(np.log10(error)))

@@ -46,6 +46,9 @@ class Free(eqx.Module):
         lower, upper = _spread_over(bounds, "bounds", free, entries, (-np.inf, np.inf))
         mean, spread = _spread_over(priors, "priors", free, entries, (0.0, np.inf))
         _check(start, lower, upper, spread, entries)
+        for i, leaf in enumerate(every):
+            if i not in chosen and eqx.is_inexact_array(leaf) and not _traced([leaf]) and np.any(np.isnan(leaf)):
+                raise ValueError(f"`params` must be known where they are not free, but {names[i]!r} is NaN. Give it a value, or free it.")
         scale = jnp.where(start == 0, 1, jnp.abs(start)) if relative else jnp.ones_like(start)
         as_start = lambda x: jnp.asarray(x, start.dtype)
         return cls(params, start, scale, *map(as_start, (lower, upper, mean, spread)), tuple(free), entries, tuple(chosen))
@@ -72,6 +75,12 @@ class Free(eqx.Module):
         start = jnp.where(between, (self.start - self.lower) / jnp.where(between, self.upper - self.lower, 1), 0.5)
         logit = lambda share: jnp.log(share) - jnp.log1p(-share)
         return jnp.where(between[None], logit(at) - logit(start)[None], jnp.log(2.0) * jax.scipy.special.ndtri(at))
+
+    def started(self) -> PyTree:
+        """All parameters, with some start within the bounds for those that have none."""
+        a, b = (jnp.where(jnp.isfinite(bound), bound, jnp.nan) for bound in (self.lower, self.upper))
+        some = jnp.where(jnp.isnan(a), jnp.where(jnp.isnan(b), 1.0, b - 1), jnp.where(jnp.isnan(b), a + 1, (a + b) / 2))
+        return self.insert(jnp.where(jnp.isnan(self.start), some, self.start))
 
     def slope(self, y: Array) -> Array:
         """dθ/dy, entry by entry."""

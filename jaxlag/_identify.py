@@ -10,8 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import PyTree
 
-from ._checks import parameters
-from ._experiment import Experiment
+from ._experiment import Experiment, measured
 from ._fit import Fit
 from ._free import Free
 from ._least_squares import INTERRUPTED, MAX_STEPS, Iterate, Line, Outcome, levenberg_marquardt
@@ -54,7 +53,7 @@ def fit(
     - `params`: a mapping with all parameters; those in `free` are starting values. `jaxlag.regress` finds such.
     - `free`: names of the entries of `params` to be identified, or paths to parts of them, `"arm.length"`, `"joints[0]"`.
     - `bounds`: (lower, upper) by name, None for none: `{"b": (0, None)}` keeps b positive. Kept by a change of variables.
-    - `priors`: (mean, standard deviation) by name, of what is known beforehand.
+    - `priors`: (mean, standard deviation) by name, of what is known beforehand; the experiments need their sigma then.
     - `loss`: `Huber()` where there are outliers.
     - `method`: an optimiser of optax in place of Levenberg–Marquardt, for thousands of parameters; it takes `max_steps` steps.
     - `starts`: how many starts are tried in one batch, the others at random within bounds, or within a factor of some two.
@@ -82,6 +81,8 @@ def fit(
     jl.fit(oscillator, record, {"c": 3.0}, free=("c",)).estimates["c"]  # 4.0
     ```
     """
+    if (pieces > 1) + (method is not None) + (starts > 1) > 1:
+        raise ValueError("`pieces`, `starts` and `method` must be used one at a time, but more than one was given. Leave the others out.")
     problem, experiments = _stated(system, experiments, params, free, bounds, priors, loss, method is None, numerics)
     steps = max_steps or (100 if method is None else 1000)
     line = Line(steps) if progress else None
@@ -90,8 +91,12 @@ def fit(
     try:
         outcome, problem = _minimised(whole.problem, method, starts, more)
         for _ in range(SCALE_ROUNDS if loss is not None and not _absolute(experiments) else 0):
-            problem = dataclasses.replace(problem, scale=robust_scale(outcome.best.rest, problem))
-            outcome, problem = _minimised(problem, method, 1, more, outcome.best.y)
+            if int(outcome.best.status) == INTERRUPTED:
+                break
+            problem = dataclasses.replace(whole.problem, scale=robust_scale(outcome.best.rest, problem))
+            before = outcome
+            outcome, problem = _minimised(problem, method, 1, more, before.best.y)
+            outcome = outcome._replace(steps=before.steps + outcome.steps, costs=np.append(before.costs, outcome.costs))
     finally:
         if line:
             line.end()
@@ -157,19 +162,20 @@ def fit_each(
 
 def _stated(system, experiments, params, free, bounds, priors, loss, relative, numerics, apart=False):
     """The problem, checked; starting values that are NaN come from `regress`."""
-    experiments = (experiments,) if isinstance(experiments, Experiment) else tuple(experiments)
-    if not experiments or not all(isinstance(e, Experiment) for e in experiments):
-        raise ValueError("`experiments` must be an `Experiment` or a list of them, but is not. Make one by `jl.Experiment(...)`.")
-    for i, e in enumerate(experiments):
-        if e.values is None:
-            raise ValueError(f"`experiments` must have been measured, but number {i} has no values. Use `information` to plan one.")
-    if not isinstance(params, Mapping):
-        raise ValueError(f"`params` must be a mapping, so that `free` can name its entries, but is a {type(params).__name__}. Use a dict.")
-    params = parameters(params, experiments[0].q0)
+    experiments, params = measured(experiments, params)
+    if len({e.sigma is None for e in experiments}) > 1:
+        raise ValueError("`experiments` must all have a `sigma` or none, but some have. Give each of them one.")
     named = Free.of(params, free, bounds, priors, relative)
-    if np.any(np.isnan(named.start)):
-        params = regress(system, experiments, params, free=free, bounds=bounds).params
-        named = Free.of(params, free, bounds, priors, relative)
+    if priors and not _absolute(experiments):
+        raise ValueError("`priors` must stand against noise that is known, but an experiment has no `sigma`. Give it.")
+    unstated = np.isnan(named.start)
+    if np.any(unstated):
+        found = regress(system, experiments, params, free=free, bounds=bounds)
+        start = Free.of(found.params, free, bounds).start
+        named = Free.of(named.insert(jnp.where(unstated, start, named.start)), free, bounds, priors, relative)
+    for name in named.names:
+        if all(name in e.params for e in experiments):
+            raise ValueError(f"`free` must name what experiments share, but each has a {name!r} of its own. Name it `unknown` there.")
     problem = Problem.of(Model(system, tuple(sorted(numerics.items())), loss), named, experiments)
     if problem.size == 0:
         raise ValueError("`free` must name at least one entry of params, but is empty. Say which parameters to identify.")

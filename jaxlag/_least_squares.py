@@ -12,13 +12,14 @@ import lineax as lx
 import numpy as np
 import optimistix as optx
 
-RUNNING, CONVERGED, STALLED, MAX_STEPS, INTERRUPTED = range(5)
+RUNNING, CONVERGED, STALLED, MAX_STEPS, INTERRUPTED, FAILED = range(6)
 REASONS = (
     "still running",
     "converged",
     "no step lowers the cost any more, though it is not flat",
     "`max_steps` was reached",
     "interrupted by the keyboard; these are the best parameters so far",
+    "the motion at the start could not be computed",
 )
 
 
@@ -118,6 +119,7 @@ def _judge(now, trial, predicted, seen, tolerance, freedom):
     flat = jnp.linalg.norm(jnp.where(now.scale > 0, now.residuals @ now.jacobian / now.scale, 0)) <= 1e-4 * jnp.sqrt(2 * before)
     status = jnp.where((short & newton_like) | (before == 0), CONVERGED, RUNNING)
     status = jnp.where(~better & (now.damping >= 1e8), jnp.where(flat, CONVERGED, STALLED), status)
+    status = jnp.where(jnp.isfinite(before), status, FAILED)
     status = jnp.where(now.status == RUNNING, status, now.status)
     done = now.status != RUNNING
     chosen = Iterate(*took((trial, r, J, rest), now[:4]), damping, jnp.maximum(now.scale, _norms(jnp.where(better, J, 0))), status)

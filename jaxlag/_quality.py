@@ -14,6 +14,7 @@ from ._experiment import entry_names
 LAGS = 20
 MANY = 12  # parameters that are looked at for what they determine together
 NOTHING = 1e-9  # singular values below this part of the largest are zero: columns have norm one, and are as exact as the integration
+ROUNDINGS = 300  # or so many units in the last place, in single precision
 
 
 class Channel(NamedTuple):
@@ -73,16 +74,18 @@ class Determined(NamedTuple):
 
 def determined_by(J: np.ndarray, gaps_J: np.ndarray) -> Determined:
     """(JᵀJ)⁻¹ on the changes that open no gap, where these are determined."""
+    nothing = max(NOTHING, ROUNDINGS * float(np.finfo(J.dtype).eps))
+    J, gaps_J = J.astype(float), gaps_J.astype(float)
     size = np.linalg.norm(J, axis=0)
     scale = np.where(size > 0, 1 / np.where(size > 0, size, 1), 1)
     basis = np.eye(size.size)
     if len(gaps_J):
         _, s, Vt = np.linalg.svd(gaps_J * scale)
-        basis = Vt[int(np.sum(s > NOTHING * s[0])) :].T
+        basis = Vt[int(np.sum(s > nothing * s[0])) :].T
     R = np.linalg.qr(np.asarray(J) * scale @ basis, mode="r")  # has the singular values of all the rows
     _, s, Vt = np.linalg.svd(R)
     s = np.concatenate([s, np.zeros(basis.shape[1] - s.size)])
-    weak = s <= NOTHING * max(s[0], 1e-300)
+    weak = s <= nothing * max(s[0], 1e-300)
     ways = basis @ Vt.T
     inverse = ways[:, ~weak] / s[~weak] ** 2 @ ways[:, ~weak].T
     null = ways[:, weak]
@@ -96,21 +99,30 @@ def correlation_of(covariance: np.ndarray) -> np.ndarray:
     return np.where(np.isfinite(covariance), covariance, np.nan) / np.outer(errors, errors)
 
 
-def in_words(names: Sequence[str], theta: np.ndarray, nulls: Sequence[np.ndarray], thetas: Sequence[np.ndarray]) -> list[str]:
+def in_words(
+    names: Sequence[str], theta: np.ndarray, nulls: Sequence[np.ndarray], thetas: Sequence[np.ndarray], idle: Sequence[int] = ()
+) -> list[str]:
     """What the measurements do not determine.
 
     `nulls`: at two places `thetas`, changes of θ that do not show, as columns. They are of one factor, or of one sum, where these
-    changes are the same at both places relative to θ, or as they are.
+    changes are the same at both places relative to θ, or as they are. `idle`: parameters of which no measurement depends.
 
     **Source:** Walter & Pronzato, Identification of Parametric Models (1997), section 2.6 (structural identifiability).
     """
     scale = np.where(theta == 0, 1, np.abs(theta))
-    idle = [i for i in range(len(names)) if any(np.any(n[i]) for n in nulls) and _alone(i, nulls, scale)]
     said = [f"{names[i]} has no influence on these measurements" for i in idle]
-    rest = [n.copy() for n in nulls]
-    for n in rest:
-        n[idle] = 0
-    rest = [_column_space(n / scale[:, None]) * scale[:, None] for n in rest]
+    rest = []
+    for n in nulls:
+        left = n / scale[:, None]
+        size = np.linalg.norm(left, axis=0)
+        left[list(idle)] = 0
+        left = left[:, np.linalg.norm(left, axis=0) > 1e-6 * size]  # the others are rounding
+        rest.append(_column_space(left) * scale[:, None])
+    for i in [i for i in range(len(names)) if _alone(i, rest, scale)]:
+        said.append(f"{names[i]} cannot be told from the unknown starts")
+        for n in rest:
+            n[i] = 0
+    rest = [n[:, np.linalg.norm(n / scale[:, None], axis=0) > 1e-6] for n in rest]
     involved = [i for i in range(len(names)) if np.max(np.abs(rest[0][i] / scale[i]), initial=0) > 1e-6]
     if not involved:
         return said
@@ -134,7 +146,8 @@ def in_words(names: Sequence[str], theta: np.ndarray, nulls: Sequence[np.ndarray
 def _alone(i, nulls, scale):
     """Whether a change of parameter i alone does not show."""
     e = np.eye(scale.size)[:, [i]]
-    return all(np.linalg.norm(e - (space := _column_space(n / scale[:, None])) @ (space.T @ e)) < 1e-5 for n in nulls)
+    spaces = [n / scale[:, None] for n in nulls]
+    return all(space.size and np.linalg.norm(e - space @ (space.T @ e)) < 1e-5 for space in spaces)
 
 
 def _column_space(A):
@@ -160,6 +173,8 @@ def _combinations(space, names, relative):
         return None
     _, pivots, exact = best
     others = [i for i in range(q) if i not in pivots]
+    if not others:
+        return None
     word = _power if relative else _sum
     determined = [word(names[i], [(names[p], x) for p, x in zip(pivots, exact[i], strict=True) if x != 0]) for i in others]
     one = len(determined) == 1

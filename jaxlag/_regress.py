@@ -10,8 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import PyTree
 
-from ._checks import parameters
-from ._experiment import Experiment
+from ._experiment import Experiment, measured
 from ._fit import plus_minus
 from ._free import Free
 from ._kinks import kinks_of
@@ -74,7 +73,8 @@ def regress(
 
     **Arguments:**
 
-    - `experiments`, `params`, `free`, `bounds`: as for `fit`; free parameters that are NaN need no start.
+    - `experiments`, `params`, `free`, `bounds`: as for `fit`; free parameters that are NaN need no start. Parameters of the experiments'
+      own are taken as they are, and starts that are `unknown` are not used.
 
     **Returns:** a `Regression`. Any consistent units. Its estimates are biased by noise in q̇ and q̈; `fit` is not.
 
@@ -92,13 +92,17 @@ def regress(
     jl.regress(oscillator, record, {"c": jnp.nan}, free=("c",)).estimates["c"]  # 4.0
     ```
     """
-    experiments = (experiments,) if isinstance(experiments, Experiment) else tuple(experiments)
-    params = parameters(params, experiments[0].q0)
-    params = jax.tree.map(lambda x: jnp.where(jnp.isnan(x), jnp.ones_like(x), x) if eqx.is_inexact_array(x) else x, params)
-    named = Free.of(params, free, bounds)
+    experiments, params = measured(experiments, params)
+    params = Free.of(params, free, bounds).started()
+    named, unbounded = Free.of(params, free, bounds), Free.of(params, free)
+    if named.size == 0:
+        raise ValueError("`free` must name at least one entry of params, but is empty. Say which parameters to identify.")
     equations = [_Equations.along(system, e, params) for e in experiments]
     weights = [piece.scaled(named) for piece in equations]
-    y, linear = jnp.zeros(named.size), _is_linear(equations, named)
+    y, linear = jnp.zeros(named.size), _is_linear(equations, unbounded)
+    if linear:
+        _refuse_homogeneous(equations, unbounded, weights)
+    linear &= not np.any(np.isfinite(named.lower) | np.isfinite(named.upper))
     for _ in range(ROUNDS):
         y = (_solved if linear else _iterated)(equations, named, y, weights)
         weights = [piece.over(np.abs(piece.linearised(named, y)[0])) for piece in equations]
@@ -185,9 +189,7 @@ def _weighted(equations, named, y, weights):
 
 
 def _is_linear(equations, named):
-    """Whether the Jacobian is the same elsewhere, where no bound bends it."""
-    if np.any(np.isfinite(named.lower) | np.isfinite(named.upper)):
-        return False
+    """Whether the Jacobian is the same elsewhere."""
     y = jnp.zeros(named.size)
     elsewhere = y + 0.37 * jnp.cos(1.0 + jnp.arange(y.size))
     pairs = [(np.asarray(piece.linearised(named, y)[1]), np.asarray(piece.linearised(named, elsewhere)[1])) for piece in equations]
@@ -200,8 +202,9 @@ def _iterated(equations, named, y, weights):
     return levenberg_marquardt(seen, y, freedom=freedom, max_steps=100, tolerance=1e-3).best.y
 
 
-def _solved(equations, named, y, weights):
-    """In one step; what is not determined stays where it is."""
+def _refuse_homogeneous(equations, named, weights):
+    """Refuses linear equations without a known term."""
+    y = jnp.zeros(named.size)
     r, J = (np.asarray(x) for x in _weighted(equations, named, y, weights))
     to_zero = -np.asarray(named.theta(y) / named.slope(y))
     if np.linalg.norm(r + J @ to_zero) <= 1e-9 * np.linalg.norm(np.abs(J) @ np.abs(to_zero)):
@@ -209,6 +212,11 @@ def _solved(equations, named, y, weights):
             f"`free` must leave something known in the equations of motion, but every term has a factor out of {', '.join(named.names)}: "
             "only their ratios are determined. Hold one of them."
         )
+
+
+def _solved(equations, named, y, weights):
+    """In one step; what is not determined stays where it is."""
+    r, J = (np.asarray(x) for x in _weighted(equations, named, y, weights))
     size = np.linalg.norm(J, axis=0)
     scale = np.where(size > 0, 1 / np.where(size > 0, size, 1), 0)
     return y + scale * np.linalg.lstsq(J * scale, -r, rcond=1e-9)[0]

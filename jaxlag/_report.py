@@ -48,7 +48,7 @@ def report(problem: Problem, experiments: Sequence[Experiment], outcome: Outcome
         if problem.model.loss is not None:
             J[p:] /= problem.model.loss.slope(np.where(there, weighted, 0) / problem.scale)[:, None]
         known = determined_by(J, gaps_J)
-        remarks = _not_determined(problem, x, known, theta, slope) if np.any(known.null[:p]) else []
+        remarks = _not_determined(problem, x, known, theta, slope, J) if np.any(known.null[:p]) else []
     unknown_count = x.size - known.null.shape[1] - len(gaps_J)
     sigma = _noise(weighted[there], problem, max(count - unknown_count, 0))
     scale = 1.0 if absolute and problem.model.loss is None else sigma
@@ -56,6 +56,8 @@ def report(problem: Problem, experiments: Sequence[Experiment], outcome: Outcome
     covariance = known.covariance[:p, :p] * np.outer(slope, slope) * scale**2
     covariance[np.diag_indices(p)] = np.where(known.determined[:p], np.diag(covariance), np.inf)
     errors = np.sqrt(np.diag(covariance))
+    if outcome.best.jacobian is not None:
+        remarks += _at_bounds(free, theta, errors)
     first = [whole.of.index(i) for i in range(len(experiments))]
     own = [_own_of(problem, x, rows, k, e, known, scale) for k, e in zip(first, experiments, strict=True)]
     residuals, predictions = _whole(problem, rows, experiments, whole)
@@ -104,7 +106,15 @@ def _noise(r, problem, freedom):
     return float(s * np.sqrt(influence @ influence / freedom) / np.mean(np.abs(r / s) <= loss.delta))
 
 
-def _not_determined(problem, x, known, theta, slope):
+def _at_bounds(free, theta, errors):
+    """Remarks on estimates that a bound holds back."""
+    for name, value, error, *bounds in zip(free.entries, theta, errors, np.asarray(free.lower), np.asarray(free.upper), strict=True):
+        for bound in bounds:
+            if abs(value - bound) < 1e-3 * error < np.inf:
+                yield f"{name} is at its bound {bound:g}, which the measurements would have it cross"
+
+
+def _not_determined(problem, x, known, theta, slope, J):
     """In words; a second place tells whether it is a factor or a sum that does not show."""
     free, p = problem.free, problem.free.size
     nulls, thetas = [slope[:, None] * known.null[:p]], [theta]
@@ -114,7 +124,7 @@ def _not_determined(problem, x, known, theta, slope):
         there = determined_by(np.asarray(rows.jacobian)[: len(rows.residuals) - len(rows.gaps)], np.asarray(rows.gaps_jacobian))
         nulls.append(np.asarray(free.slope(elsewhere[:p]))[:, None] * there.null[:p])
         thetas.append(np.asarray(free.theta(elsewhere[:p])))
-    return in_words(free.entries, theta, nulls, thetas)
+    return in_words(free.entries, theta, nulls, thetas, np.flatnonzero(~np.any(J[:, :p], axis=0)).tolist())
 
 
 def _place(problem, i):
@@ -143,7 +153,10 @@ def _own_of(problem, x, rows, i, e, known, scale):
     unravel = ravel_pytree((e.q0, e.qdot0))[1]
     half = rows.of_stacks[k].ends.shape[1] // 2
     start = unravel(jnp.asarray(part.ends[row, :half]))
-    start_errors = unravel(jnp.asarray(errors(np.asarray(part.ends_jacobian[row, :half]))))
+    if part.ends_jacobian is None:
+        start_errors = jax.tree.map(lambda x: jnp.full_like(x, jnp.nan), start)
+    else:
+        start_errors = unravel(jnp.asarray(errors(np.asarray(part.ends_jacobian[row, :half]))))
     for which, value, error in zip(("q0", "qdot0"), start, start_errors, strict=True):
         if any(is_within(name, which) for name in e.unknown):
             values[which], spreads[which] = value, error

@@ -20,7 +20,8 @@ FIRST = 0.1  # of what the residuals weigh, the gaps do when they are first look
 TIGHTER = 10.0  # the weight of the gaps from one round to the next
 ROUGH = 0.1  # of a standard error, the tolerance until the gaps are closed
 LOST = 0.5  # of its misfit that a piece has to gain to begin where the one before ends
-CLOSED = 1e-9  # gaps that are left, in units of the motion
+CLOSED = 1e-9  # gaps that are left, in units of the motion,
+ROUNDINGS = 300  # or so many units in the last place, in single precision
 
 
 class Pieces(NamedTuple):
@@ -119,7 +120,7 @@ def join(problem: Problem, x: Any, *, max_steps: int, tolerance: float, freedom:
             x, lost = _begun_anew(problem, x, rows)
             if lost:
                 continue
-        closed = float(jnp.max(jnp.abs(rows.gaps))) < CLOSED
+        closed = float(jnp.max(jnp.abs(rows.gaps))) < max(CLOSED, ROUNDINGS * float(jnp.finfo(x.dtype).eps))
         before, weight = weight, weight * TIGHTER or FIRST * float(jnp.linalg.norm(rows.residuals) / jnp.linalg.norm(rows.gaps))
         dual = (links.dual + rows.gaps) * (before / weight) ** 2  # weight² dual are the multipliers of the gaps, which go on
         links = dataclasses.replace(links, weight=jnp.asarray(weight), dual=dual)

@@ -35,6 +35,8 @@ def smooth(experiment: Experiment, params: Any, *, between: bool = False) -> Smo
     **Source:** Craven & Wahba, Numer. Math. 31 (1979) 377-403; de Boor, A Practical Guide to Splines, chapter XIV.
     """
     e = experiment
+    if e.delay is not None:
+        raise ValueError("`delay` must be none where the motion is read off the measurements, but there is one. Shift `ts` by it.")
     ts = np.asarray(e.ts)
     at = (ts[1:] + ts[:-1]) / 2 if between else ts
     seen = _Sensors(e, {**params, **e.params})

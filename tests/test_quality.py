@@ -108,7 +108,7 @@ def test_other_combinations(change, said):
         return np.linalg.svd(slope)[2][1:].T
 
     places = [np.array([2.0, 3.0, 5.0]), np.array([2.2, 2.5, 5.5])]
-    words = in_words(("a", "b", "c"), places[0], [null(p) for p in places], places)
+    words = in_words(("a", "b", "c"), places[0], [null(p) for p in places], places, [2] if said else [])
     if said:
         assert words == ["c has no influence on these measurements", f"{said}; a and b one by one are not"]
     else:
@@ -254,7 +254,7 @@ def test_paths_vectors_and_payloads():
     system = jl.System(lambda q, qdot, body, load: 0.5 * (body["m"] + load) * qdot**2 - 0.5 * body["c"] @ jnp.ones(2) * q**2)
     ts = osc.TIMES
     e1, e2 = (
-        jl.Experiment(ts, np.cos(np.sqrt(4 / m) * ts), 1.0, 0.0, params={"load": load}, unknown=unknown)
+        jl.Experiment(ts, np.cos(np.sqrt(4 / m) * ts), 1.0, 0.0, params={"load": load}, unknown=unknown, sigma=1e-3)
         for m, load, unknown in ((1.0, 0.0, ()), (1.5, 0.4, ("load",)))
     )
     params = {"body": {"m": 1.0, "c": np.array([1.5, 2.0])}}
@@ -281,3 +281,83 @@ def test_single_precision(single_precision):
     found = fit(osc.record(0))
     assert found.estimates["c"].dtype == jnp.float32
     np.testing.assert_allclose([found.estimates[name] for name in FREE], by_scipy(osc.noisy(0)).x, rtol=2e-3)
+
+
+def test_robust_pieces_are_the_robust_whole():
+    z = osc.noisy(2)
+    z[::7] += 0.5
+    e = jl.Experiment(osc.TIMES, z, 1.0, 0.0)
+    whole, pieces = (fit(e, loss=jl.Huber(), pieces=n) for n in (1, 3))
+    np.testing.assert_allclose([pieces.estimates[name] for name in FREE], [whole.estimates[name] for name in FREE], rtol=1e-3)
+
+
+def test_an_estimate_at_a_bound_is_remarked():
+    found = fit(osc.record(0), bounds={"c": (None, 3.5)})
+    assert found.remarks == ["c is at its bound 3.5, which the measurements would have it cross"]
+    assert found.interval("c").upper <= 3.5
+
+
+def test_what_trades_with_the_unknown_start_is_said():
+    """A sliding mass whose sensor has an offset: only offset + x₀ shows."""
+    system = jl.System(lambda qdot: 0.5 * qdot**2, dissipation=lambda qdot, b: 0.5 * b * qdot**2)
+    ts = osc.TIMES
+    e = jl.Experiment(ts, (1 - np.exp(-0.4 * ts)) / 0.4, 0.0, 1.0, observe=lambda q, offset: q + offset, unknown=("q0",))
+    found = jl.fit(system, e, {"b": 0.5, "offset": 0.1}, free=("b", "offset"))
+    assert found.remarks == ["offset cannot be told from the unknown starts"]
+    np.testing.assert_allclose(found.estimates["b"], 0.4, rtol=1e-6)
+
+
+def test_one_of_many_without_a_motion_is_marked():
+    system = jl.System(lambda q, qdot, c: 0.5 * qdot**2 - 0.5 * c * q**2 + 0.25 * q**4)
+    good = jl.Experiment(osc.TIMES, np.cos(osc.TIMES), 0.5, 0.0, observe=lambda q: q)
+    bad = jl.Experiment(osc.TIMES, np.cos(osc.TIMES), 5.0, 0.0, observe=good.observe)
+    fits = jl.fit_each(system, [good, bad], {"c": 3.0}, free=("c",), max_steps=10)
+    assert not fits[1].converged and "could not be computed" in fits[1].reason
+    assert fits[0].reason != fits[1].reason
+    with pytest.raises(ValueError, match="must have a motion at the estimates, but it ended with"):
+        fits[0].predict(bad)
+
+
+def test_prediction_with_a_late_sensor(plain):
+    late = plain.predict(jl.Experiment(osc.TIMES, None, 1.0, 0.0, delay=0.5))
+    theta = [plain.estimates[name] for name in FREE]
+    np.testing.assert_allclose(late.values, np.where(osc.TIMES > 0.5, osc.position(np.maximum(osc.TIMES - 0.5, 0), *theta), 1.0), atol=1e-6)
+
+
+MORE_BAD = {
+    "a prior against unknown noise": (
+        lambda: fit(osc.record(0), priors={"b": (0.3, 0.1)}),
+        "`priors` must stand against noise that is known",
+    ),
+    "sigma of some only": (lambda: fit([osc.record(0), osc.record(1, sigma=0.01)]), "must all have a `sigma` or none"),
+    "pieces and an optimiser": (lambda: fit(osc.record(0), pieces=3, method=optax.lbfgs()), "must be used one at a time"),
+    "NaN where it is not free": (lambda: fit(osc.record(0), osc.START | {"m": np.nan}), "'m' is NaN. Give it a value, or free it."),
+    "a parameter of each one's own": (lambda: fit(osc.record(0, params={"b": 0.3})), "each has a 'b' of its own"),
+    "everything free, with bounds": (
+        lambda: jl.regress(osc.SYSTEM, osc.record(0), osc.START, free=("m", "c", "b"), bounds={"c": (0, None)}),
+        "only their ratios are determined",
+    ),
+    "a regression of nothing": (lambda: jl.regress(osc.SYSTEM, [], osc.START, free=FREE), "`experiments` must be an `Experiment`"),
+    "a regression with nothing free": (lambda: jl.regress(osc.SYSTEM, osc.record(0), osc.START, free=()), "at least one entry"),
+    "a regression with a delay": (lambda: jl.regress(osc.SYSTEM, osc.record(0, delay=0.1), osc.START, free=FREE), "`delay` must be none"),
+    "a time that is missing": (lambda: jl.Experiment([0.0, 0.1, np.nan], np.ones(3), 1.0, 0.0), "`ts` must be finite"),
+    "a start that is missing": (lambda: jl.Experiment([0.0, 0.1], np.ones(2), np.nan, 0.0), "`q0` must be finite"),
+}
+
+
+@pytest.mark.parametrize("case", MORE_BAD)
+def test_what_would_give_wrong_numbers_is_refused(case):
+    make, said = MORE_BAD[case]
+    with pytest.raises(ValueError) as error:
+        make()
+    assert said in str(error.value) and str(error.value).endswith(".")
+
+
+def test_a_start_that_is_not_known_is_found_within_its_bounds():
+    found = fit(osc.record(0), osc.START | {"b": np.nan}, bounds={"b": (0, 0.5)})
+    np.testing.assert_allclose(found.estimates["b"], by_scipy(osc.noisy(0)).x[1], rtol=1e-4)
+
+
+def test_ratios_are_named_in_single_precision(single_precision):
+    found = fit(osc.record(0), osc.START | {"m": 1.3}, free=("b", "c", "m"))
+    assert found.remarks == ["only b/m and c/m are determined; their common factor is not"]
