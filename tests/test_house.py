@@ -13,6 +13,10 @@ import jaxlag
 
 PACKAGE = pathlib.Path(jaxlag.__file__).parent
 ORDER = [
+    "_folding",
+    "_primitives",
+    "_entries",
+    "_scalarised",
     "_arguments",
     "_system",
     "_checks",
