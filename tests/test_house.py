@@ -36,13 +36,27 @@ ORDER = [
     "_steps",
     "_integrate",
     "_identify",
+    "_symbols",
+    "_tidy",
+    "_linear",
+    "_derivation",
+    "_statement",
+    "_notation",
+    "_programs",
+    "_equations",
     "plot",
 ]
 BESIDE = ["dissipation"]  # needs nothing of the package
 PUBLIC = [name for name in vars(jaxlag) if not name.startswith("_") and callable(getattr(jaxlag, name))]
 
 
-HOMES = [("diffrax", {"_results", "_steps", "_integrate"}), ("matplotlib", {"plot"}), ("optimistix", {"_identify"})]
+PAPER = {"_symbols", "_tidy", "_linear", "_derivation", "_statement", "_notation", "_programs", "_equations"}
+HOMES = [
+    ("diffrax", {"_results", "_steps", "_integrate"}),
+    ("matplotlib", {"plot"}),
+    ("optimistix", {"_identify"}),
+    ("sympy", PAPER),
+]
 
 
 def _imported(file):
