@@ -13,6 +13,10 @@ import jaxlag
 
 PACKAGE = pathlib.Path(jaxlag.__file__).parent
 ORDER = [
+    "_folding",
+    "_primitives",
+    "_entries",
+    "_scalarised",
     "_arguments",
     "_system",
     "_checks",
@@ -45,18 +49,28 @@ ORDER = [
     "_regress",
     "_identify",
     "_assess",
+    "_symbols",
+    "_tidy",
+    "_linear",
+    "_derivation",
+    "_statement",
+    "_notation",
+    "_programs",
+    "_equations",
     "plot",
 ]
 BESIDE = ["dissipation", "learnt"]  # need nothing of the package
 PUBLIC = [name for name in vars(jaxlag) if not name.startswith("_") and callable(getattr(jaxlag, name))]
 
 
+PAPER = {"_symbols", "_tidy", "_linear", "_derivation", "_statement", "_notation", "_programs", "_equations"}
 HOMES = [
     ("diffrax", {"_results", "_steps", "_integrate"}),
     ("matplotlib", {"plot"}),
     ("optimistix", {"_least_squares"}),
     ("optax", {"_identify"}),
     ("scipy", {"_quality", "_smoothing", "_fit"}),
+    ("sympy", PAPER),
 ]
 
 

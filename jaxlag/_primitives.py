@@ -1,0 +1,333 @@
+"""How the primitives of JAX are taken apart into operations on entries, and which of them only move entries about.
+
+Each rule takes the reader (`_entries`), the equation and its operands, and gives the outputs; NotImplemented leaves the equation whole.
+"""
+
+import functools
+import math
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import numpy as np
+from jax import lax
+from jax.extend import core
+
+from ._folding import Arrays, Entry, Folding, objects
+
+RULES: dict[str, Callable] = {}
+
+
+def alike(*arrays: np.ndarray) -> Arrays:
+    """All with objects, where one has."""
+    return [objects(x) for x in arrays] if any(x.dtype == object for x in arrays) else list(arrays)
+
+
+def each(function: Callable, *arrays: np.ndarray) -> np.ndarray:
+    """A function of each of their entries."""
+    return np.asarray(np.frompyfunc(function, len(arrays), 1)(*map(objects, arrays)), object)
+
+
+def _rule(*names: str) -> Callable:
+    def register(rule: Callable) -> Callable:
+        RULES.update(dict.fromkeys(names, rule))
+        return rule
+
+    return register
+
+
+def _moving(**movements: Callable) -> None:
+    """Rules of equations that only move data: functions of the parameters and the operands."""
+    for name, movement in movements.items():
+        RULES[name] = lambda reader, equation, *operands, movement=movement: movement(equation.params, *alike(*operands))
+
+
+def _broadcast(p, x):
+    shape = np.ones(len(p["shape"]), int)
+    shape[list(p["broadcast_dimensions"])] = x.shape
+    return np.broadcast_to(x.reshape(shape), p["shape"])
+
+
+def _padded(p, x, value):
+    low, high, inner = np.array(p["padding_config"], int).reshape(-1, 3).T
+    out = np.broadcast_to(value, low + high + x.shape + inner * np.maximum(np.array(x.shape, int) - 1, 0)).copy()
+    for at in np.ndindex(x.shape):
+        place = low + at * (1 + inner)
+        if (place >= 0).all() and (place < out.shape).all():
+            out[tuple(place)] = x[at]
+    return out
+
+
+_moving(
+    reshape=lambda p, x: x.reshape(p["new_sizes"]) if p["dimensions"] is None else NotImplemented,
+    squeeze=lambda p, x: np.squeeze(x, p["dimensions"]),
+    transpose=lambda p, x: np.transpose(x, p["permutation"]),
+    broadcast_in_dim=_broadcast,
+    slice=lambda p, x: x[tuple(map(slice, p["start_indices"], p["limit_indices"], p["strides"] or [1] * x.ndim))],
+    rev=lambda p, x: np.flip(x, p["dimensions"]),
+    concatenate=lambda p, *xs: np.concatenate(xs, p["dimension"]),
+    stack=lambda p, *xs: np.stack(xs, p["axis"]),
+    unstack=lambda p, x: [np.asarray(part, x.dtype) for part in np.moveaxis(x, p["axis"], 0)],
+    split=lambda p, x: np.split(x, np.cumsum(p["sizes"])[:-1], p["axis"]),
+    tile=lambda p, x: np.tile(x, p["reps"]),
+    pad=_padded,
+    copy=lambda p, x: x,
+    iota=lambda p: _broadcast(p | {"broadcast_dimensions": (p["dimension"],)}, np.arange(p["shape"][p["dimension"]], dtype=p["dtype"])),
+)
+
+
+@_rule("convert_element_type")
+def _converted(reader, equation, x):
+    dtype = equation.params["new_dtype"]
+
+    def convert(x):
+        if isinstance(x, Entry):
+            return x if x.dtype == dtype else reader.entry(equation.primitive, equation.params, dtype, x)
+        return x.astype(dtype)
+
+    return convert(x) if x.dtype != object else each(convert, x)
+
+
+@_rule("integer_pow", "square")
+def _power(reader, equation, x):
+    return each(functools.partial(reader.power, n=equation.params.get("y", 2)), x)
+
+
+def _reducing(name: str, primitive: core.Primitive, neutral: Any = None) -> None:
+    def combining(reader, equation):
+        return np.frompyfunc(functools.partial(reader.apply, primitive, {}, equation.outvars[0].aval.dtype), 2, 1)
+
+    @_rule(f"reduce_{name}")
+    def reduced(reader, equation, x):
+        combine, x = combining(reader, equation), objects(x)
+        if x.size == 0:
+            aval = equation.outvars[0].aval
+            return NotImplemented if neutral is None else np.full(aval.shape, neutral, aval.dtype)
+        for axis in sorted(equation.params["axes"], reverse=True):
+            x = combine.reduce(x, axis)
+        return np.asarray(x, object)
+
+    @_rule(f"cum{name}")
+    def cumulated(reader, equation, x):
+        turned = functools.partial(np.flip, axis=equation.params["axis"]) if equation.params["reverse"] else lambda x: x
+        return turned(combining(reader, equation).accumulate(turned(objects(x)), equation.params["axis"]))
+
+
+_reducing("sum", lax.add_p, 0)
+_reducing("prod", lax.mul_p, 1)
+_reducing("and", lax.and_p, True)
+_reducing("or", lax.or_p, False)
+_reducing("max", lax.max_p)
+_reducing("min", lax.min_p)
+
+
+@_rule("dot_general")
+def _dot(reader, equation, x, y):
+    (x_sum, y_sum), (x_batch, y_batch) = equation.params["dimension_numbers"]
+    aval = equation.outvars[0].aval
+    if any(atom.aval.dtype != aval.dtype for atom in equation.invars):
+        return NotImplemented
+
+    def rows(array, batch, summed):
+        free = [d for d in range(array.ndim) if d not in (*batch, *summed)]
+        sizes = [math.prod(array.shape[d] for d in dims) for dims in (batch, free, summed)]
+        return objects(array).transpose(*batch, *free, *summed).reshape(sizes)
+
+    x, y = rows(x, x_batch, x_sum), rows(y, y_batch, y_sum)
+    products = np.frompyfunc(reader.mul, 2, 1)(x[:, :, None], y[:, None])
+    if products.size == 0:
+        return np.zeros(aval.shape, aval.dtype)
+    return np.frompyfunc(reader.add, 2, 1).reduce(products, -1).reshape(aval.shape)
+
+
+def _windows(starts, shape, sizes, start_dims, batch_dims, start_batch_dims, clip):
+    """For each vector of starts its place among them, and its window of an array; None for a window that does not fit."""
+    room = np.array(shape, int) - sizes
+    for at in np.ndindex(starts.shape[:-1]):
+        start = np.zeros(len(shape), int)
+        start[list(start_dims)] = starts[at]
+        start[list(batch_dims)] = [at[d] for d in start_batch_dims]
+        start = np.clip(start, 0, room) if clip else start
+        fits = ((start >= 0) & (start <= room)).all()
+        yield at, tuple(slice(i, i + n) for i, n in zip(start, sizes, strict=True)) if fits else None
+
+
+@_rule("gather")
+def _gathered(reader, equation, x, starts):
+    p, how = equation.params, equation.params["dimension_numbers"]
+    if starts.dtype == object:
+        return NotImplemented
+    clip = p["mode"] in (lax.GatherScatterMode.CLIP, lax.GatherScatterMode.PROMISE_IN_BOUNDS)
+    out = np.empty(equation.outvars[0].aval.shape, x.dtype)
+    part = np.moveaxis(out, [d for d in range(out.ndim) if d not in how.offset_dims], range(starts.ndim - 1))
+    gone = (*how.collapsed_slice_dims, *how.operand_batching_dims)
+    kept = [n for d, n in enumerate(p["slice_sizes"]) if d not in gone]
+    batch = how.operand_batching_dims, how.start_indices_batching_dims
+    for at, window in _windows(starts, x.shape, p["slice_sizes"], how.start_index_map, *batch, clip):
+        if window is None:
+            return NotImplemented
+        part[(*at, ...)] = x[window].reshape(kept)
+    return out
+
+
+def _scattering(name: str, method: Callable) -> None:
+    @_rule(name)
+    def scattered(reader, equation, x, starts, updates):
+        p, how = equation.params, equation.params["dimension_numbers"]
+        if starts.dtype == object:
+            return NotImplemented
+        x, updates = objects(x).copy(), objects(updates)
+        part = np.moveaxis(updates, [d for d in range(updates.ndim) if d not in how.update_window_dims], range(starts.ndim - 1))
+        gone = (*how.inserted_window_dims, *how.operand_batching_dims)
+        sizes = np.ones(x.ndim, int)
+        sizes[[d for d in range(x.ndim) if d not in gone]] = [updates.shape[d] for d in how.update_window_dims]
+        batch = how.operand_batching_dims, how.scatter_indices_batching_dims
+        clip = p["mode"] == lax.GatherScatterMode.CLIP
+        for at, window in _windows(starts, x.shape, sizes, how.scatter_dims_to_operand_dims, *batch, clip):
+            if window is not None:
+                x[window] = each(functools.partial(method, reader), x[window], part[(*at, ...)].reshape(sizes))
+        return x
+
+
+_scattering("scatter", lambda reader, old, new: new)
+_scattering("scatter-add", Folding.add)
+_scattering("scatter-mul", Folding.mul)
+
+
+@_rule("dynamic_slice", "dynamic_update_slice")
+def _at_start(reader, equation, x, *rest):
+    updates, starts = (rest[:1], rest[1:]) if equation.primitive is lax.dynamic_update_slice_p else ((), rest)
+    if any(start.dtype == object for start in starts):
+        return NotImplemented
+    sizes = updates[0].shape if updates else equation.params["slice_sizes"]
+    window = tuple(slice(i := min(max(int(start), 0), size - n), i + n) for start, size, n in zip(starts, x.shape, sizes, strict=True))
+    if not updates:
+        return x[window]
+    x, update = alike(x.copy(), updates[0])
+    x[window] = update
+    return x
+
+
+# Linear algebra.
+
+
+@_rule("cholesky")
+def _cholesky(reader, equation, A):
+    dtype = equation.outvars[0].aval.dtype
+    L = objects(np.zeros(A.shape, dtype))
+    for at in np.ndindex(A.shape[:-2]):
+        a, l = objects(A[at]), L[at]
+        for j in range(len(a)):
+            for i in range(j, len(a)):
+                rest = functools.reduce(reader.sub, map(reader.mul, l[i, :j], l[j, :j]), a[i, j])
+                l[i, j] = reader.mul(rest, reader.div(dtype.type(1), l[j, j])) if i > j else reader.apply(lax.sqrt_p, {}, dtype, rest)
+    return L
+
+
+@_rule("triangular_solve")
+def _triangular_solve(reader, equation, A, B):
+    p, one = equation.params, equation.outvars[0].aval.dtype.type(1)
+    turned = p["transpose_a"] == p["left_side"]  # A X = B is solved, with A or Aᵀ, for X or, where X stands on the left, Xᵀ
+    A, X = objects(A.swapaxes(-1, -2) if turned else A), objects(B).copy()
+    for at in np.ndindex(A.shape[:-2]):
+        a, x = A[at], X[at] if p["left_side"] else X[at].T
+        upwards = p["lower"] == turned
+        for i in reversed(range(len(a))) if upwards else range(len(a)):
+            known = slice(i + 1, None) if upwards else slice(i)
+            for k in range(x.shape[1]):
+                rest = functools.reduce(reader.sub, map(reader.mul, a[i, known], x[known, k]), x[i, k])
+                x[i, k] = rest if p["unit_diagonal"] else reader.mul(rest, reader.div(one, a[i, i]))
+    return X
+
+
+@_rule("lu")
+def _lu(reader, equation, A):
+    """P A = L U where the algebra has no numbers to choose pivots by: the first that is not zero serves."""
+    if reader.algebra.block(equation) is not None:
+        return NotImplemented
+    *batch, rows, columns = A.shape
+    A = objects(A).copy()
+    pivots = np.zeros((*batch, min(rows, columns)), np.int32)
+    permutation = np.broadcast_to(np.arange(rows, dtype=np.int32), (*batch, rows)).copy()
+    for at in np.ndindex(*batch):
+        a = A[at]
+        for j in range(min(rows, columns)):
+            k = pivots[(*at, j)] = next((i for i in range(j, rows) if isinstance(a[i, j], Entry) or a[i, j] != 0), j)
+            for swapped in (a, permutation[at]):
+                swapped[[j, k]] = swapped[[k, j]]
+            for i in range(j + 1, rows):
+                a[i, j] = reader.div(a[i, j], a[j, j])
+                a[i, j + 1 :] = [reader.sub(x, reader.mul(a[i, j], y)) for x, y in zip(a[i, j + 1 :], a[j, j + 1 :], strict=True)]
+    return [A, pivots, permutation]
+
+
+@_rule("custom_linear_solve")
+def _linear_solve(reader, equation, *operands):
+    """The solution written out; where the algebra differentiates, it gets its derivative from the equation it solves."""
+    lengths, solve = equation.params["const_lengths"], equation.params["jaxprs"].solve
+    before, right, function = lengths.matvec + lengths.vecmat, operands[sum(lengths) :], reader.algebra.block(equation)
+    if function is not None:
+        held = lambda x: reader.new(x.dtype, "held", lax.stop_gradient, (x,)) if isinstance(x, Entry) else x
+        right = [each(held, x) for x in right]
+    x = reader.inner(solve, [*operands[before : before + lengths.solve], *right])
+    if function is None:
+        return x
+    # What comes out as a number is one whatever the operands are, and so is its derivative.
+    whole = reader.block(function, [*x, *operands], equation.outvars)
+    return [each(lambda x, entry: entry if isinstance(x, Entry) else x, *pair) for pair in zip(x, whole, strict=True)]
+
+
+# Calls and loops.
+
+
+@_rule("jit", "pjit", "closed_call", "core_call", "remat", "remat2", "checkpoint")
+def _called(reader, equation, *operands):
+    shortcut = reader.algebra.shortcut(equation)
+    if shortcut is not None and any(x.dtype == object for x in operands):
+        return reader.block(shortcut, operands, equation.outvars)
+    body = next(equation.params[name] for name in ("jaxpr", "call_jaxpr", "fun_jaxpr") if name in equation.params)
+    return reader.inner(body, operands)
+
+
+@_rule("custom_jvp_call", "custom_vjp_call", "custom_vjp_call_jaxpr")
+def _with_rule(reader, equation, *operands):
+    """Taken apart, unless the algebra differentiates: then it stays in one piece, with its rule."""
+    results = _called(reader, equation, *operands)
+    return results if reader.algebra.block(equation) is None else NotImplemented
+
+
+@_rule("platform_index")
+def _platform(reader, equation):
+    fits = [names is None or jax.default_backend() in names for names in equation.params["platforms"]]
+    return np.asarray(fits.index(True), np.int32)
+
+
+@_rule("cond")
+def _branch(reader, equation, index, *operands):
+    branches = equation.params["branches"]
+    return NotImplemented if index.dtype == object else reader.inner(branches[min(max(int(index), 0), len(branches) - 1)], operands)
+
+
+@_rule("while")
+def _while(reader, equation, *operands):
+    p = equation.params
+    i, j = p["cond_nconsts"], p["cond_nconsts"] + p["body_nconsts"]
+    condition, consts, state = operands[:i], operands[i:j], list(operands[j:])
+    while (goes_on := reader.inner(p["cond_jaxpr"], [*condition, *state])[0]).dtype != object:
+        if not goes_on:
+            return state
+        state = reader.inner(p["body_jaxpr"], [*consts, *state])
+    return NotImplemented
+
+
+@_rule("scan")
+def _scan(reader, equation, *operands):
+    p = equation.params
+    i, j = p["num_consts"], p["num_consts"] + p["num_carry"]
+    consts, carry, columns, rows = operands[:i], list(operands[i:j]), operands[j:], {}
+    for k in reversed(range(p["length"])) if p["reverse"] else range(p["length"]):
+        out = reader.inner(p["jaxpr"], [*consts, *carry, *(np.asarray(x[k], x.dtype) for x in columns)])
+        carry, rows[k] = out[: len(carry)], out[len(carry) :]
+    if not rows:
+        return NotImplemented
+    return [*carry, *(np.stack(alike(*column)) for column in zip(*(rows[k] for k in sorted(rows)), strict=True))]
