@@ -1,6 +1,6 @@
 """The Runge–Kutta scheme DOP853 written out in `lax`, stage by stage: the limit of what a compiled motion can cost.
 
-The state is a tuple of coordinates, each a number or, for a batch that shares its steps, a vector of all members.
+The state is an array of coordinates, or of coordinates × members for a batch that shares its steps.
 Source: Hairer, Nørsett & Wanner, Solving Ordinary Differential Equations I, section II.10.
 """
 
@@ -13,67 +13,63 @@ STAGES = scheme.N_STAGES
 
 
 def motion(rates, start, ts, tolerance, max_steps=192):
-    """The states at `ts` as an array (coordinates, [members,] samples). The steps are chosen by values alone: their size is not differentiated."""
-    end, buffers = ts[-1], (jnp.full(max_steps, jnp.inf), jnp.ones(max_steps), jnp.zeros((max_steps, 8, *jnp.shape(jnp.stack(start)))))
+    """The states at `ts`, samples last. The steps are chosen by values alone: their size is not differentiated."""
+    # Held back from fusion: the compiler would compute a stage again for each one that uses it.
+    rates = lambda y, rates=rates: jax.lax.optimization_barrier(rates(y))
+    end, buffers = ts[-1], (jnp.full(max_steps, jnp.inf), jnp.ones(max_steps), jnp.zeros((max_steps, 8, *start.shape)))
 
     def step(carry):
         i, t, h, y, k, (begins, sizes, series) = carry
         h = jnp.minimum(h, end - t)
         K = stages(rates, y, k, h)
-        after = moved(y, scheme.B, K[:STAGES], h)
-        K = [*K[:STAGES], rates(after)]
+        after = y + h * weighted(scheme.B, K)
+        K.append(rates(after))
         error = jax.lax.stop_gradient(error_norm(K, y, after, h, tolerance))
         good = error <= 1
         K = further(rates, y, K, h)
-        buffers = begins.at[i].set(t), sizes.at[i].set(h), series.at[i].set(jnp.stack([jnp.stack(f) for f in dense(y, after, K, h)]))
+        buffers = begins.at[i].set(t), sizes.at[i].set(h), series.at[i].set(dense(y, after, K, h))
         grown = h * jnp.clip(0.9 * error ** (-1 / 8), 0.2, 10.0)
-        chosen = lambda a, b: tuple(jnp.where(good, x, z) for x, z in zip(a, b, strict=True))
-        return i + good, jnp.where(good, t + h, t), grown, chosen(after, y), chosen(K[STAGES], k), buffers
+        return i + good, jnp.where(good, t + h, t), grown, jnp.where(good, after, y), jnp.where(good, K[STAGES], k), buffers
 
-    first = 0.02 * jnp.ones(()) * (tolerance / 1e-8) ** (1 / 8)
+    first = 0.02 * (tolerance / 1e-8) ** (1 / 8)
     unfinished = lambda carry: (carry[1] < end) & (carry[0] < max_steps)
     count, *_, (begins, sizes, series) = jax.lax.while_loop(unfinished, step, (0, ts[0], first, start, rates(start), buffers))
     begins = jnp.where(jnp.arange(max_steps) < count, begins, jnp.inf)
     return sampled(begins, sizes, series, ts)
 
 
-def moved(y, weights, K, h):
-    """y + h Σ wᵢ kᵢ."""
-    used = [(float(w), k) for w, k in zip(weights, K, strict=True) if w != 0]
-    return tuple(y_j + h * sum(w * k[j] for w, k in used) for j, y_j in enumerate(y))
+def weighted(weights, K):
+    """Σ wᵢ kᵢ."""
+    return sum(float(w) * k for w, k in zip(weights, K, strict=False) if w != 0)
 
 
 def stages(rates, y, k, h):
     """k₁ … k₁₂."""
     K = [k]
     for i in range(1, STAGES):
-        K.append(rates(moved(y, scheme.A[i, :i], K, h)))
+        K.append(rates(y + h * weighted(scheme.A[i], K)))
     return K
 
 
 def further(rates, y, K, h):
     """The three more stages that the dense output needs."""
     for i in range(STAGES + 1, scheme.N_STAGES_EXTENDED):
-        K = [*K, rates(moved(y, scheme.A[i, :i], K, h))]
+        K = [*K, rates(y + h * weighted(scheme.A[i], K))]
     return K
 
 
 def error_norm(K, y, after, h, tolerance):
     """Hairer's combination of the embedded estimates of orders 5 and 3, relative to the tolerance (atol is a hundredth of rtol)."""
-    scale = [tolerance * (0.01 + jnp.maximum(jnp.abs(a), jnp.abs(b))) for a, b in zip(y, after, strict=True)]
-    zero = tuple(jnp.zeros_like(x) for x in y)
-    squares = lambda weights: sum((e / s) ** 2 for e, s in zip(moved(zero, weights, K, h), scale, strict=True))
+    scale = tolerance * (0.01 + jnp.maximum(jnp.abs(y), jnp.abs(after)))
+    squares = lambda weights: jnp.sum((h * weighted(weights, K) / scale) ** 2, axis=0)
     fifth, third = squares(scheme.E5), squares(scheme.E3)
     return jnp.max(fifth / jnp.sqrt(jnp.maximum((fifth + 0.01 * third) * len(y), 1e-300)))
 
 
 def dense(y, after, K, h):
     """y and the seven coefficients of the interpolation of 7th order."""
-    zero = tuple(jnp.zeros_like(x) for x in y)
-    change = tuple(b - a for a, b in zip(y, after, strict=True))
-    out = [y, change, tuple(h * k - d for k, d in zip(K[0], change, strict=True))]
-    out.append(tuple(2 * d - h * (a + b) for d, a, b in zip(change, K[STAGES], K[0], strict=True)))
-    return out + [moved(zero, row, K, h) for row in np.asarray(scheme.D)]
+    change, begin, end = after - y, h * K[0], h * K[STAGES]
+    return jnp.stack([y, change, begin - change, 2 * change - begin - end, *(h * weighted(row, K) for row in np.asarray(scheme.D))])
 
 
 def sampled(begins, sizes, series, ts):
