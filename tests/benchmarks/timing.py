@@ -6,13 +6,14 @@ compiles, is kept apart. A table compares with its first row; `results.json` bes
 
 import dataclasses
 import json
+import math
 import os
 import platform
 import statistics
 import time
 from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 
@@ -54,24 +55,35 @@ def medians(runs: Mapping[str, Callable[[], Any]], rounds: int = ROUNDS, span: f
     return {name: statistics.median(times) for name, times in taken.items()}
 
 
-def loosest(run: Callable[[float], Any], error: Callable[[Any], float], bound: float, start: float = 1e-5) -> tuple[float, float]:
-    """The loosest tolerance, in quarters of a decade, with which the error is within the bound; and that error."""
-    tolerance, found = start, error(run(start))
-    while not found <= bound:
+class Met(NamedTuple):
+    """The loosest tolerance that meets a bound, the error with it, and the seconds of the very first call."""
+
+    tolerance: float
+    error: float
+    first: float
+
+
+def loosest(run: Callable[[float], Any], error: Callable[[Any], float], bound: float, start: float = 1e-5) -> Met:
+    """The loosest tolerance, in quarters of a decade, with which the error is within the bound."""
+    tolerance = start
+    first = once(lambda: run(start))
+    found = error(run(start))
+    while not found <= bound and tolerance > 1e-14:
         tolerance *= 10**-0.25
-        if tolerance < 1e-14:
-            return float("nan"), found
         found = error(run(tolerance))
-    return tolerance, found
+    return Met(tolerance, float(found), first)
 
 
-def compared(runs: Mapping[str, Callable[[], Any]], rounds: int = ROUNDS, **facts: Mapping[str, Any]) -> list[Row]:
-    """First calls, medians and ratios to the first of the runs; `facts` are more entries of the rows, by name."""
-    first = {name: once(run) for name, run in runs.items()}
+def compared(runs: Mapping[str, Callable[[], Any]], met: Mapping[str, Met] | None = None, rounds: int = ROUNDS) -> list[Row]:
+    """First calls, medians, and ratios to the first of the runs."""
+    if met is None:
+        met = {name: Met(math.nan, math.nan, once(run)) for name, run in runs.items()}
     seconds = medians(runs, rounds)
-    base = seconds[next(iter(runs))]
-    more = lambda name: {fact: by_name[name] for fact, by_name in facts.items() if name in by_name}
-    return [Row(name, first[name], seconds[name], ratio=seconds[name] / base, **more(name)) for name in runs]
+    base, known = seconds[next(iter(runs))], lambda x: None if math.isnan(x) else x
+    return [
+        Row(name, met[name].first, seconds[name], known(met[name].error), known(met[name].tolerance), ratio=seconds[name] / base)
+        for name in runs
+    ]
 
 
 def skipped(names: Mapping[str, str]) -> list[Row]:

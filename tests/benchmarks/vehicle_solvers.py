@@ -28,14 +28,15 @@ class Solver(NamedTuple):
     many: Callable[[float], Any] | None = None
 
 
-def of_jax(motion, motions=None):
+def of_jax(motion, motions=None, static=()):
     """From `motion(theta, ts, tolerance)` in JAX, (samples, 6): derivatives by one vectorised forward pass."""
 
     def sensitive(theta, ts, tolerance):
         along = lambda e: jax.jvp(lambda theta: motion(theta, ts, tolerance), (theta,), (e,))
         return jax.vmap(along, out_axes=(None, -1))(jnp.eye(3))
 
-    one, three, all_ = jax.jit(motion), jax.jit(sensitive), jax.jit(motions or jax.vmap(motion, (0, None, None)))
+    motions = motions or (lambda spread, ts, tolerance: jax.vmap(lambda theta: motion(theta, ts, tolerance))(spread))
+    one, three, all_ = (jax.jit(f, static_argnums=static) for f in (motion, sensitive, motions))
     ts, few, theta, spread = (jnp.asarray(x) for x in (TS, FEW, THETA, SPREAD))
     return Solver(
         lambda tolerance: one(theta, ts, tolerance),
@@ -45,22 +46,35 @@ def of_jax(motion, motions=None):
 
 
 def jaxlag():
-    """From L and D, as a user calls it."""
+    """From L and D, within one compiled function."""
+    return of_jax(lambda theta, ts, tolerance: stacked(*simulated(theta, ts, tolerance)), jaxlag_many, static=(2,))
 
-    def motion(theta, ts, tolerance):
-        params = P | dict(zip("bck", theta, strict=True))
-        found = jl.simulate(vehicle.system, vehicle.q0, vehicle.qdot0, ts, params, rtol=tolerance, atol=0.01 * tolerance)
-        return jnp.stack([part[name] for part in (found.q, found.qdot) for name in ("x", "y", "phi")], axis=-1)
 
-    return of_jax(motion, getattr(jl, "simulate_many", None) and jaxlag_many)
+def jaxlag_from_python():
+    """As a user calls it, with Python's share of the call."""
+    together = jax.jit(stacked)
+    return Solver(lambda tolerance: together(*simulated(THETA, TS, tolerance)))
+
+
+def simulated(theta, ts, tolerance):
+    """q and q̇."""
+    params = P | dict(zip("bck", theta, strict=True))
+    found = jl.simulate(vehicle.system, vehicle.q0, vehicle.qdot0, ts, params, rtol=tolerance, atol=0.01 * tolerance)
+    return found.q, found.qdot
+
+
+def stacked(*parts):
+    """(x, y, φ, ẋ, ẏ, φ̇) as the last axis."""
+    return jnp.stack([part[name] for part in parts for name in ("x", "y", "phi")], axis=-1)
 
 
 def jaxlag_many(spread, ts, tolerance):
-    """By `simulate_many`."""
-    params = {name: jnp.broadcast_to(value, len(spread)) for name, value in P.items()} | dict(zip("bck", spread.T, strict=True))
-    q0, qdot0 = (jax.tree.map(lambda x: jnp.full(len(spread), x), part) for part in (vehicle.q0, vehicle.qdot0))
-    found = jl.simulate_many(vehicle.system, q0, qdot0, ts, params, rtol=tolerance, atol=0.01 * tolerance)
-    return jnp.stack([part[name] for part in (found.q, found.qdot) for name in ("x", "y", "phi")], axis=-1)
+    """By `simulate_many` where the package has it, or by `vmap`."""
+    if not hasattr(jl, "simulate_many"):
+        return jax.vmap(lambda theta: stacked(*simulated(theta, ts, tolerance)))(spread)
+    params = P | dict(zip("bck", spread.T, strict=True))
+    found = jl.simulate_many(vehicle.system, vehicle.q0, vehicle.qdot0, ts, params, rtol=tolerance, atol=0.01 * tolerance)
+    return stacked(found.q, found.qdot)
 
 
 def field(t, y, theta):
@@ -96,7 +110,7 @@ def lax():
 
 
 def heyoka():
-    """Taylor series, compiled; variational equations; four sets at once in the vector registers, on all cores."""
+    """Taylor series, compiled; variational equations; as many sets at once as fill a vector register."""
     import heyoka as hy
 
     state, parameters = hy.make_vars("x", "y", "phi", "vx", "vy", "vphi"), [hy.par[i] for i in range(3)]
@@ -104,6 +118,7 @@ def heyoka():
     variational = hy.var_ode_sys(equations, hy.var_args.params, order=1)
     build = functools.cache(lambda what, tol: hy.taylor_adaptive(what and variational or equations, list(START), pars=list(THETA), tol=tol))
     width = hy.recommended_simd_size()
+    grid = np.repeat(FEW[:, None], width, 1)
     wide = functools.cache(
         lambda tol: hy.taylor_adaptive_batch(equations, np.repeat(np.array(START)[:, None], width, 1), pars=np.zeros((3, width)), tol=tol)
     )
@@ -119,13 +134,13 @@ def heyoka():
         out = run(True, theta, tolerance)
         return out[:, :6], out[:, 6:].reshape(-1, 6, 3)
 
-    def prepared(integrator, i):
-        integrator.pars[:] = SPREAD[width * i : width * (i + 1)].T
-        return integrator
-
     def many(tolerance):
-        found = hy.ensemble_propagate_grid_batch(wide(tolerance), FEW, len(SPREAD) // width, prepared)
-        return np.moveaxis(np.stack([each[-1] for each in found]), -1, 1).reshape(len(SPREAD), len(FEW), 6)
+        integrator, out = wide(tolerance), []
+        for members in SPREAD.reshape(-1, width, 3):
+            integrator.set_time(0.0)
+            integrator.pars[:], integrator.state[:] = members.T, np.array(START)[:, None]
+            out.append(integrator.propagate_grid(grid))
+        return np.moveaxis(np.stack(out), -1, 1).reshape(len(SPREAD), len(FEW), 6)
 
     return Solver(lambda tolerance: run(False, THETA, tolerance), sensitive, many)
 
@@ -134,8 +149,8 @@ def casadi():
     """CVODES; derivatives by its forward sensitivities; the many in two threads."""
     import casadi as ca
 
-    y, theta = ca.MX.sym("y", 6), ca.MX.sym("theta", 3)
-    ode = {"x": y, "p": theta, "ode": ca.vertcat(*rates(*ca.vertsplit(y), *ca.vertsplit(theta)))}
+    y, p, theta = ca.SX.sym("y", 6), ca.SX.sym("p", 3), ca.MX.sym("theta", 3)
+    ode = {"x": y, "p": p, "ode": ca.vertcat(*rates(*ca.vertsplit(y), *ca.vertsplit(p)))}
 
     @functools.cache
     def integrator(few, tolerance):
