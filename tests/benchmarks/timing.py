@@ -30,6 +30,7 @@ class Row:
     seconds: float | None = None
     error: float | None = None
     tolerance: float | None = None
+    drift: float | None = None  # the largest |g|, where there are constraints
     note: str = ""
     ratio: float | None = None  # to the first row of its table
 
@@ -94,9 +95,9 @@ def skipped(names: Mapping[str, str]) -> list[Row]:
 def show(task: str, rows: Iterable[Row]) -> None:
     """Prints the table, as Markdown."""
     number = lambda x, form: "" if x is None else format(x, form)
-    print(f"\n**{task}**\n\n| | time | ratio | error | tolerance | first call | |\n|---|---|---|---|---|---|---|")
+    print(f"\n**{task}**\n\n| | time | ratio | error | drift | tolerance | first call | |\n|---|---|---|---|---|---|---|---|")
     for row in rows:
-        cells = [duration(row.seconds), number(row.ratio, ".3g"), number(row.error, ".1e"), number(row.tolerance, ".1e")]
+        cells = [duration(row.seconds), number(row.ratio, ".3g"), *(number(x, ".1e") for x in (row.error, row.drift, row.tolerance))]
         print("| " + " | ".join([row.name, *cells, duration(row.first), row.note]) + " |", flush=True)
 
 

@@ -139,7 +139,7 @@ def heyoka():
         for members in SPREAD.reshape(-1, width, 3):
             integrator.set_time(0.0)
             integrator.pars[:], integrator.state[:] = members.T, np.array(START)[:, None]
-            out.append(integrator.propagate_grid(grid))
+            out.append(integrator.propagate_grid(grid)[-1])
         return np.moveaxis(np.stack(out), -1, 1).reshape(len(SPREAD), len(FEW), 6)
 
     return Solver(lambda tolerance: run(False, THETA, tolerance), sensitive, many)
