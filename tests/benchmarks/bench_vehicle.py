@@ -13,7 +13,7 @@ import optimistix as optx
 import vehicle_by_hand as by_hand
 import vehicle_solvers as solvers
 from timing import compared, loosest, record, skipped
-from vehicle_by_hand import AT_GUESS, EXACT, GUESS, OF_SPREAD, RECORD, SEEN, THETA, TS
+from vehicle_by_hand import AT_GUESS, EXACT, GUESS, OF_SPREAD, RECORD, SEEN, TS
 
 import jaxlag as jl
 from jaxlag.examples import vehicle

@@ -1,7 +1,7 @@
 """Points of mass 1 kg joined by rods, in Cartesian coordinates, with equations derived by hand.
 
-    g_k = ½(|r_k|² − l_k²),   r = D x − anchors,   D the incidence matrix
-    S λ = −(|ṙ_k|² + r_k · D g),   S = (D Dᵀ) ∘ (r rᵀ),   ẍ = g + Dᵀ(λ r)
+g_k = ½(|r_k|² − l_k²),   r = D x − anchors,   D the incidence matrix
+S λ = −(|ṙ_k|² + r_k · D g),   S = (D Dᵀ) ∘ (r rᵀ),   ẍ = g + Dᵀ(λ r)
 """
 
 import dataclasses

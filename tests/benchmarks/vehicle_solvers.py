@@ -1,8 +1,8 @@
 """The vehicle solved by jaxlag, by JAX written by hand, and by the peers: one `Solver` each.
 
-    motion(tolerance)                 states (1000, 6) at TS
-    sensitive(theta, tolerance)       states (1000, 6) and their derivatives (1000, 6, 3) in θ
-    many(tolerance)                   states (1024, 101, 6) at FEW for each row of SPREAD
+motion(tolerance)                 states (1000, 6) at TS
+sensitive(theta, tolerance)       states (1000, 6) and their derivatives (1000, 6, 3) in θ
+many(tolerance)                   states (1024, 101, 6) at FEW for each row of SPREAD
 """
 
 import functools
@@ -116,7 +116,7 @@ def heyoka():
     state, parameters = hy.make_vars("x", "y", "phi", "vx", "vy", "vphi"), [hy.par[i] for i in range(3)]
     equations = list(zip(state, rates(*state, *parameters), strict=True))
     variational = hy.var_ode_sys(equations, hy.var_args.params, order=1)
-    build = functools.cache(lambda what, tol: hy.taylor_adaptive(what and variational or equations, list(START), pars=list(THETA), tol=tol))
+    build = functools.cache(lambda what, tol: hy.taylor_adaptive((what and variational) or equations, list(START), pars=list(THETA), tol=tol))
     width = hy.recommended_simd_size()
     grid = np.repeat(FEW[:, None], width, 1)
     wide = functools.cache(
@@ -225,7 +225,9 @@ def derived_by_sympy():
     y, theta = sp.symbols("x y phi vx vy vphi", real=True), sp.symbols("b c k", positive=True)
     q, v = y[:3], y[3:]
     params = P | dict(zip("bck", theta, strict=True))
-    named = lambda f, **more: f(**{name: params[name] for name in f.__code__.co_varnames[: f.__code__.co_argcount] if name in params}, **more)
+    named = lambda f, **more: f(
+        **{name: params[name] for name in f.__code__.co_varnames[: f.__code__.co_argcount] if name in params}, **more
+    )
     at = {"q": dict(zip(("x", "y", "phi"), q, strict=True)), "qdot": dict(zip(("x", "y", "phi"), v, strict=True))}
     L = named(vehicle.lagrangian, **at)
     D = named(vehicle.dampers, qdot=at["qdot"]) + params["k"] * sp.Abs(v[0] + P["v"]) ** 3 / 3
