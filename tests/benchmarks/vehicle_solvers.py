@@ -116,7 +116,8 @@ def heyoka():
     state, parameters = hy.make_vars("x", "y", "phi", "vx", "vy", "vphi"), [hy.par[i] for i in range(3)]
     equations = list(zip(state, rates(*state, *parameters), strict=True))
     variational = hy.var_ode_sys(equations, hy.var_args.params, order=1)
-    build = functools.cache(lambda what, tol: hy.taylor_adaptive((what and variational) or equations, list(START), pars=list(THETA), tol=tol))
+    described = {True: variational, False: equations}
+    build = functools.cache(lambda what, tol: hy.taylor_adaptive(described[what], list(START), pars=list(THETA), tol=tol))
     width = hy.recommended_simd_size()
     grid = np.repeat(FEW[:, None], width, 1)
     wide = functools.cache(
