@@ -4,13 +4,11 @@ The error is the largest difference of the final positions from a motion with ex
 Run: python tests/benchmarks/bench_friction.py
 """
 
-import statistics
-import time
-
 import diffrax
 import jax
 import jax.numpy as jnp
 import numpy as np
+from timing import medians, once
 
 import jaxlag as jl
 
@@ -30,15 +28,9 @@ def run(**how):
 
 
 def timed(**how):
-    begin = time.perf_counter()
-    jax.block_until_ready(run(**how))
-    first, runs = time.perf_counter() - begin, []
-    for _ in range(5):
-        begin = time.perf_counter()
-        motion = run(**how)
-        jax.block_until_ready(motion)
-        runs.append(time.perf_counter() - begin)
-    return motion, first, statistics.median(runs)
+    action = lambda: run(**how)
+    first = once(action)
+    return action(), first, medians({"": action}, rounds=7)[""]
 
 
 def main():

@@ -4,11 +4,9 @@ Four oscillators, whose stiffnesses are mixed from p parameters. The crossing se
 Run: python tests/benchmarks/bench_gradient.py
 """
 
-import statistics
-import time
-
 import jax
 import jax.numpy as jnp
+from timing import medians, once
 
 import jaxlag as jl
 from jaxlag import _sensitivities
@@ -19,21 +17,15 @@ TS = jnp.linspace(0, 5, 100)
 
 
 def seconds(p, limit):
-    """Compilation, and one evaluation (median of 7)."""
+    """Compilation, and one evaluation (median)."""
     _sensitivities.FORWARD_LIMIT = limit
     jax.clear_caches()
     q0 = jnp.ones(4)
     spread = jnp.linspace(0.5, 1.5, 4 * p).reshape(4, p) / p
     loss = lambda c: jnp.sum(jl.simulate(oscillators, q0, jnp.zeros(4), TS, {"c": c, "mix": spread}, rtol=1e-6, atol=1e-8).q ** 2)
     gradient = jax.jit(jax.value_and_grad(loss))
-    begin = time.perf_counter()
-    jax.block_until_ready(gradient(jnp.ones(p)))
-    first, runs = time.perf_counter() - begin, []
-    for _ in range(7):
-        begin = time.perf_counter()
-        jax.block_until_ready(gradient(jnp.ones(p)))
-        runs.append(time.perf_counter() - begin)
-    return first, statistics.median(runs)
+    action = lambda: gradient(jnp.ones(p))
+    return once(action), medians({"": action})[""]
 
 
 def main():

@@ -1,0 +1,20 @@
+"""All comparisons of speed in one run, each in a process of its own; the tables go to `results.json`.
+
+Peers: pip install -e ".[benchmarks]". A peer that is not installed is named in the tables as skipped.
+Run: python tests/benchmarks/run.py
+"""
+
+import subprocess
+import sys
+from pathlib import Path
+
+TOPICS = ("vehicle", "pendulum", "constraints", "first_use")
+
+
+def main():
+    for topic in TOPICS:
+        subprocess.run([sys.executable, Path(__file__).with_name(f"bench_{topic}.py")], check=True)
+
+
+if __name__ == "__main__":
+    main()
