@@ -36,6 +36,7 @@ from ._mechanics import (
     momentum as momentum,
 )
 from ._power import powers as powers
+from ._runge_kutta import Dop853 as Dop853, Dopri5 as Dopri5
 from ._results import RESULTS as RESULTS
 from ._signal import Signal as Signal
 from ._system import System as System

@@ -16,9 +16,10 @@ from ._friction import Regularised, StickSlip
 from ._manifold import Baumgarte, NoStabilisation, Projection, nearest_state
 from ._motion import Equations, slack_of
 from ._results import OF_THE_INPUT, RESULTS, reason_of
+from ._runge_kutta import Dopri5
 from ._sensitivities import differentiable
 from ._signal import jump_times, solved
-from ._steps import Kept, Resuming, StickSlipSolver, behind_a_jump
+from ._steps import AtSamples, Kept, Resuming, StickSlipSolver, behind_a_jump
 from ._system import System
 from ._trajectory import Rubbing, Stated, Trajectory
 
@@ -53,8 +54,8 @@ def simulate(
     - `q0`, `qdot0`: the state at ts[0]; pytrees of one structure. Any consistent units.
     - `ts`: sample times, increasing, at least two.
     - `params`: what the functions of the system name; measured inputs among them are `Signal`s.
-    - `solver`: any explicit or diagonally implicit Runge–Kutta solver of diffrax. Default `diffrax.Tsit5()`; stiff systems
-      want `diffrax.Kvaerno5()`, high accuracy `diffrax.Dopri8()`.
+    - `solver`: any explicit or diagonally implicit Runge–Kutta solver of diffrax. Default `jaxlag.Dopri5()`; high accuracy
+      wants `jaxlag.Dop853()`, stiff systems `diffrax.Kvaerno5()`.
     - `rtol`, `atol`: tolerances of the step size control. Defaults 1e-8 and 1e-10 in double, 1e-4 and 1e-6 in single precision.
     - `stabilisation`: how the constraints are kept, `Projection()`, `Baumgarte(...)` or `NoStabilisation()`.
     - `friction`: how kinks of D are taken, `StickSlip()` (exactly) or `Regularised(width)`.
@@ -82,7 +83,7 @@ def simulate(
     q0, qdot0 = state(q0, qdot0, ("q0", "qdot0"))
     dtype = jax.tree.leaves(q0)[0].dtype
     ts = sample_times(ts, dtype)
-    how = _How(solver or dfx.Tsit5(), stabilisation, friction, max_steps, adjoint, progress, audit)
+    how = _How(solver or Dopri5(), stabilisation, friction, max_steps, adjoint, progress, audit)
     single = jnp.finfo(dtype).bits < 64
     if single:
         _warn_of_single_precision()
@@ -149,10 +150,10 @@ def _solve(equations, how, adjoint, t0, y0, ts, args, tolerances):
     """States at the samples, by diffrax, and the reason it stopped."""
     rtol, atol = tolerances
     rounding = jnp.finfo(y0.dtype).eps * jnp.maximum(jnp.abs(ts[0]), jnp.abs(ts[-1]))
-    controller = dfx.PIDController(rtol, atol, dtmin=4 * rounding, force_dtmin=False)
+    controller = dfx.PIDController(rtol, atol, dtmin=4 * rounding, force_dtmin=False, norm=root_mean_square)
     end, jumps, behind = ts[-1], jump_times(args[0], ts.dtype), None
     if jumps is not None:
-        controller = dfx.ClipStepSizeController(Resuming(rtol, atol, smallest=4 * rounding), jump_ts=jumps)
+        controller = dfx.ClipStepSizeController(Resuming(rtol, atol, smallest=4 * rounding, norm=root_mean_square), jump_ts=jumps)
         end = end + 256 * rounding  # a jump at the last sample is stepped on too: diffrax rounds what is within 100 ulp of the end
         behind = functools.partial(behind_a_jump, equations)
     kept = equations.kept if equations.projection else None
@@ -169,9 +170,9 @@ def _solve(equations, how, adjoint, t0, y0, ts, args, tolerances):
         None,
         y0,
         args,
-        saveat=dfx.SaveAt(ts=ts),
+        saveat=dfx.SaveAt(t1=True),
         stepsize_controller=controller,
-        adjoint=adjoint,
+        adjoint=AtSamples(adjoint, ts),
         max_steps=how.max_steps,
         throw=False,
         progress_meter=dfx.TextProgressMeter() if how.progress else dfx.NoProgressMeter(),
@@ -181,6 +182,11 @@ def _solve(equations, how, adjoint, t0, y0, ts, args, tolerances):
     result = RESULTS.promote(solution.result)
     result = RESULTS.where(result == RESULTS.internal_error, RESULTS.no_friction, result)  # as StickSlipSolver says it
     return ys, RESULTS.where(result == RESULTS.max_steps_rejected, RESULTS.chattering, result), stats
+
+
+def root_mean_square(x) -> jax.Array:
+    """The norm of an error; without derivative, as the length of a step is not differentiated, and without a library's dot product."""
+    return jnp.sqrt(jnp.mean(jax.lax.stop_gradient(x) ** 2))
 
 
 @functools.cache

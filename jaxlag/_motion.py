@@ -30,6 +30,7 @@ from ._kinks import Kinks, kinks_of
 from ._manifold import Baumgarte, NoStabilisation, Projection
 from ._multipliers import constrained_acceleration
 from ._power import energy_turnover, listed_powers
+from ._scalarised import scalarised
 from ._system import Flat, System, bind
 
 PROJECTION = "projection"  # how the work that projection does is named
@@ -186,7 +187,8 @@ class Equations:
 def _rates(equations: Equations, t, y, params):
     q, v, works, sigma, transitions, time_stuck = equations.parts(y)
     _, mode, kinks = equations.mode(t, q, v, sigma, params)
-    qddot = constrained_acceleration(mode, t, q, v, equations.stabilisation.feedback()).x
+    feedback = equations.stabilisation.feedback()
+    qddot = scalarised(lambda t, q, v: constrained_acceleration(mode, t, q, v, feedback).x)(t, q, v)
     powers = listed_powers(mode, t, q, v) if equations.audit else works
     stuck = time_stuck if kinks is None else sticking(kinks, sigma).astype(y.dtype)
     return jnp.concatenate([v, qddot, powers, 0 * sigma, 0 * transitions, stuck])
@@ -205,7 +207,8 @@ def _kept(equations: Equations, t, y, params):
     q, v, works, sigma, *counts = equations.parts(y)
     _, mode, kinks = equations.mode(t, q, v, sigma, params)
     assert equations.projection is not None  # asked where there is something to keep
-    on_q, on_v = equations.projection.project(mode, t, q, v)
+    projection = equations.projection
+    on_q, on_v = scalarised(lambda t, q, v: projection.project(mode, t, q, v))(t, q, v)
     if equations.audit:
         lift = energy_turnover(mode, t, on_q, on_v)[0] - energy_turnover(mode, t, q, v)[0]
         works = works.at[equations.works.index(PROJECTION)].add(lift)

@@ -7,10 +7,12 @@ import diffrax as dfx
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from equinox.internal import prevbefore
 from jaxtyping import Array, Float
 
 from ._friction import norms, settle
+from ._kernels import in_one_kernel
 from ._motion import Equations
 from ._power import energy_turnover
 from ._signal import delayed
@@ -21,14 +23,31 @@ BISECTIONS = 40
 NEWTON_STEPS = 3  # the first makes the time right, the second its derivative, the third its second derivative
 
 
+class AtSamples(dfx.AbstractAdjoint):
+    """Another adjoint, with samples at `ts`, in place of what `SaveAt` asks for; its loop is one kernel where it can be.
+
+    `SaveAt(ts=ts)` has diffrax check `ts` while it runs, and a program with such a check is never taken from JAX's persistent cache.
+    """
+
+    adjoint: dfx.AbstractAdjoint
+    ts: Float[Array, " k"]
+
+    def loop(self, *, saveat, init_state, **how):
+        unfilled = lambda x: jnp.full((self.ts.size, *x.shape[1:]), jnp.inf, x.dtype)
+        saved = lambda state: (state.save_state.ts, state.save_state.ys)
+        state = eqx.tree_at(saved, init_state, replace_fn=unfilled)
+        loop = lambda: self.adjoint.loop(saveat=dfx.SaveAt(ts=self.ts), init_state=state, **how)
+        return in_one_kernel(loop) if isinstance(self.adjoint, dfx.ForwardMode) else loop()
+
+
 class Kept(dfx.AbstractWrappedSolver, dfx.AbstractAdaptiveSolver):
-    """Any Runge–Kutta solver, with the end of each step put back on the constraints.
+    """Any solver that estimates its error, with the end of each step put back on the constraints.
 
     `kept(t, y, args)` does that; the error of the first `controlled` entries of y alone sets the steps. Where an input has jumped, a
     step starts from `behind(t, y, args)`.
     """
 
-    solver: dfx.AbstractRungeKutta
+    solver: dfx.AbstractAdaptiveSolver
     kept: Callable | None = eqx.field(static=True)
     controlled: int = eqx.field(static=True)
     behind: Callable | None = eqx.field(static=True)
@@ -82,7 +101,7 @@ class Kept(dfx.AbstractWrappedSolver, dfx.AbstractAdaptiveSolver):
     def _stepped(self, terms, t0, t1, y0, args, solver_state, made_jump):
         terms, given = self._within(terms, t1, args)
         y1, error, dense, solver_state, result = self.solver.step(terms, t0, t1, y0, given, solver_state, made_jump)
-        error = error.at[self.controlled :].set(0)
+        error = jnp.where(np.arange(error.size) < self.controlled, error, 0)
         if self.kept is not None:
             y1 = self.kept(t1, y1, args)
             # A step that cannot be put back is rejected, and tried again with half the length or less.

@@ -17,6 +17,7 @@ ORDER = [
     "_primitives",
     "_entries",
     "_scalarised",
+    "_kernels",
     "_arguments",
     "_system",
     "_checks",
@@ -34,6 +35,8 @@ ORDER = [
     "_results",
     "_trajectory",
     "_sensitivities",
+    "_tableaux",
+    "_runge_kutta",
     "_steps",
     "_integrate",
     "_experiment",
@@ -65,7 +68,7 @@ PUBLIC = [name for name in vars(jaxlag) if not name.startswith("_") and callable
 
 PAPER = {"_symbols", "_tidy", "_linear", "_derivation", "_statement", "_notation", "_programs", "_equations"}
 HOMES = [
-    ("diffrax", {"_results", "_steps", "_integrate"}),
+    ("diffrax", {"_results", "_runge_kutta", "_steps", "_integrate"}),
     ("matplotlib", {"plot"}),
     ("optimistix", {"_least_squares"}),
     ("optax", {"_identify"}),
