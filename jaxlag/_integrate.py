@@ -15,6 +15,7 @@ from ._checks import checked, is_concrete, parameters, sample_times, state
 from ._friction import Regularised, StickSlip
 from ._manifold import Baumgarte, NoStabilisation, Projection, nearest_state
 from ._motion import Equations, slack_of
+from ._progress import Bar
 from ._results import OF_THE_INPUT, RESULTS, reason_of
 from ._sensitivities import differentiable
 from ._signal import jump_times, solved
@@ -61,7 +62,7 @@ def simulate(
     - `max_steps`: steps after which the motion is given up.
     - `adjoint`: a diffrax adjoint, to be used in place of the derivative rule of this package.
     - `audit`: integrates the work of each term along with the motion, for `Trajectory.work()` and the energy balance.
-    - `progress`: shows a bar while it runs.
+    - `progress`: shows a bar while it runs, on standard error; in a log a line now and then.
     - `throw`: whether a failure raises. If not, or under `jit`, `Trajectory.result` holds the reason, and samples not reached are NaN.
 
     **Returns:** a `Trajectory`.
@@ -174,13 +175,29 @@ def _solve(equations, how, adjoint, t0, y0, ts, args, tolerances):
         adjoint=adjoint,
         max_steps=how.max_steps,
         throw=False,
-        progress_meter=dfx.TextProgressMeter() if how.progress else dfx.NoProgressMeter(),
+        progress_meter=Meter() if how.progress else dfx.NoProgressMeter(),
     )
     ys = solution.ys if kept is None else jax.vmap(lambda t, y: kept(t, y, args))(ts, solution.ys)
     stats = {key: solution.stats[key] for key in ("num_steps", "num_accepted_steps", "num_rejected_steps")}
     result = RESULTS.promote(solution.result)
     result = RESULTS.where(result == RESULTS.internal_error, RESULTS.no_friction, result)  # as StickSlipSolver says it
     return ys, RESULTS.where(result == RESULTS.max_steps_rejected, RESULTS.chattering, result), stats
+
+
+class Meter(dfx.TextProgressMeter):
+    """diffrax's meter, which keeps count inside the compiled loop, with a bar in place of its printing."""
+
+    @staticmethod
+    def _init_bar():
+        return Bar()
+
+    @staticmethod
+    def _step_bar(bar, progress):
+        bar(float(progress))
+
+    @staticmethod
+    def _close_bar(bar):
+        bar.end()
 
 
 @functools.cache

@@ -59,7 +59,7 @@ ORDER = [
     "_equations",
     "plot",
 ]
-BESIDE = ["dissipation", "learnt"]  # need nothing of the package
+BESIDE = ["_progress", "dissipation", "learnt"]  # need nothing of the package
 PUBLIC = [name for name in vars(jaxlag) if not name.startswith("_") and callable(getattr(jaxlag, name))]
 
 
