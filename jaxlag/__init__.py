@@ -2,6 +2,7 @@
 
 from . import dissipation as dissipation, learnt as learnt
 from ._acceleration import Acceleration as Acceleration, acceleration as acceleration, constraint_force as constraint_force
+from ._animate import animate as animate
 from ._equations import Equations as Equations, equations as equations, to_sympy as to_sympy
 from ._examine import Examination as Examination, examine as examine
 from ._friction import Regularised as Regularised, StickSlip as StickSlip

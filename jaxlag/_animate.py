@@ -1,0 +1,277 @@
+"""A motion as a moving picture: points and links by position maps, in a notebook or a file."""
+
+import dataclasses
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+from jax.flatten_util import ravel_pytree
+
+from ._acceleration import constraint_force
+from ._arguments import call
+from ._canvas import GREY, Units, canvas, colour, label, one_motion, pyplot
+from ._trajectory import Trajectory
+
+MOST_FRAMES = 2000
+LONGEST_ARROW = 0.25  # of the diagonal of all points
+MARGIN = 0.06
+SMALL = 72  # dots per inch in a notebook, which stores every frame
+
+
+def animate(
+    trajectory: Trajectory,
+    points: Mapping[str, Callable],
+    links: Sequence[tuple[Any, Any]] = (),
+    *,
+    forces: Mapping[str, str] | None = None,
+    trail: float | None = None,
+    fps: float = 25,
+    speed: float = 1.0,
+    units: Units = None,
+    ax: Any = None,
+) -> "Animation":
+    r"""A motion as a moving picture in the plane, in real time.
+
+    $$ x_p(t) = x_p(t, q(t)), \qquad F_c \cdot \delta x_p = Q_c \cdot \delta q $$
+
+    Between the samples q is interpolated by the cubics that have the right positions and velocities at both ends. The limits are fixed,
+    from the whole motion; a machine that travels far is looked at in a frame of its own, by points that leave its travel out.
+
+    **Arguments:**
+
+    - `trajectory`: one motion, as `simulate` returns it.
+    - `points`: position maps (x, y) by name, functions of the arguments they name, of `t`, `q`, `qdot`, `params` and its entries.
+    - `links`: pairs to be joined by a line, of names of points or of places that stay, `("bob", (0.0, 0.0))`.
+    - `forces`: constraint forces to be drawn as arrows, by the name of the constraint the name of the point they act on: the force
+      `constraint_force(..., at=point)`. The longest of each is written beside its name; all have one scale.
+    - `trail`: for how long the path of the points stays in sight, in units of time; `math.inf` keeps all of it.
+    - `fps`: frames per second. `speed`: units of time shown per second, 1 for real time, 0.1 for ten times slower.
+    - `units`: units of `"t"`, of `"x"` for both axes, and of forces by the name of the constraint.
+    - `ax`: matplotlib axes to draw in. Default: those of a new figure.
+
+    **Returns:** an object that a notebook shows, with buttons; `.save("motion.gif")`, `.save("motion.mp4")` (needs ffmpeg) and
+    `.save("motion.html")` write a file; `.frames` is their number, `.ax` the axes. In a notebook and an HTML file every frame is
+    stored, some 2 kB each: fewer of them make it smaller.
+
+    **Raises:** `ValueError` where `points`, `links` or `forces` do not fit together, or `fps` and `speed` make fewer than 2 or more than
+    2000 frames; `ImportError` without matplotlib.
+
+    **Source:** Goldstein, Classical Mechanics, 3rd ed., eq. 1.49 (the force on a point).
+
+    ```python
+    import jax.numpy as jnp
+    import jaxlag as jl
+    from jaxlag.examples import pendulum
+    start = pendulum.cartesian_state(2.0, 0.0, 1.0)
+    trajectory = jl.simulate(pendulum.cartesian, *start, jnp.linspace(0.0, 2.0, 101), pendulum.params)
+    bob = lambda q: (q["x"], q["y"])
+    moving = jl.animate(trajectory, {"bob": bob}, [((0.0, 0.0), "bob")], forces={"rod": "bob"}, units={"x": "m", "rod": "N"})
+    moving.frames  # 51
+    ```
+    """
+    motion, links, forces = _reached(one_motion(trajectory)), tuple(links), dict(forces or {})
+    _check_names(motion, points, links, forces)
+    ts = np.asarray(motion.ts)
+    at = _frame_times(ts, fps, speed)
+    placed = {name: _positions(motion, ts, at, name, point) for name, point in points.items()}
+    arrows = {name: (point, _forces(motion, at, name, points[point])) for name, point in forces.items()}
+    picture = _Picture.of(at, placed, links, arrows, trail, units, ax)
+    return Animation(picture.ax, at.size, fps, picture.draw)
+
+
+@dataclasses.dataclass(frozen=True, repr=False)
+class Animation:
+    """A moving picture, drawn when it is shown or saved."""
+
+    ax: Any
+    frames: int
+    fps: float
+    draw: Callable[[int], Any]
+
+    def save(self, file: str | Path, *, dpi: float = 100) -> None:
+        """Writes a GIF, an MP4 (which needs ffmpeg) or an HTML file with buttons, by the ending of its name."""
+        from matplotlib import animation
+
+        ending = Path(file).suffix.lower()
+        if ending == ".html":
+            Path(file).write_text(self._html(dpi), encoding="utf-8")
+            return
+        if ending not in (".gif", ".mp4"):
+            raise ValueError(f"`file` must end with .gif, .mp4 or .html, but is {str(file)!r}. Rename it.")
+        if ending == ".mp4" and not animation.FFMpegWriter.isAvailable():
+            raise RuntimeError("an .mp4 must be written by ffmpeg, but it is not installed. Install it, or save a .gif.")
+        writer = animation.PillowWriter if ending == ".gif" else animation.FFMpegWriter
+        self._animated(animation).save(file, writer=writer(fps=self.fps), dpi=dpi)  # type: ignore[arg-type]
+
+    def _repr_html_(self) -> str:
+        return self._html(SMALL)
+
+    def _html(self, dpi):
+        from matplotlib import animation
+
+        with pyplot().rc_context({"savefig.dpi": dpi, "animation.embed_limit": 200}):
+            return self._animated(animation).to_jshtml(fps=self.fps, default_mode="loop")
+
+    def _animated(self, animation):
+        return animation.FuncAnimation(
+            self.ax.figure, self.draw, frames=self.frames, interval=1000 / self.fps, init_func=lambda: None, cache_frame_data=False
+        )
+
+    def __repr__(self) -> str:
+        return f"Animation({self.frames} frames, {self.frames / self.fps:.3g} s)"
+
+
+@dataclasses.dataclass(frozen=True)
+class _Picture:
+    """The axes with what moves in them, and where it is in each frame."""
+
+    ax: Any
+    at: np.ndarray
+    placed: dict[str, np.ndarray]  # (frames, 2)
+    links: tuple
+    arrows: dict[str, tuple[str, np.ndarray]]
+    trail: float | None
+    unit: str
+    lines: list
+    dots: dict[str, Any]
+    paths: dict[str, Any]
+    quivers: dict[str, Any]
+
+    @classmethod
+    def of(cls, at, placed, links, arrows, trail, units, ax) -> "_Picture":
+        """Everything laid out once; the frames move it alone."""
+        fixed = [np.asarray(end, float) for link in links for end in link if not isinstance(end, str)]
+        seen = np.concatenate([*placed.values(), *(end[None] for end in fixed)])
+        strongest = {name: np.nanmax(np.linalg.norm(F, axis=1)) for name, (_, F) in arrows.items()}
+        length = np.linalg.norm(np.ptp(seen, axis=0)) or 1.0
+        scale = LONGEST_ARROW * length / (max(strongest.values(), default=1.0) or 1.0)
+        arrows = {name: (point, scale * np.nan_to_num(F)) for name, (point, F) in arrows.items()}
+        seen = np.concatenate([seen, *(placed[point] + F for point, F in arrows.values())])
+        middle, half = (seen.max(axis=0) + seen.min(axis=0)) / 2, np.ptp(seen, axis=0) / 2 + MARGIN * length
+        mine = ax is None
+        ax = _alone(half[1] / half[0]) if mine else ax
+        ax.set_aspect("equal")
+        ax.set_xlim(middle[0] - half[0], middle[0] + half[0])
+        ax.set_ylim(middle[1] - half[1], middle[1] + half[1])
+        ax.set_xlabel(label("x", units))
+        ax.set_ylabel(label("y", units, "x"))
+        colours = {name: colour(i) for i, name in enumerate(placed)}
+        paths = {name: ax.plot([], [], color=colours[name], alpha=0.5, linewidth=1.2)[0] for name in placed} if trail else {}
+        lines = [ax.plot([], [], color=GREY, linewidth=2.5, solid_capstyle="round")[0] for _ in links]
+        for x, y in fixed:
+            ax.plot(x, y, "s", color="black", markersize=6)
+        dots = {name: ax.plot([], [], "o", color=colours[name], markersize=9)[0] for name in placed}
+        style = {"angles": "xy", "scale_units": "xy", "scale": 1.0, "width": 0.008, "zorder": 3}
+        quivers = {}
+        for i, (name, size) in enumerate(strongest.items()):
+            said = f"{name}, up to {size:.3g} {(units or {}).get(name, '')}".rstrip()
+            quivers[name] = ax.quiver([0.0], [0.0], [0.0], [0.0], color=colour(len(placed) + i), label=said, **style)
+        if quivers:
+            ax.legend(loc="upper center", bbox_to_anchor=(0.5, -0.16), fontsize="small", ncols=2, frameon=False)
+        picture = cls(ax, at, placed, links, arrows, trail, (units or {}).get("t", ""), lines, dots, paths, quivers)
+        picture.draw(0)
+        if mine:  # laid out once, so that nothing trembles
+            ax.figure.draw_without_rendering()
+            ax.figure.set_layout_engine("none")
+        return picture
+
+    def draw(self, i: int) -> list:
+        """Moves all to frame i."""
+        place = lambda end: self.placed[end][i] if isinstance(end, str) else end
+        for line, link in zip(self.lines, self.links, strict=True):
+            line.set_data(*zip(*map(place, link), strict=True))
+        for name, dot in self.dots.items():
+            dot.set_data(*self.placed[name][i][:, None])
+        since = 0 if self.trail is None else int(np.searchsorted(self.at, self.at[i] - self.trail))
+        for name, path in self.paths.items():
+            path.set_data(*self.placed[name][since : i + 1].T)
+        for name, quiver in self.quivers.items():
+            point, F = self.arrows[name]
+            quiver.set_offsets(self.placed[point][i])
+            quiver.set_UVC(*F[i])
+        digits = max(0, int(np.ceil(-np.log10(self.at[1] - self.at[0]))))
+        self.ax.set_title(f"t = {self.at[i]:.{digits}f} {self.unit}".rstrip(), fontsize="medium")
+        return [*self.lines, *self.dots.values(), *self.paths.values(), *self.quivers.values()]
+
+
+def _alone(ratio):
+    """The axes of a figure that no notebook shows by itself as well."""
+    ax = canvas(None, figsize=(4.8, 1.0 + 4.2 * float(np.clip(ratio, 0.25, 1.3))))
+    pyplot().close(ax.figure)
+    return ax
+
+
+def _check_names(motion, points, links, forces):
+    if not points:
+        raise ValueError(
+            "`points` must name at least one point, but is empty. Give position maps, e.g. `{'bob': lambda q: (q['x'], q['y'])}`."
+        )
+    there = ", ".join(points)
+    for link in links:
+        if isinstance(link, str) or len(link) != 2:
+            raise ValueError(f"`links` must be pairs, but hold {link!r}. Give the two ends of each line, `('a', 'b')`.")
+        for end in link:
+            if end not in points if isinstance(end, str) else np.shape(end) != (2,):
+                raise ValueError(f"`links` must join points or places (x, y), but one ends at {end!r}. The points are {there}.")
+    for name, point in forces.items():
+        if name not in motion.multipliers:
+            known = ", ".join(motion.multipliers) or "none"
+            raise ValueError(f"`forces` must be of constraints of the system, but {name!r} is not. There are {known}.")
+        if point not in points:
+            raise ValueError(f"`forces` must act on points, but {name!r} is to act on {point!r}. The points are {there}.")
+
+
+def _reached(motion):
+    """The part of a motion that was computed."""
+    first = np.asarray(jax.tree.leaves(motion.q)[0]).reshape(motion.ts.size, -1)[:, 0]
+    count = int(np.sum(np.isfinite(first)))
+    if count < 2:
+        raise ValueError(f"`trajectory` must have at least two samples, but only {count} were computed. Look at `trajectory.result`.")
+    parts = {name: jax.tree.map(lambda x: x[:count], getattr(motion, name)) for name in ("ts", "q", "qdot", "qddot")}
+    return dataclasses.replace(motion, **parts)
+
+
+def _frame_times(ts, fps, speed):
+    """Even times, one for each frame."""
+    count = int(np.floor((ts[-1] - ts[0]) * fps / speed + 1e-9)) + 1
+    if not 2 <= count <= MOST_FRAMES:
+        raise ValueError(
+            f"`fps` and `speed` must give 2 to {MOST_FRAMES} frames, but this motion of {ts[-1] - ts[0]:g} gives {count}. "
+            f"Choose `speed`, now {speed:g}: what passes in a second."
+        )
+    return ts[0] + np.arange(count) * speed / fps
+
+
+def _positions(motion, ts, at, name, point):
+    """Where a point is in each frame."""
+    q, qdot = (
+        jax.tree.map(lambda x, v: between(ts, np.asarray(x), np.asarray(v), at), *pair)
+        for pair in ((motion.q, motion.qdot), (motion.qdot, motion.qddot))
+    )
+    place = lambda t, q, qdot: ravel_pytree(call(point, f"`points` {name!r}", motion.stated.params, t=t, q=q, qdot=qdot))[0]
+    x = np.asarray(jax.jit(jax.vmap(place))(at, q, qdot))
+    if x.shape[1] != 2:
+        raise ValueError(f"`points` {name!r} must return a position (x, y), but returned {x.shape[1]} numbers. Return the two to be seen.")
+    return x
+
+
+def _forces(motion, at, name, point):
+    """The force of a constraint on a point in each frame, from that at the samples."""
+    stated = motion.stated
+    force = lambda t, q, qdot: ravel_pytree(constraint_force(stated.system, q, qdot, stated.params, t=t, at=point)[name])[0]
+    F = np.asarray(jax.jit(jax.vmap(force))(motion.ts, motion.q, motion.qdot))
+    if np.all(np.isnan(F)):
+        raise ValueError(f"`forces` must act through the points they are given, but {name!r} does not through its own alone. Take another.")
+    return np.stack([np.interp(at, motion.ts, component) for component in F.T], axis=1)
+
+
+def between(ts: np.ndarray, x: np.ndarray, v: np.ndarray, at: np.ndarray) -> np.ndarray:
+    """x at times between the samples: the cubics of Hermite, with the right values and rates at both ends."""
+    i = np.clip(np.searchsorted(ts, at, side="right") - 1, 0, ts.size - 2)
+    column = lambda s: s.reshape(-1, *(1,) * (x.ndim - 1))
+    h = column(ts[i + 1] - ts[i])
+    s = column(at - ts[i]) / h
+    values = (1 + 2 * s) * (1 - s) ** 2 * x[i] + s**2 * (3 - 2 * s) * x[i + 1]
+    return values + h * s * (1 - s) * ((1 - s) * v[i] - s * v[i + 1])
