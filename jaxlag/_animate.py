@@ -1,6 +1,10 @@
 """A motion as a moving picture: points and links by position maps, in a notebook or a file."""
 
+import base64
 import dataclasses
+import io
+import math
+import re
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -17,18 +21,18 @@ from ._trajectory import Trajectory
 MOST_FRAMES = 2000
 LONGEST_ARROW = 0.25  # of the diagonal of all points
 MARGIN = 0.06
-SMALL = 72  # dots per inch in a notebook, which stores every frame
+SMALL, FEW = 72, 12.5  # dots per inch and frames per second in a notebook, which stores every frame
 
 
 def animate(
     trajectory: Trajectory,
     points: Mapping[str, Callable],
-    links: Sequence[tuple[Any, Any]] = (),
+    links: Sequence[Any] = (),
     *,
     forces: Mapping[str, str] | None = None,
-    trail: float | None = None,
-    fps: float = 25,
-    speed: float = 1.0,
+    trail: float | int | None = None,
+    fps: float | int = 25,
+    speed: float | int = 1.0,
     units: Units = None,
     ax: Any = None,
 ) -> "Animation":
@@ -52,8 +56,8 @@ def animate(
     - `ax`: matplotlib axes to draw in. Default: those of a new figure.
 
     **Returns:** an object that a notebook shows, with buttons; `.save("motion.gif")`, `.save("motion.mp4")` (needs ffmpeg) and
-    `.save("motion.html")` write a file; `.frames` is their number, `.ax` the axes. In a notebook and an HTML file every frame is
-    stored, some 2 kB each: fewer of them make it smaller.
+    `.save("motion.html")` write a file; `.frames` is their number, `.ax` the axes. A notebook stores each frame it shows, of some 4 kB,
+    and so gets no more than 12.5 of them per second.
 
     **Raises:** `ValueError` where `points`, `links` or `forces` do not fit together, or `fps` and `speed` make fewer than 2 or more than
     2000 frames; `ImportError` without matplotlib.
@@ -87,10 +91,10 @@ class Animation:
 
     ax: Any
     frames: int
-    fps: float
+    fps: float | int
     draw: Callable[[int], Any]
 
-    def save(self, file: str | Path, *, dpi: float = 100) -> None:
+    def save(self, file: str | Path, *, dpi: float | int = 100) -> None:
         """Writes a GIF, an MP4 (which needs ffmpeg) or an HTML file with buttons, by the ending of its name."""
         from matplotlib import animation
 
@@ -106,17 +110,19 @@ class Animation:
         self._animated(animation).save(file, writer=writer(fps=self.fps), dpi=dpi)  # type: ignore[arg-type]
 
     def _repr_html_(self) -> str:
-        return self._html(SMALL)
+        return self._html(SMALL, stride=math.ceil(self.fps / FEW))
 
-    def _html(self, dpi):
+    def _html(self, dpi, stride=1):
         from matplotlib import animation
 
-        with pyplot().rc_context({"savefig.dpi": dpi, "animation.embed_limit": 200}):
-            return self._animated(animation).to_jshtml(fps=self.fps, default_mode="loop")
+        with pyplot().rc_context({"savefig.dpi": dpi, "animation.embed_limit": 1000}):
+            page = self._animated(animation, stride).to_jshtml(fps=self.fps / stride, default_mode="loop")
+        return re.sub(r'(?<=data:image/png;base64,)[^"]+', _fewer_colours, page)
 
-    def _animated(self, animation):
+    def _animated(self, animation, stride=1):
+        frames = range(0, self.frames, stride)
         return animation.FuncAnimation(
-            self.ax.figure, self.draw, frames=self.frames, interval=1000 / self.fps, init_func=lambda: None, cache_frame_data=False
+            self.ax.figure, self.draw, frames, init_func=lambda: None, interval=1000 * stride / self.fps, cache_frame_data=False
         )
 
     def __repr__(self) -> str:
@@ -132,7 +138,7 @@ class _Picture:
     placed: dict[str, np.ndarray]  # (frames, 2)
     links: tuple
     arrows: dict[str, tuple[str, np.ndarray]]
-    trail: float | None
+    trail: float | int | None
     unit: str
     lines: list
     dots: dict[str, Any]
@@ -169,7 +175,7 @@ class _Picture:
             said = f"{name}, up to {size:.3g} {(units or {}).get(name, '')}".rstrip()
             quivers[name] = ax.quiver([0.0], [0.0], [0.0], [0.0], color=colour(len(placed) + i), label=said, **style)
         if quivers:
-            ax.legend(loc="upper center", bbox_to_anchor=(0.5, -0.16), fontsize="small", ncols=2, frameon=False)
+            ax.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), fontsize="small", frameon=False, borderpad=0)
         picture = cls(ax, at, placed, links, arrows, trail, (units or {}).get("t", ""), lines, dots, paths, quivers)
         picture.draw(0)
         if mine:  # laid out once, so that nothing trembles
@@ -192,8 +198,18 @@ class _Picture:
             quiver.set_offsets(self.placed[point][i])
             quiver.set_UVC(*F[i])
         digits = max(0, int(np.ceil(-np.log10(self.at[1] - self.at[0]))))
-        self.ax.set_title(f"t = {self.at[i]:.{digits}f} {self.unit}".rstrip(), fontsize="medium")
+        self.ax.set_title(f"t = {self.at[i]:.{digits}f} {self.unit}".rstrip(), loc="left", fontsize="medium")
         return [*self.lines, *self.dots.values(), *self.paths.values(), *self.quivers.values()]
+
+
+def _fewer_colours(match):
+    """A picture in base64 that takes a third of the room, for want of shades."""
+    from PIL import Image  # which matplotlib needs as well
+
+    small = io.BytesIO()
+    picture = Image.open(io.BytesIO(base64.b64decode(match[0].replace("\\\n", "")))).convert("RGB")
+    picture.quantize(16, dither=Image.Dither.NONE).save(small, "PNG", optimize=True)
+    return base64.b64encode(small.getvalue()).decode()
 
 
 def _alone(ratio):

@@ -81,6 +81,11 @@ def legend_beside(ax: Any) -> None:
     ax.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), fontsize="small")
 
 
+def legend_above(ax: Any, ncols: int = 3) -> None:
+    """A legend above the panel, where it hides nothing and takes no width."""
+    ax.legend(loc="lower center", bbox_to_anchor=(0.5, 1.0), fontsize="small", ncols=ncols, frameon=False)
+
+
 def zero_line(ax: Any) -> None:
     """A thin line at zero, behind what is drawn."""
     ax.axhline(0.0, color=GREY, linewidth=0.8, zorder=0.5)

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ._canvas import GREY, Units, canvas, channels, chosen, colour, label, legend_beside, panels
+from ._canvas import GREY, Units, canvas, channels, chosen, colour, label, legend_above, legend_beside, panels
 from ._fit import Fit, plus_minus
 
 READABLE = 40  # parameters in one picture
@@ -40,23 +40,21 @@ def fit(fit: Fit, *, number: int = 0, level: float = 0.95, units: Units = None, 
     section 5.1 (the band).
 
     ```python
-    import jax.numpy as jnp
     import jaxlag as jl
     from jaxlag import plot
-    oscillator = jl.System(lambda q, qdot, c: 0.5 * qdot**2 - 0.5 * c * q**2)
-    ts = jnp.linspace(0.0, 3.0, 50)
-    measured = {"x": jnp.cos(2.0 * ts) + 1e-3 * jnp.sin(1e3 * ts)}
-    record = jl.Experiment(ts, measured, q0=1.0, qdot0=0.0, observe=lambda q: {"x": q})
-    axes = plot.fit(jl.fit(oscillator, record, {"c": 3.0}, free=("c",)), units={"t": "s", "x": "m"})
-    axes.shape  # (2, 1)
+    from jaxlag.examples import vehicle
+    record = jl.Experiment.from_csv(vehicle.recording, vehicle.q0, vehicle.qdot0, time="t", observe=vehicle.observe)
+    fit = jl.fit(vehicle.system, record, vehicle.params | {"b": 4000.0, "c": 30000.0}, free=("b", "c", "k"))
+    axes = plot.fit(fit, units={"t": "s", "y": "m", "phi": "rad", "xdot": "m/s"})
+    axes.shape  # (2, 3)
     ```
     """
     experiment = fit.experiments[number]
     sigma = experiment.sigma
     if sigma is None:
         sigma = jax.tree.map(lambda value: np.full(value.shape, fit.sigma), experiment.values)
-    trees = (experiment.values, fit.predictions[number], *fit.band(number, level), fit.residuals[number], sigma)
-    measured, fitted, low, high, residuals, sigma = (channels(tree, "z") for tree in trees)
+    trees = (experiment.values, fit.predictions[number], fit.band(number, level)[1], fit.residuals[number], sigma)
+    measured, fitted, upmost, residuals, sigma = (channels(tree, "z") for tree in trees)
     ts = np.asarray(experiment.ts)
 
     size = (max(5.0, 3.6 * len(measured)), 4.8)
@@ -64,20 +62,22 @@ def fit(fit: Fit, *, number: int = 0, level: float = 0.95, units: Units = None, 
     for (upper, lower), (name, entries) in zip(drawn.T, measured.items(), strict=True):
         several = len(entries) > 1
         for i, (entry, z) in enumerate(entries.items()):
-            known, noise = np.isfinite(low[name][entry]), 2 * sigma[name][entry]
+            model, noise = fitted[name][entry], 2 * sigma[name][entry]
             upper.plot(ts, z, ".", color=GREY, markersize=3, label=None if i else "measured")
-            upper.plot(ts, fitted[name][entry], color=colour(i), label=f"{entry} fitted" if several else "fitted")
+            upper.plot(ts, model, color=colour(i), label=f"{entry} fitted" if several else "fitted")
+            reach = upmost[name][entry] - model
+            known = np.isfinite(reach)
             if known.any():
-                ends = low[name][entry][known], high[name][entry][known]
-                said = {} if i else {"label": f"{100 * level:g} % confidence"}
-                upper.fill_between(ts[known], *ends, color=colour(i), alpha=0.3, linewidth=0, **said)
+                reach = np.interp(ts, ts[known], reach[known])  # where a sample is missing, from its neighbours
+                said = None if i else f"{100 * level:g} % confidence"
+                upper.fill_between(ts, model - reach, model + reach, color=colour(i), alpha=0.3, linewidth=0, label=said)
             lower.fill_between(ts, -noise, noise, color=GREY, alpha=0.3 / len(entries), linewidth=0)
             lower.plot(ts, residuals[name][entry], ".", color=colour(i), markersize=3)
         upper.set_ylabel(label(name, units))
         if several:
             legend_beside(upper)
-        else:
-            upper.legend(loc="best", fontsize="small")
+        elif upper is drawn[0, 0]:
+            legend_above(upper)
         lower.set_ylabel("residual, ±2σ" + label(name, units).removeprefix(name))
         lower.set_xlabel(label("t", units))
     return drawn
@@ -105,13 +105,12 @@ def parameters(fit: Fit, names: Sequence[str] | None = None, *, axes: Any = None
     **Source:** Seber & Wild, Nonlinear Regression (1989), section 5.1.
 
     ```python
-    import jax.numpy as jnp
     import jaxlag as jl
     from jaxlag import plot
-    oscillator = jl.System(lambda q, qdot, c: 0.5 * qdot**2 - 0.5 * c * q**2, dissipation=lambda qdot, b: 0.5 * b * qdot**2)
-    ts = jnp.linspace(0.0, 3.0, 50)
-    record = jl.Experiment(ts, jnp.cos(2.0 * ts) + 1e-3 * jnp.sin(1e3 * ts), q0=1.0, qdot0=0.0)
-    plot.parameters(jl.fit(oscillator, record, {"b": 0.1, "c": 3.0}, free=("b", "c")))
+    from jaxlag.examples import vehicle
+    record = jl.Experiment.from_csv(vehicle.recording, vehicle.q0, vehicle.qdot0, time="t", observe=vehicle.observe)
+    fit = jl.fit(vehicle.system, record, vehicle.params | {"b": 4000.0, "c": 30000.0}, free=("b", "c", "k"))
+    plot.parameters(fit)
     ```
     """
     names = chosen(names, fit.names, "fitted parameters")
@@ -165,13 +164,12 @@ def convergence(fit: Fit, *, ax: Any = None) -> Any:
     **Source:** Nocedal & Wright, Numerical Optimization, section 10.3.
 
     ```python
-    import jax.numpy as jnp
     import jaxlag as jl
     from jaxlag import plot
-    oscillator = jl.System(lambda q, qdot, c: 0.5 * qdot**2 - 0.5 * c * q**2)
-    ts = jnp.linspace(0.0, 3.0, 50)
-    record = jl.Experiment(ts, jnp.cos(2.0 * ts) + 1e-3 * jnp.sin(1e3 * ts), q0=1.0, qdot0=0.0)
-    plot.convergence(jl.fit(oscillator, record, {"c": 3.0}, free=("c",)))
+    from jaxlag.examples import vehicle
+    record = jl.Experiment.from_csv(vehicle.recording, vehicle.q0, vehicle.qdot0, time="t", observe=vehicle.observe)
+    fit = jl.fit(vehicle.system, record, vehicle.params | {"b": 4000.0, "c": 30000.0}, free=("b", "c", "k"))
+    plot.convergence(fit)
     ```
     """
     costs = np.asarray(fit.costs)

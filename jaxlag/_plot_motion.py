@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from ._canvas import GREY, Units, canvas, channels, chosen, colour, label, legend_beside, one_motion, panels, zero_line
+from ._canvas import GREY, Units, canvas, channels, chosen, colour, label, legend_above, legend_beside, one_motion, panels, zero_line
 from ._trajectory import Trajectory
 
 THIN = 1e-3  # of the largest area, below which none can be seen
@@ -36,10 +36,11 @@ def motion(trajectory: Trajectory, names: Sequence[str] | None = None, *, units:
     import jax.numpy as jnp
     import jaxlag as jl
     from jaxlag import plot
-    oscillator = jl.System(lambda q, qdot: 0.5 * qdot["x"] ** 2 - 2.0 * q["x"] ** 2)
-    trajectory = jl.simulate(oscillator, {"x": 1.0}, {"x": 0.0}, jnp.linspace(0.0, 5.0, 101))
-    (ax,) = plot.motion(trajectory, units={"t": "s", "x": "m"})
-    ax.get_ylabel()  # x (m)
+    from jaxlag.examples import pendulum
+    start = pendulum.cartesian_state(2.0, 0.0, 1.0)
+    trajectory = jl.simulate(pendulum.cartesian, *start, jnp.linspace(0.0, 2.0, 101), pendulum.params)
+    axes = plot.motion(trajectory, units={"t": "s", "x": "m", "y": "m"})
+    axes[0].get_ylabel()  # x (m)
     ```
     """
     coordinates = channels(one_motion(trajectory).q, "q")
@@ -71,9 +72,10 @@ def phase(trajectory: Trajectory, names: Sequence[str] | None = None, *, units: 
     import jax.numpy as jnp
     import jaxlag as jl
     from jaxlag import plot
-    oscillator = jl.System(lambda q, qdot: 0.5 * qdot["x"] ** 2 - 2.0 * q["x"] ** 2)
-    trajectory = jl.simulate(oscillator, {"x": 1.0}, {"x": 0.0}, jnp.linspace(0.0, 5.0, 101))
-    ax = plot.phase(trajectory, units={"t": "s", "x": "m"})
+    from jaxlag.examples import pendulum
+    start = pendulum.cartesian_state(2.0, 0.0, 1.0)
+    trajectory = jl.simulate(pendulum.cartesian, *start, jnp.linspace(0.0, 2.0, 101), pendulum.params)
+    ax = plot.phase(trajectory, ("x",), units={"t": "s", "x": "m"})
     ax.get_ylabel()  # dx/dt (m/s)
     ```
     """
@@ -138,8 +140,12 @@ def forces(trajectory: Trajectory, names: Sequence[str] | None = None, *, units:
         zero_line(ax)
         crossings = np.concatenate([_sign_changes(np.asarray(trajectory.ts), samples) for samples in entries.values()])
         if crossings.size:
-            ax.plot(crossings, 0 * crossings, "o", markerfacecolor="white", markeredgecolor="black", label="λ changes sign")
-            legend_beside(ax)
+            ax.plot(crossings, 0 * crossings, "o", markerfacecolor="white", markeredgecolor="black", label="λ changes its sign")
+            if len(entries) == 1:
+                ax.lines[0].set_label(None)
+                legend_above(ax)
+            else:
+                legend_beside(ax)
     return drawn
 
 
@@ -167,10 +173,10 @@ def energy(trajectory: Trajectory, *, units: Units = None, ax: Any = None) -> An
     import jax.numpy as jnp
     import jaxlag as jl
     from jaxlag import plot
-    oscillator = jl.System(lambda q, qdot: 0.5 * qdot**2 - 2.0 * q**2, dissipation={"oil": lambda qdot: 0.1 * qdot**2})
-    trajectory = jl.simulate(oscillator, 1.0, 0.0, jnp.linspace(0.0, 5.0, 101), audit=True)
+    from jaxlag.examples import vehicle
+    trajectory = jl.simulate(vehicle.system, vehicle.q0, vehicle.qdot0, jnp.linspace(0.0, 5.0, 101), vehicle.params, audit=True)
     ax = plot.energy(trajectory, units={"t": "s", "energy": "J"})
-    [line.get_label() for line in ax.lines]  # energy, work of oil, energy at the start + works
+    [line.get_label() for line in ax.lines]  # energy, work of air, work of dampers, work of drive, energy at the start + works
     ```
     """
     h, ts = np.asarray(one_motion(trajectory).energy()), trajectory.ts
@@ -183,7 +189,7 @@ def energy(trajectory: Trajectory, *, units: Units = None, ax: Any = None) -> An
         zero_line(ax)
     ax.set_xlabel(label("t", units))
     ax.set_ylabel(label("energy", units))
-    legend_beside(ax)
+    legend_above(ax)
     return ax
 
 
@@ -212,8 +218,8 @@ def balance(trajectory: Trajectory, *, units: Units = None, ax: Any = None) -> A
     import jax.numpy as jnp
     import jaxlag as jl
     from jaxlag import plot
-    oscillator = jl.System(lambda q, qdot: 0.5 * qdot**2 - 2.0 * q**2, dissipation={"oil": lambda qdot: 0.1 * qdot**2})
-    trajectory = jl.simulate(oscillator, 1.0, 0.0, jnp.linspace(0.0, 5.0, 101), audit=True)
+    from jaxlag.examples import vehicle
+    trajectory = jl.simulate(vehicle.system, vehicle.q0, vehicle.qdot0, jnp.linspace(0.0, 5.0, 101), vehicle.params, audit=True)
     plot.balance(trajectory, units={"t": "s", "energy": "J"})
     ```
     """
@@ -233,8 +239,8 @@ def balance(trajectory: Trajectory, *, units: Units = None, ax: Any = None) -> A
     ax.set_xlim(float(trajectory.ts[0]), float(trajectory.ts[-1]))
     ax.axhline(0.0, color="black", linewidth=0.8)
     ax.set_xlabel(label("t", units))
-    ax.set_ylabel(f"← came from    {label('energy', units)}    went to →")
-    legend_beside(ax)
+    ax.set_ylabel(f"← from    {label('energy', units)}    to →")
+    legend_above(ax, 4)
     return ax
 
 
@@ -279,14 +285,18 @@ def friction(trajectory: Trajectory, names: Sequence[str] | None = None, *, unit
             zero_line(ax)
             for i, (entry, samples) in enumerate(entries.items()):
                 ax.plot(trajectory.ts, samples, color=colour(i), label=entry)
-            rows = np.reshape(trajectory.friction[name].sticking, (trajectory.ts.size, -1)).T
-            for start, end in [interval for row in rows for interval in _intervals(np.asarray(trajectory.ts), row)]:
-                ax.axvspan(start, end, color=GREY, alpha=0.3 / len(rows), linewidth=0)
+            stuck = np.reshape(trajectory.friction[name].sticking, (trajectory.ts.size, -1)).T
+            intervals = [interval for row in stuck for interval in _intervals(np.asarray(trajectory.ts), row)]
+            for i, (start, end) in enumerate(intervals):
+                ax.axvspan(start, end, color=GREY, alpha=0.35 / len(stuck), linewidth=0, label=None if i else "sticks")
         upper.set_ylabel(label(f"slip {name}", units, "slip"))
         lower.set_ylabel(label(f"force {name}", units, name))
         lower.set_xlabel(label("t", units))
-        if len(rows) > 1:
-            legend_beside(upper)
+        several = len(slip[name]) > 1
+        if not several:
+            upper.lines[-1].set_label(None)
+        if several or intervals:
+            legend_above(upper)
     return drawn
 
 
@@ -315,7 +325,7 @@ def _shown_works(trajectory):
     works = {name: np.asarray(work) for name, work in trajectory.work().items()}
     h, turned = (np.asarray(x) for x in trajectory._energy_turnover())
     sizes = {name: np.nanmax(np.abs(work)) for name, work in works.items()}
-    least = THIN * max(*sizes.values(), np.nanmax(np.abs(h - h[0])), 1e-6 * np.nanmax(np.abs(turned)))
+    least = THIN * max(*sizes.values(), np.nanmax(np.abs(h - h[0])), THIN * np.nanmax(np.abs(turned)))
     return {name: works[name] for name, size in sizes.items() if size > least}
 
 
