@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
 
@@ -19,6 +20,7 @@ from ._canvas import GREY, Units, canvas, colour, label, one_motion, pyplot
 from ._trajectory import Trajectory
 
 MOST_FRAMES = 2000
+BETWEEN = 4  # points of a trail from frame to frame
 LONGEST_ARROW = 0.25  # of the diagonal of all points
 MARGIN = 0.06
 SMALL, FEW = 72, 12.5  # dots per inch and frames per second in a notebook, which stores every frame
@@ -29,7 +31,7 @@ def animate(
     points: Mapping[str, Callable],
     links: Sequence[Any] = (),
     *,
-    forces: Mapping[str, str] | None = None,
+    forces: Mapping[str, str | Sequence[str]] | None = None,
     trail: float | int | None = None,
     fps: float | int = 25,
     speed: float | int = 1.0,
@@ -48,8 +50,9 @@ def animate(
     - `trajectory`: one motion, as `simulate` returns it.
     - `points`: position maps (x, y) by name, functions of the arguments they name, of `t`, `q`, `qdot`, `params` and its entries.
     - `links`: pairs to be joined by a line, of names of points or of places that stay, `("bob", (0.0, 0.0))`.
-    - `forces`: constraint forces to be drawn as arrows, by the name of the constraint the name of the point they act on: the force
-      `constraint_force(..., at=point)`. The longest of each is written beside its name; all have one scale.
+    - `forces`: constraint forces to be drawn as arrows: by the name of the constraint the name of the point it acts on, or of all such
+      points, `{"rod": ("a", "b")}` for one that pulls two bodies together; the forces are `constraint_force(..., at=points)`. The
+      largest of each is written beside its name; all arrows have one scale.
     - `trail`: for how long the path of the points stays in sight, in units of time; `math.inf` keeps all of it.
     - `fps`: frames per second. `speed`: units of time shown per second, 1 for real time, 0.1 for ten times slower.
     - `units`: units of `"t"`, of `"x"` for both axes, and of forces by the name of the constraint.
@@ -75,13 +78,13 @@ def animate(
     moving.frames  # 51
     ```
     """
-    motion, links, forces = _reached(one_motion(trajectory)), tuple(links), dict(forces or {})
-    _check_names(motion, points, links, forces)
-    ts = np.asarray(motion.ts)
-    at = _frame_times(ts, fps, speed)
-    placed = {name: _positions(motion, ts, at, name, point) for name, point in points.items()}
-    arrows = {name: (point, _forces(motion, at, name, points[point])) for name, point in forces.items()}
-    picture = _Picture.of(at, placed, links, arrows, trail, units, ax)
+    motion, links = _reached(one_motion(trajectory)), tuple(links)
+    acting = {name: (on,) if isinstance(on, str) else tuple(on) for name, on in (forces or {}).items()}
+    _check_names(motion, points, links, acting)
+    at = _frame_times(np.asarray(motion.ts), fps, speed)
+    tracks = {name: _track(motion, at, name, point) for name, point in points.items()}
+    arrows = {name: _forces(motion, at, name, {point: points[point] for point in on}) for name, on in acting.items()}
+    picture = _Picture.of(at, tracks, links, arrows, trail, units, ax)
     return Animation(picture.ax, at.size, fps, picture.draw)
 
 
@@ -135,48 +138,40 @@ class _Picture:
 
     ax: Any
     at: np.ndarray
-    placed: dict[str, np.ndarray]  # (frames, 2)
+    tracks: dict[str, np.ndarray]  # (BETWEEN · frames, 2)
     links: tuple
-    arrows: dict[str, tuple[str, np.ndarray]]
+    arrows: dict[str, dict[str, np.ndarray]]  # by constraint and point, (frames, 2)
     trail: float | int | None
     unit: str
+    paths: list
     lines: list
-    dots: dict[str, Any]
-    paths: dict[str, Any]
-    quivers: dict[str, Any]
+    dots: list
+    quivers: dict[tuple[str, str], Any]
 
     @classmethod
-    def of(cls, at, placed, links, arrows, trail, units, ax) -> "_Picture":
+    def of(cls, at, tracks, links, arrows, trail, units, ax) -> "_Picture":
         """Everything laid out once; the frames move it alone."""
         fixed = [np.asarray(end, float) for link in links for end in link if not isinstance(end, str)]
-        seen = np.concatenate([*placed.values(), *(end[None] for end in fixed)])
-        strongest = {name: np.nanmax(np.linalg.norm(F, axis=1)) for name, (_, F) in arrows.items()}
-        length = np.linalg.norm(np.ptp(seen, axis=0)) or 1.0
-        scale = LONGEST_ARROW * length / (max(strongest.values(), default=1.0) or 1.0)
-        arrows = {name: (point, scale * np.nan_to_num(F)) for name, (point, F) in arrows.items()}
-        seen = np.concatenate([seen, *(placed[point] + F for point, F in arrows.values())])
-        middle, half = (seen.max(axis=0) + seen.min(axis=0)) / 2, np.ptp(seen, axis=0) / 2 + MARGIN * length
-        mine = ax is None
-        ax = _alone(half[1] / half[0]) if mine else ax
-        ax.set_aspect("equal")
-        ax.set_xlim(middle[0] - half[0], middle[0] + half[0])
-        ax.set_ylim(middle[1] - half[1], middle[1] + half[1])
-        ax.set_xlabel(label("x", units))
-        ax.set_ylabel(label("y", units, "x"))
-        colours = {name: colour(i) for i, name in enumerate(placed)}
-        paths = {name: ax.plot([], [], color=colours[name], alpha=0.5, linewidth=1.2)[0] for name in placed} if trail else {}
+        arrows, largest, lower, upper = _scaled(tracks, fixed, arrows)
+        mine, size = ax is None, upper - lower
+        ax = _alone(size[1] / size[0]) if mine else ax
+        ax.set(
+            aspect="equal", xlim=(lower[0], upper[0]), ylim=(lower[1], upper[1]), xlabel=label("x", units), ylabel=label("y", units, "x")
+        )
+        paths = [ax.plot([], [], color=colour(i), alpha=0.5, linewidth=1.2)[0] for i in range(len(tracks))]
         lines = [ax.plot([], [], color=GREY, linewidth=2.5, solid_capstyle="round")[0] for _ in links]
         for x, y in fixed:
             ax.plot(x, y, "s", color="black", markersize=6)
-        dots = {name: ax.plot([], [], "o", color=colours[name], markersize=9)[0] for name in placed}
-        style = {"angles": "xy", "scale_units": "xy", "scale": 1.0, "width": 0.008, "zorder": 3}
+        dots = [ax.plot([], [], "o", color=colour(i), markersize=9)[0] for i in range(len(tracks))]
         quivers = {}
-        for i, (name, size) in enumerate(strongest.items()):
-            said = f"{name}, up to {size:.3g} {(units or {}).get(name, '')}".rstrip()
-            quivers[name] = ax.quiver([0.0], [0.0], [0.0], [0.0], color=colour(len(placed) + i), label=said, **style)
+        for i, (name, on) in enumerate(arrows.items()):
+            of_all = f"{name}, up to {largest[name]:.3g} {(units or {}).get(name, '')}".rstrip()
+            for said, point in zip((of_all, *(None,) * len(on)), on, strict=False):
+                shaft = {"angles": "xy", "scale_units": "xy", "scale": 1.0, "width": 0.008, "zorder": 3}
+                quivers[name, point] = ax.quiver([0.0], [0.0], [0.0], [0.0], color=colour(len(tracks) + i), label=said, **shaft)
         if quivers:
             ax.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), fontsize="small", frameon=False, borderpad=0)
-        picture = cls(ax, at, placed, links, arrows, trail, (units or {}).get("t", ""), lines, dots, paths, quivers)
+        picture = cls(ax, at, tracks, links, arrows, trail, (units or {}).get("t", ""), paths, lines, dots, quivers)
         picture.draw(0)
         if mine:  # laid out once, so that nothing trembles
             ax.figure.draw_without_rendering()
@@ -185,21 +180,33 @@ class _Picture:
 
     def draw(self, i: int) -> list:
         """Moves all to frame i."""
-        place = lambda end: self.placed[end][i] if isinstance(end, str) else end
+        now = BETWEEN * i
+        place = lambda end: self.tracks[end][now] if isinstance(end, str) else end
         for line, link in zip(self.lines, self.links, strict=True):
             line.set_data(*zip(*map(place, link), strict=True))
-        for name, dot in self.dots.items():
-            dot.set_data(*self.placed[name][i][:, None])
-        since = 0 if self.trail is None else int(np.searchsorted(self.at, self.at[i] - self.trail))
-        for name, path in self.paths.items():
-            path.set_data(*self.placed[name][since : i + 1].T)
-        for name, quiver in self.quivers.items():
-            point, F = self.arrows[name]
-            quiver.set_offsets(self.placed[point][i])
-            quiver.set_UVC(*F[i])
-        digits = max(0, int(np.ceil(-np.log10(self.at[1] - self.at[0]))))
+        step = self.at[1] - self.at[0]
+        since = max(0, now - int(min(BETWEEN * (self.trail or 0) / step, now)))
+        for dot, path, track in zip(self.dots, self.paths, self.tracks.values(), strict=True):
+            dot.set_data(*track[now][:, None])
+            path.set_data(*track[since : now + 1].T)
+        for (name, point), quiver in self.quivers.items():
+            quiver.set_offsets(place(point))
+            quiver.set_UVC(*self.arrows[name][point][i])
+        digits = max(0, int(np.ceil(-np.log10(step))))
         self.ax.set_title(f"t = {self.at[i]:.{digits}f} {self.unit}".rstrip(), loc="left", fontsize="medium")
-        return [*self.lines, *self.dots.values(), *self.paths.values(), *self.quivers.values()]
+        return [*self.paths, *self.lines, *self.dots, *self.quivers.values()]
+
+
+def _scaled(tracks, fixed, arrows):
+    """The forces in lengths of the picture; the largest of each; and the corners of what is to be seen."""
+    seen = np.concatenate([*tracks.values(), *(end[None] for end in fixed)])
+    length = np.linalg.norm(np.ptp(seen, axis=0)) or 1.0
+    largest = {name: max(np.max(np.linalg.norm(F, axis=1)) for F in on.values()) for name, on in arrows.items()}
+    scale = LONGEST_ARROW * length / (max(largest.values(), default=1.0) or 1.0)
+    arrows = {name: {point: scale * F for point, F in on.items()} for name, on in arrows.items()}
+    tips = [tracks[point][::BETWEEN] + F for on in arrows.values() for point, F in on.items()]
+    seen = np.concatenate([seen, *tips])
+    return arrows, largest, seen.min(axis=0) - MARGIN * length, seen.max(axis=0) + MARGIN * length
 
 
 def _fewer_colours(match):
@@ -208,7 +215,7 @@ def _fewer_colours(match):
 
     small = io.BytesIO()
     picture = Image.open(io.BytesIO(base64.b64decode(match[0].replace("\\\n", "")))).convert("RGB")
-    picture.quantize(16, dither=Image.Dither.NONE).save(small, "PNG", optimize=True)
+    picture.quantize(64, Image.Quantize.FASTOCTREE).save(small, "PNG", optimize=True)
     return base64.b64encode(small.getvalue()).decode()
 
 
@@ -231,12 +238,13 @@ def _check_names(motion, points, links, forces):
         for end in link:
             if end not in points if isinstance(end, str) else np.shape(end) != (2,):
                 raise ValueError(f"`links` must join points or places (x, y), but one ends at {end!r}. The points are {there}.")
-    for name, point in forces.items():
+    for name, on in forces.items():
         if name not in motion.multipliers:
             known = ", ".join(motion.multipliers) or "none"
             raise ValueError(f"`forces` must be of constraints of the system, but {name!r} is not. There are {known}.")
-        if point not in points:
-            raise ValueError(f"`forces` must act on points, but {name!r} is to act on {point!r}. The points are {there}.")
+        for point in on:
+            if point not in points:
+                raise ValueError(f"`forces` must act on points, but {name!r} is to act on {point!r}. The points are {there}.")
 
 
 def _reached(motion):
@@ -260,27 +268,30 @@ def _frame_times(ts, fps, speed):
     return ts[0] + np.arange(count) * speed / fps
 
 
-def _positions(motion, ts, at, name, point):
-    """Where a point is in each frame."""
-    q, qdot = (
-        jax.tree.map(lambda x, v: between(ts, np.asarray(x), np.asarray(v), at), *pair)
-        for pair in ((motion.q, motion.qdot), (motion.qdot, motion.qddot))
-    )
+def _track(motion, at, name, point):
+    """Where a point is in each frame, and at times between two of them."""
+    ts, fine = np.asarray(motion.ts), np.linspace(at[0], at[-1], BETWEEN * (at.size - 1) + 1)
+    along = lambda x, v: jax.tree.map(lambda x, v: between(ts, np.asarray(x), np.asarray(v), fine), x, v)
     place = lambda t, q, qdot: ravel_pytree(call(point, f"`points` {name!r}", motion.stated.params, t=t, q=q, qdot=qdot))[0]
-    x = np.asarray(jax.jit(jax.vmap(place))(at, q, qdot))
+    x = np.asarray(jax.jit(jax.vmap(place))(fine, along(motion.q, motion.qdot), along(motion.qdot, motion.qddot)))
     if x.shape[1] != 2:
         raise ValueError(f"`points` {name!r} must return a position (x, y), but returned {x.shape[1]} numbers. Return the two to be seen.")
     return x
 
 
-def _forces(motion, at, name, point):
-    """The force of a constraint on a point in each frame, from that at the samples."""
-    stated = motion.stated
-    force = lambda t, q, qdot: ravel_pytree(constraint_force(stated.system, q, qdot, stated.params, t=t, at=point)[name])[0]
+def _forces(motion, at, name, on):
+    """The forces of a constraint on its points in each frame, from those at the samples."""
+    system, params, ts = motion.stated.system, motion.stated.params, np.asarray(motion.ts)
+    together = lambda t, q, params: [ravel_pytree(call(x, f"`points` {point!r}", params, t=t, q=q))[0] for point, x in on.items()]
+    force = lambda t, q, qdot: jnp.stack(constraint_force(system, q, qdot, params, t=t, at=together)[name])
     F = np.asarray(jax.jit(jax.vmap(force))(motion.ts, motion.q, motion.qdot))
-    if np.all(np.isnan(F)):
-        raise ValueError(f"`forces` must act through the points they are given, but {name!r} does not through its own alone. Take another.")
-    return np.stack([np.interp(at, motion.ts, component) for component in F.T], axis=1)
+    known = np.all(np.isfinite(F), axis=(1, 2))
+    if 2 * np.sum(known) < ts.size:
+        raise ValueError(
+            f"`forces` must name all points that a constraint acts through, but {name!r} acts not through {', '.join(on)} alone. "
+            "Name the points at both of its ends."
+        )
+    return {point: np.stack([np.interp(at, ts[known], component) for component in F[known, k].T], axis=1) for k, point in enumerate(on)}
 
 
 def between(ts: np.ndarray, x: np.ndarray, v: np.ndarray, at: np.ndarray) -> np.ndarray:

@@ -75,7 +75,8 @@ def test_frames_are_where_the_motion_is():
     np.testing.assert_allclose(links[0].get_xydata(), [[0, 0], here / 2], atol=1e-6)
     np.testing.assert_allclose(links[1].get_xydata(), [here / 2, here], atol=1e-6)
     np.testing.assert_allclose(fixed[0].get_xydata(), [[0, 0]])
-    np.testing.assert_allclose(paths[0].get_xydata()[:, 0], whirl().q["x"][10:36:5], atol=1e-6)
+    ts = np.linspace(0.2, 0.7, 21)
+    np.testing.assert_allclose(paths[0].get_xydata(), l * np.stack([np.cos(omega * ts), np.sin(omega * ts)], axis=1), atol=1e-6)
     assert moving.ax.get_aspect() == 1
     limits = moving.ax.get_xlim()
     moving.draw(20)
@@ -93,6 +94,26 @@ def test_arrows_are_the_forces_of_the_constraints():
         x = np.array([whirl().q["x"][5 * i], whirl().q["y"][5 * i]])
         np.testing.assert_allclose(arrow.get_offsets(), [x], atol=1e-6)
         np.testing.assert_allclose([arrow.U[0], arrow.V[0]], -x / l * length, atol=0.01)  # the extremes lie between two frames
+
+
+def test_a_rod_between_two_bodies_pulls_at_both():
+    """A dumb-bell that turns about its middle: −m (l/2) ω² on each end, along the rod."""
+    out = l / 2 * np.stack([np.cos(omega * TS), np.sin(omega * TS)], axis=1)
+    aside = l / 2 * omega * np.stack([-np.sin(omega * TS), np.cos(omega * TS)], axis=1)
+    ends = lambda x: {"a": jnp.asarray(x), "b": jnp.asarray(-x)}
+    energy = lambda qdot, m: 0.5 * m * (qdot["a"] @ qdot["a"] + qdot["b"] @ qdot["b"])
+    dumb_bell = jl.System(energy, holonomic={"rod": lambda q, l: jnp.linalg.norm(q["a"] - q["b"]) - l})
+    stated = Stated.of(dumb_bell, {"l": jnp.asarray(l), "m": jnp.asarray(m)})
+    motion = ends(out), ends(aside), ends(-(omega**2) * out), {"rod": jnp.full(TS.shape, -m * l / 2 * omega**2)}
+    turning = jl.Trajectory(jnp.asarray(TS), *motion, jl.RESULTS.successful, {}, None, {}, stated)
+    points = {"a": lambda q: q["a"], "b": lambda q: q["b"]}
+    moving = jl.animate(turning, points, [("a", "b")], forces={"rod": ("a", "b")}, fps=10)
+    one, other = moving.ax.collections
+    moving.draw(4)
+    np.testing.assert_allclose([one.U[0], one.V[0]], -out[20] * np.hypot(one.U[0], one.V[0]) / (l / 2), atol=1e-6)
+    np.testing.assert_allclose([other.U[0], other.V[0]], [-one.U[0], -one.V[0]], rtol=1e-6)
+    (said,) = moving.ax.get_legend().get_texts()
+    assert said.get_text() == f"rod, up to {m * l / 2 * omega**2:.3g}"
 
 
 @pytest.mark.parametrize(("speed", "frames"), [(1.0, 21), (0.5, 41), (2.0, 11)])
@@ -117,7 +138,7 @@ def test_it_is_drawn_on_the_axes_that_are_given(tmp_path):
     moving = whirling(ax=ax, trail=math.inf)
     assert moving.ax is ax
     moving.draw(20)
-    assert len(ax.lines[0].get_xdata()) == 21
+    assert len(ax.lines[0].get_xdata()) == 4 * 20 + 1
     moving.save(tmp_path / "whirl.html", dpi=30)
     assert "<button" in (tmp_path / "whirl.html").read_text()
     plt.close("all")
@@ -151,9 +172,10 @@ def test_a_file_that_cannot_be_written_is_refused(tmp_path, monkeypatch):
         ({"links": [("bob", (0.0, 0.0, 0.0))]}, "but one ends at (0.0, 0.0, 0.0). The points are bob."),
         ({"forces": {"string": "bob"}}, "`forces` must be of constraints of the system, but 'string' is not. There are rod."),
         ({"forces": {"rod": "pin"}}, "`forces` must act on points, but 'rod' is to act on 'pin'. The points are bob."),
+        ({"forces": {"rod": ("bob", "pin")}}, "`forces` must act on points, but 'rod' is to act on 'pin'."),
         (
             {"points": {"bob": bob, "wall": lambda t: (0.0 * t, 0.0 * t)}, "forces": {"rod": "wall"}},
-            "`forces` must act through the points they are given, but 'rod' does not through its own alone.",
+            "`forces` must name all points that a constraint acts through, but 'rod' acts not through wall alone. Name the points at both",
         ),
         ({"speed": 1e-3}, "`fps` and `speed` must give 2 to 2000 frames, but this motion of 2 gives 50001. Choose `speed`, now 0.001"),
     ],

@@ -32,6 +32,7 @@ ORDER = [
     "_manifold",
     "_motion",
     "_results",
+    "_progress",
     "_trajectory",
     "_canvas",
     "_plot_motion",
@@ -63,7 +64,7 @@ ORDER = [
     "_equations",
     "plot",
 ]
-BESIDE = ["_progress", "dissipation", "learnt"]  # need nothing of the package
+BESIDE = ["dissipation", "learnt"]  # need nothing of the package
 PUBLIC = [name for name in vars(jaxlag) if not name.startswith("_") and callable(getattr(jaxlag, name))]
 
 
