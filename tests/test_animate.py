@@ -116,7 +116,7 @@ def test_a_rod_between_two_bodies_pulls_at_both():
     assert said.get_text() == f"rod, up to {m * l / 2 * omega**2:.3g}"
 
 
-@pytest.mark.parametrize(("speed", "frames"), [(1.0, 21), (0.5, 41), (2.0, 11)])
+@pytest.mark.parametrize(("speed", "frames"), [(1.0, 21), (2.0, 11)])
 def test_a_gif_has_a_frame_for_each_time(tmp_path, speed, frames):
     file = tmp_path / "whirl.gif"
     whirling(speed=speed).save(file, dpi=40)
