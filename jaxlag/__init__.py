@@ -2,6 +2,7 @@
 
 from . import dissipation as dissipation, learnt as learnt
 from ._acceleration import Acceleration as Acceleration, acceleration as acceleration, constraint_force as constraint_force
+from ._animate import animate as animate
 from ._equations import Equations as Equations, equations as equations, to_sympy as to_sympy
 from ._examine import Examination as Examination, examine as examine
 from ._friction import Regularised as Regularised, StickSlip as StickSlip
@@ -20,6 +21,7 @@ from ._prediction import Huber as Huber
 from ._quality import Channel as Channel
 from ._regress import Regression as Regression, regress as regress
 from ._integrate import simulate as simulate
+from ._many import simulate_many as simulate_many
 from ._kinematics import rate as rate, substitute as substitute, virtual_work as virtual_work
 from ._manifold import (
     Baumgarte as Baumgarte,

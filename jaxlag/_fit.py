@@ -53,8 +53,9 @@ class Fit:
       what they do determine. `covariance`, `correlation`: in the flat order whose entries `names` names.
     - `experiments`: what was fitted, with estimated starts put in; `unknowns` and `unknown_errors`: for each experiment its own
       estimates, `"q0"`, `"qdot0"` and parameters, with standard errors.
-    - `predictions`, `residuals` (measured minus predicted): per experiment, structured like its values. `channels`: how well each is
-      predicted. `sigma`: σ̂, in units of the sigma given, which is 1 where none was.
+    - `predictions`, `residuals` (measured minus predicted): per experiment, structured like its values. `prediction_errors`: standard
+      errors of the predictions, NaN where nothing was measured. `channels`: how well each is predicted. `sigma`: σ̂, in units of the
+      sigma given, which is 1 where none was.
     - `converged`, `reason`, `steps`, `costs` (after each step), `cost` (half the sum of squares).
 
     **Source:** Ljung, System Identification, 2nd ed., sections 7.2, 9.4 and 16; Seber & Wild, Nonlinear Regression (1989), chapter 5.
@@ -70,6 +71,7 @@ class Fit:
     unknown_errors: list[dict[str, PyTree]]
     residuals: list[PyTree]
     predictions: list[PyTree]
+    prediction_errors: list[PyTree]
     channels: list[Channel]
     sigma: float
     cost: float
@@ -126,6 +128,17 @@ class Fit:
         if self.problem.model.loss is not None:
             raise ValueError("`profile` must be of a plain least-squares fit, but this one has a loss of its own. Take `profile=False`.")
         return Interval(*(self._profile_end(i, side, t) if np.isfinite(error) else side * np.inf for side in (-1, 1)))
+
+    def band(self, number: int = 0, level: float = 0.95) -> tuple[PyTree, PyTree]:
+        """The ends of the confidence band of what was fitted, from the uncertainty of all unknowns, those of the experiment included.
+
+        **Source:** Seber & Wild, Nonlinear Regression (1989), section 5.1.
+        """
+        t = self._quantile(level)
+        lower, upper = (
+            jax.tree.map(lambda p, e, s=s: p + s * t * e, self.predictions[number], self.prediction_errors[number]) for s in (-1, 1)
+        )
+        return lower, upper
 
     def predict(self, experiment: Experiment, *, level: float = 0.95) -> Prediction:
         """What an experiment should show at the estimates, with the confidence band that their uncertainty makes.

@@ -13,9 +13,10 @@ from jaxtyping import PyTree
 from ._experiment import Experiment, measured
 from ._fit import Fit
 from ._free import Free
-from ._least_squares import INTERRUPTED, MAX_STEPS, Iterate, Line, Outcome, levenberg_marquardt
+from ._least_squares import INTERRUPTED, MAX_STEPS, Iterate, Outcome, levenberg_marquardt
 from ._prediction import Huber, Model
 from ._problem import Problem, check_observations, failure_of, linearise, linearise_each, linearise_starts, look
+from ._progress import Steps
 from ._regress import regress
 from ._report import report, robust_scale
 from ._sensitivities import FORWARD_LIMIT
@@ -60,7 +61,7 @@ def fit(
     - `pieces`: into how many pieces each record is cut, each with a start of its own (multiple shooting): for long or chaotic records.
     - `max_steps`: default 100, with `method` 1000. `tolerance`: the iteration ends when the next step would change no parameter by more
       than this part of its standard error.
-    - `progress`: prints a line with step, cost and time left while it runs, on standard error.
+    - `progress`: shows step, cost and time left while it runs, on standard error, in one line; in a log a line now and then.
     - `**numerics`: handed on to `simulate`: `solver`, `rtol`, `atol`, `stabilisation`, `friction`.
 
     Stopped by the keyboard, it returns the best so far and says so. Experiments run side by side, over several devices where there are.
@@ -85,7 +86,7 @@ def fit(
         raise ValueError("`pieces`, `starts` and `method` must be used one at a time, but more than one was given. Leave the others out.")
     problem, experiments = _stated(system, experiments, params, free, bounds, priors, loss, method is None, numerics)
     steps = max_steps or (100 if method is None else 1000)
-    line = Line(steps) if progress else None
+    line = Steps(steps) if progress else None
     more = {"freedom": _freedom(problem, experiments), "max_steps": steps, "tolerance": tolerance, "progress": line}
     whole = cut(problem, experiments, pieces) if pieces > 1 else Pieces(problem, tuple(range(len(experiments))), ())
     try:
@@ -145,7 +146,7 @@ def fit_each(
         rows = linearise_each(problem, xs)
         return rows.residuals, rows.jacobian, rows
 
-    line = Line(max_steps) if progress else None
+    line = Steps(max_steps) if progress else None
     freedom = max(min(map(_measurements, experiments)) - xs.shape[1], 1)
     outcome = levenberg_marquardt(seen, xs, freedom=freedom, max_steps=max_steps, tolerance=tolerance, progress=line)
     if line:

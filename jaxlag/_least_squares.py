@@ -1,7 +1,5 @@
 """Nonlinear least squares, from residuals and Jacobians that come together, one problem or a batch of them."""
 
-import sys
-import time
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -128,21 +126,3 @@ def _judge(now, trial, predicted, seen, tolerance, freedom):
 
 ONE = tuple(eqx.filter_jit(f) for f in (_begin, _propose, _judge))
 MANY = tuple(eqx.filter_jit(jax.vmap(f)) for f in (_begin, _propose, _judge))
-
-
-class Line:
-    """A line on standard error that says how the fit gets on, rewritten in place."""
-
-    def __init__(self, max_steps: int):
-        self.max_steps, self.first = max_steps, 0.0
-
-    def __call__(self, step: int, cost: float) -> None:
-        """Writes step, cost, and how long the rest may take at most; the first step is not counted, for it may compile."""
-        now = time.perf_counter()
-        self.first = now if step == 1 else self.first
-        left = f"   at most {(now - self.first) / (step - 1) * (self.max_steps - step):.0f} s more" if step > 1 else ""
-        print(f"\rstep {step:3d}   cost {cost:.6g}{left}   ", end="", file=sys.stderr, flush=True)
-
-    def end(self) -> None:
-        """Leaves the line."""
-        print(file=sys.stderr)

@@ -60,7 +60,7 @@ def report(problem: Problem, experiments: Sequence[Experiment], outcome: Outcome
         remarks += _at_bounds(free, theta, errors)
     first = [whole.of.index(i) for i in range(len(experiments))]
     own = [_own_of(problem, x, rows, k, e, known, scale) for k, e in zip(first, experiments, strict=True)]
-    residuals, predictions = _whole(problem, rows, experiments, whole)
+    residuals, predictions, spreads = _whole(problem, rows, experiments, whole, known.covariance)
     status = int(outcome.best.status)
     return Fit(
         experiments=tuple(_as_found(e, found) for e, (found, _) in zip(experiments, own, strict=True)),
@@ -73,6 +73,7 @@ def report(problem: Problem, experiments: Sequence[Experiment], outcome: Outcome
         unknown_errors=[errors for _, errors in own],
         residuals=residuals,
         predictions=predictions,
+        prediction_errors=[jax.tree.map(lambda spread: scale * spread, tree) for tree in spreads],
         channels=[c for k, (e, r) in enumerate(zip(experiments, residuals, strict=True)) for c in channels_of(k, e.values, r)],
         sigma=sigma,
         cost=float(np.sum(np.asarray(rows.residuals)[: p + weighted.size] ** 2) / 2),
@@ -169,16 +170,36 @@ def _as_found(e, own):
     return eqx.tree_at(lambda e: (e.q0, e.qdot0, e.params), e, (own.get("q0", e.q0), own.get("qdot0", e.qdot0), params))
 
 
-def _whole(problem, rows, experiments, whole):
-    """Residuals and predictions of each experiment, its pieces put together."""
-    residuals, predictions = [], []
+def _whole(problem, rows, experiments, whole, covariance):
+    """Residuals, predictions and their standard errors over σ̂ of each experiment, its pieces put together."""
+    residuals, predictions, spreads = [], [], []
     samples = whole.samples or [e.ts.size for e in experiments]
+    together = lambda parts: jax.tree.map(lambda *pieces: np.concatenate(pieces), *parts)
     for i, e in enumerate(experiments):
-        mine = [(j, n) for j, (of, n) in enumerate(zip(whole.of, samples, strict=True)) if of == i]
-        parts = []
-        for j, n in mine:
+        seen, spread = [], []
+        for j, n in [(j, n) for j, (of, n) in enumerate(zip(whole.of, samples, strict=True)) if of == i]:
             k, row = _place(problem, j)
-            parts.append(jax.tree.map(lambda x, row=row, n=n: np.asarray(x[row, :n]), rows.of_stacks[k].channels))
-        predictions.append(jax.tree.map(lambda *pieces: np.concatenate(pieces), *parts))
+            cut = lambda tree, n=n: jax.tree.map(lambda x: x[:n], tree)
+            seen.append(cut(jax.tree.map(lambda x, row=row: np.asarray(x[row]), rows.of_stacks[k].channels)))
+            spread.append(cut(_spread(problem, rows, k, row, covariance)))
+        predictions.append(together(seen))
+        spreads.append(together(spread))
         residuals.append(jax.tree.map(lambda z, p: np.asarray(z) - p, e.values, predictions[-1]))
-    return residuals, predictions
+    return residuals, predictions, spreads
+
+
+def _spread(problem, rows, k, row, covariance):
+    """√(J cov Jᵀ) of what the sensors of one experiment should see; NaN where nothing was measured, for there J is not at hand."""
+    stack, part, loss = problem.stacks[k], rows.of_stacks[k], problem.model.loss
+    values, sigma, seen = (jax.tree.map(lambda x: np.asarray(x[row]), tree) for tree in (stack.values, stack.sigma, part.channels))
+    if part.jacobian is None:
+        return jax.tree.map(lambda z: np.full(z.shape, np.nan), values)
+    flat = lambda tree: np.concatenate([np.ravel(leaf) for leaf in jax.tree.leaves(tree)])
+    columns = np.r_[0 : problem.free.size, problem.own_columns(k, np.array([row]))[0]]
+    J = np.asarray(part.jacobian[row]) * flat(sigma)[:, None]
+    if loss is not None:
+        weighted = np.nan_to_num((flat(values) - flat(seen)) / flat(sigma))
+        J = J / np.asarray(loss.slope(weighted / problem.scale))[:, None]
+    spread = np.sqrt(np.maximum(np.einsum("ij,jk,ik->i", J, covariance[np.ix_(columns, columns)], J), 0))
+    there = np.where(np.isfinite(flat(values)), spread, np.nan)
+    return jax.tree.map(np.asarray, ravel_pytree(values)[1](jnp.asarray(there)))

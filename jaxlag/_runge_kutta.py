@@ -1,7 +1,4 @@
-"""Explicit Runge–Kutta schemes with their stages written out, and with all samples of a step in one polynomial.
-
-diffrax's own loop over the stages; where the acceleration is a few hundred scalar operations, that loop costs more than they do.
-"""
+"""Explicit Runge–Kutta schemes for small systems: one short loop over the stages, and dense output of high order."""
 
 from typing import Any, ClassVar
 
@@ -61,34 +58,30 @@ class ExplicitRungeKutta(dfx.AbstractAdaptiveSolver):
         scheme, h = self.tableau, terms.contr(t0, t1)
         if made_jump is not False:
             solver_state = jax.lax.cond(made_jump, lambda: terms.vf(t0, y0, args), lambda: solver_state)
-        changed = lambda weights, f: terms.prod(weighted(weights, f), h)
+        changed = lambda weights, f: jax.tree.map(lambda f: terms.prod(weighted(weights, f), h), f)
 
         def stage(f, row):
             i, c, weights = row
-            y = jax.tree.map(jnp.add, y0, changed(weights, f))
-            put = lambda f, new: jax.lax.dynamic_update_index_in_dim(f, new, i, 0)
-            return jax.tree.map(put, f, terms.vf(t0 + c * (t1 - t0), y, args)), None
+            new = terms.vf(t0 + c * (t1 - t0), jax.tree.map(jnp.add, y0, changed(weights, f)), args)
+            return jax.tree.map(lambda f, new: jax.lax.dynamic_update_index_in_dim(f, new, i, 0), f, new), None
 
-        # One loop, so that a stage is compiled once. All rows are as long as the last: what is not there yet counts as nothing.
-        size = len(scheme.c)
-        first = lambda x: jnp.concatenate([x[None], jnp.zeros((size - 1, *x.shape), x.dtype)])
-        times, rows = (np.array(x) for x in (scheme.c[1:], [[*row, *[0.0] * (size - len(row))] for row in scheme.a]))
-        dtype = jnp.result_type(t0)
-        f, _ = jax.lax.scan(stage, jax.tree.map(first, solver_state), (np.arange(1, size), times.astype(dtype), rows.astype(dtype)))
+        # One loop, so that the equations are compiled once. All rows are as long as the last: what is not there yet counts as nothing.
+        size, dtype = len(scheme.c), jnp.result_type(*jax.tree.leaves(y0))
+        rows = [[*row, *[0.0] * (size - len(row))] for row in scheme.a]
+        first = jax.tree.map(lambda x: jnp.concatenate([x[None], jnp.zeros((size - 1, *x.shape), x.dtype)]), solver_state)
+        f, _ = jax.lax.scan(stage, first, (np.arange(1, size), np.array(scheme.c[1:], dtype), np.array(rows, dtype)))
 
         y1 = jax.tree.map(jnp.add, y0, changed(scheme.a[scheme.stages - 2], f))
         error = jax.tree.map(combined, *(changed(row, f) for row in scheme.errors))
         last = jax.tree.map(lambda f: f[scheme.stages - 1], f)
-        ends = [terms.prod(solver_state, h), terms.prod(last, h)]
+        ends = [terms.prod(of_end, h) for of_end in (solver_state, last)]
         series = jax.tree.map(lambda *terms: jnp.stack(terms), *ends, *(changed(row, f) for row in scheme.dense))
         return y1, error, {"y0": y0, "y1": y1, "k": series}, last, dfx.RESULTS.successful
 
 
 def weighted(weights, f):
-    """Σ wᵢ fᵢ."""
-    if isinstance(weights, tuple):
-        return jax.tree.map(lambda f: sum(w * f[i] for i, w in enumerate(weights) if w != 0), f)
-    return jax.tree.map(lambda f: jnp.sum(weights.reshape(-1, *[1] * (f.ndim - 1)).astype(f.dtype) * f, 0), f)
+    """Σ wᵢ fᵢ; written as a sum, because a product of arrays would be a call of a library."""
+    return sum(w * f[i] for i, w in enumerate(weights) if not (isinstance(w, float) and w == 0))
 
 
 def combined(error, lower=None):

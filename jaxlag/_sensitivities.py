@@ -6,6 +6,7 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax.flatten_util import ravel_pytree
 
 # Up to this many perturbed numbers the Jacobian comes whole out of one vectorised forward pass; beyond it a tangent is
@@ -53,6 +54,50 @@ def differentiable(solve: Callable[..., Any], pull_back: Callable[..., Any], dri
         return (y, aux), (change, jax.tree.map(lambda _: None, aux))
 
     return motion
+
+
+def differentiable_abreast(solve: Callable[..., Any], drift: Callable[..., Any]) -> Callable[..., Any]:
+    """The same for members side by side that do not touch one another: `solve((common, own), ts) -> (y, aux)`.
+
+    Leaves of `own`, and y, have the members as their last axis: one pass along e perturbs that number of every member, and gives each
+    of them its own derivative.
+    """
+
+    @eqx.filter_custom_jvp
+    def motions(inputs, ts):
+        return solve(inputs, ts)
+
+    @motions.def_jvp
+    def rule(primals, tangents):
+        (inputs, ts), (d_inputs, d_ts) = primals, tangents
+        moving, still = eqx.partition(inputs, jax.tree.map(lambda d: d is not None, d_inputs, is_leaf=lambda d: d is None))
+        x, unravel = ravel_pytree(moving[0])
+        flat, structure = jax.tree.flatten(moving[1])
+        sizes = [leaf[..., 0].size for leaf in flat]
+
+        def of_rows(x, rows):
+            own = [part.reshape(leaf.shape) for part, leaf in zip(jnp.split(rows, np.cumsum(sizes)[:-1]), flat, strict=True)]
+            return solve(eqx.combine((unravel(x), jax.tree.unflatten(structure, own)), still), ts)
+
+        members = jax.tree.leaves(inputs[1])[0].shape[-1]
+        joined = lambda leaves: jnp.concatenate([jnp.zeros((0, members), ts.dtype), *(leaf.reshape(-1, members) for leaf in leaves)])
+        rows, count = joined(flat), x.size + sum(sizes)
+        change = None
+        if count == 0:
+            y, aux = motions(inputs, ts)
+        else:
+            along = lambda e: jax.jvp(
+                of_rows, (x, rows), (e[: x.size].astype(x.dtype), jnp.broadcast_to(e[x.size :, None], rows.shape)), has_aux=True
+            )
+            y, J, aux = jax.vmap(along, out_axes=(None, 0, None))(jnp.eye(count, dtype=ts.dtype))
+            dx = jnp.broadcast_to(ravel_pytree(d_inputs[0])[0][:, None], (x.size, members))
+            change = jnp.einsum("p...m,pm->...m", J, jnp.concatenate([dx, joined(jax.tree.leaves(d_inputs[1]))]))
+        if d_ts is not None:
+            shift = drift(inputs, ts, y) * d_ts[:, None, None]
+            change = shift if change is None else change + shift
+        return (y, aux), (change, jax.tree.map(lambda _: None, aux))
+
+    return motions
 
 
 def _with_jacobian(solve, pull_back, drift):

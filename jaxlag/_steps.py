@@ -12,7 +12,6 @@ from equinox.internal import prevbefore
 from jaxtyping import Array, Float
 
 from ._friction import norms, settle
-from ._kernels import in_one_kernel
 from ._motion import Equations
 from ._power import energy_turnover
 from ._signal import delayed
@@ -24,7 +23,7 @@ NEWTON_STEPS = 3  # the first makes the time right, the second its derivative, t
 
 
 class AtSamples(dfx.AbstractAdjoint):
-    """Another adjoint, with samples at `ts`, in place of what `SaveAt` asks for; its loop is one kernel where it can be.
+    """Another adjoint, with samples at `ts` in place of what `SaveAt` asks for.
 
     `SaveAt(ts=ts)` has diffrax check `ts` while it runs, and a program with such a check is never taken from JAX's persistent cache.
     """
@@ -33,11 +32,10 @@ class AtSamples(dfx.AbstractAdjoint):
     ts: Float[Array, " k"]
 
     def loop(self, *, saveat, init_state, **how):
-        unfilled = lambda x: jnp.full((self.ts.size, *x.shape[1:]), jnp.inf, x.dtype)
+        times, states = jnp.full(self.ts.shape, jnp.inf), jnp.full((self.ts.size, *init_state.y.shape), jnp.inf, init_state.y.dtype)
         saved = lambda state: (state.save_state.ts, state.save_state.ys)
-        state = eqx.tree_at(saved, init_state, replace_fn=unfilled)
-        loop = lambda: self.adjoint.loop(saveat=dfx.SaveAt(ts=self.ts), init_state=state, **how)
-        return in_one_kernel(loop) if isinstance(self.adjoint, dfx.ForwardMode) else loop()
+        state = eqx.tree_at(saved, init_state, (times.astype(self.ts.dtype), states))
+        return self.adjoint.loop(saveat=dfx.SaveAt(ts=self.ts), init_state=state, **how)
 
 
 class Kept(dfx.AbstractWrappedSolver, dfx.AbstractAdaptiveSolver):
@@ -101,7 +99,7 @@ class Kept(dfx.AbstractWrappedSolver, dfx.AbstractAdaptiveSolver):
     def _stepped(self, terms, t0, t1, y0, args, solver_state, made_jump):
         terms, given = self._within(terms, t1, args)
         y1, error, dense, solver_state, result = self.solver.step(terms, t0, t1, y0, given, solver_state, made_jump)
-        error = jnp.where(np.arange(error.size) < self.controlled, error, 0)
+        error = jnp.where((np.arange(len(error)) < self.controlled).reshape(-1, *[1] * (error.ndim - 1)), error, 0)
         if self.kept is not None:
             y1 = self.kept(t1, y1, args)
             # A step that cannot be put back is rejected, and tried again with half the length or less.

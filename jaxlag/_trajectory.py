@@ -12,6 +12,7 @@ from jaxtyping import Array, Bool, Float, PyTree
 
 from ._checks import is_concrete
 from ._friction import Regularised, StickSlip
+from ._kinks import kinks_of
 from ._power import energy_turnover
 from ._results import RESULTS, reason_of
 from ._system import Flat, System, bind, leaf_names
@@ -33,11 +34,15 @@ class Stated(eqx.Module):
         numbers = [leaf for leaf in leaves if eqx.is_array(leaf)]
         return cls(numbers, system, (structure, tuple(None if eqx.is_array(leaf) else leaf for leaf in leaves)), friction)
 
-    def flat(self, like: PyTree) -> Flat:
+    @property
+    def params(self) -> PyTree:
+        """The params, put together again."""
         structure, others = self.rest
         numbers = iter(self.numbers)
-        leaves = [next(numbers) if other is None else other for other in others]
-        return bind(self.system, like, jax.tree.unflatten(structure, leaves))
+        return jax.tree.unflatten(structure, [next(numbers) if other is None else other for other in others])
+
+    def flat(self, like: PyTree) -> Flat:
+        return bind(self.system, like, self.params)
 
 
 class Rubbing(eqx.Module):
@@ -94,10 +99,23 @@ class Trajectory(eqx.Module):
         scale = jnp.nanmax(jnp.abs(turned)) + jnp.nansum(jnp.nanmax(jnp.abs(works), axis=1))
         return (energy - energy[0] - jnp.sum(works, axis=0)) / jnp.where(scale > 0, scale, 1)
 
+    def slip(self) -> dict[str, Float[Array, "..."]]:
+        """The slip velocities of each dissipation term with dry friction, shaped like `friction[name].force`."""
+        flat, (q, v) = self._flat(), self._vectors()
+        kinks = kinks_of(flat, self.ts[0], q[0], v[0]) if self.friction else None
+        if kinks is None:
+            return {}
+        slip = jax.vmap(kinks.slip)(self.ts, q, v)
+        return {name: slip[:, rows].reshape(self.friction[name].force.shape) for name, rows in kinks.rows_of_term.items()}
+
     def _energy_turnover(self):
-        q, v = (jax.vmap(lambda leaf: ravel_pytree(leaf)[0])(tree) for tree in (self.q, self.qdot))
-        flat = self.stated.flat(jax.tree.map(lambda leaf: leaf[0], self.q))
-        return jax.vmap(functools.partial(energy_turnover, flat))(self.ts, q, v)
+        return jax.vmap(functools.partial(energy_turnover, self._flat()))(self.ts, *self._vectors())
+
+    def _vectors(self):
+        return [jax.vmap(lambda leaf: ravel_pytree(leaf)[0])(tree) for tree in (self.q, self.qdot)]
+
+    def _flat(self):
+        return self.stated.flat(jax.tree.map(lambda leaf: leaf[0], self.q))
 
     def __repr__(self) -> str:
         if not is_concrete(self):

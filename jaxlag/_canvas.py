@@ -1,0 +1,97 @@
+"""What all pictures have in common: axes, colours, labels. Matplotlib is imported when the first one is drawn."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import jax
+import numpy as np
+from jaxtyping import PyTree
+
+from ._trajectory import Trajectory
+
+# Okabe & Ito, Color Universal Design (2008): told apart with every kind of colour vision. Their yellow is too pale for a thin line.
+COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00", "#000000")
+GREY = "#777777"
+
+Units = Mapping[str, str] | None
+
+
+def colour(i: int) -> str:
+    """The colours in turn."""
+    return COLOURS[i % len(COLOURS)]
+
+
+def channels(tree: PyTree, bare: str) -> dict[str, dict[str, np.ndarray]]:
+    """The samples of each entry, by the path of the leaf and then by a label; `bare` names a leaf without a path."""
+    found = {}
+    for path, leaf in jax.tree_util.tree_flatten_with_path(tree)[0]:
+        name = jax.tree_util.keystr(path, simple=True, separator=".") or bare
+        leaf = np.asarray(leaf)
+        labels = [f"{name}[{', '.join(map(str, index))}]" if index else name for index in np.ndindex(leaf.shape[1:])]
+        found[name] = dict(zip(labels, leaf.reshape(len(leaf), -1).T, strict=True))
+    return found
+
+
+def one_motion(trajectory: Trajectory) -> Trajectory:
+    """The trajectory, which a batch is refused as."""
+    if trajectory.ts.ndim != 1:
+        raise ValueError(
+            f"`trajectory` must be one motion, but is a batch of shape {trajectory.ts.shape[:-1]}. "
+            "Take one of it, e.g. `jax.tree.map(lambda x: x[0], trajectory)`."
+        )
+    return trajectory
+
+
+def chosen(names: Sequence[str] | None, known: Sequence[str], what: str) -> tuple[str, ...]:
+    """The names that were asked for, or all."""
+    for name in names or ():
+        if name not in known:
+            raise ValueError(f"`names` must name {what}, but holds {name!r}. There are {', '.join(known)}.")
+    return tuple(known if names is None else names)
+
+
+def panels(axes: Any, shape: tuple[int, int], which: str, *, sharex: Any = True, **layout: Any) -> Any:
+    """The axes that were handed over, or those of a new figure, as an array of that shape."""
+    if axes is None:
+        _, axes = pyplot().subplots(*shape, sharex=sharex, squeeze=False, layout="constrained", **layout)
+    if np.size(axes) != np.prod(shape):
+        raise ValueError(
+            f"`axes` must be {np.prod(shape)}, {which}, but {np.size(axes)} were given. "
+            f"Make them by `plt.subplots{shape}`, or leave them out."
+        )
+    return np.reshape(axes, shape)
+
+
+def canvas(ax: Any, **layout: Any) -> Any:
+    """The axes that were handed over, or those of a new figure."""
+    return pyplot().subplots(layout="constrained", **layout)[1] if ax is None else ax
+
+
+def pyplot() -> Any:
+    """Matplotlib's, without which there are no pictures."""
+    try:
+        import matplotlib.pyplot as plt
+    except ImportError as error:
+        raise ImportError("`jaxlag.plot` must have matplotlib, but it cannot be imported. Install `jaxlag[plot]`.") from error
+    return plt
+
+
+def legend_beside(ax: Any) -> None:
+    """A legend to the right of the panel, where it hides nothing."""
+    ax.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), fontsize="small")
+
+
+def legend_above(ax: Any, ncols: int = 3) -> None:
+    """A legend above the panel, where it hides nothing and takes no width."""
+    ax.legend(loc="lower center", bbox_to_anchor=(0.5, 1.0), fontsize="small", ncols=ncols, frameon=False)
+
+
+def zero_line(ax: Any) -> None:
+    """A thin line at zero, behind what is drawn."""
+    ax.axhline(0.0, color=GREY, linewidth=0.8, zorder=0.5)
+
+
+def label(name: str, units: Units, of: str | None = None) -> str:
+    """A name with the unit of it, or of another quantity."""
+    unit = (units or {}).get(of or name)
+    return f"{name} ({unit})" if unit else name

@@ -1,0 +1,167 @@
+"""The solution of the equations of motion: diffrax takes the steps."""
+
+import functools
+import warnings
+from typing import Any, NamedTuple
+
+import diffrax as dfx
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool
+
+from ._checks import is_concrete
+from ._manifold import nearest_state
+from ._motion import Equations, slack_of
+from ._progress import Bar
+from ._results import OF_THE_INPUT, RESULTS, reason_of
+from ._runge_kutta import Dop853
+from ._signal import jump_times
+from ._steps import AtSamples, Kept, Resuming, StickSlipSolver, behind_a_jump
+from ._trajectory import Trajectory
+
+
+class How(eqx.Module):
+    """The choices of numerics, which a compiled program is made for."""
+
+    solver: dfx.AbstractSolver
+    stabilisation: Any = eqx.field(static=True)
+    friction: Any = eqx.field(static=True)
+    max_steps: int = eqx.field(static=True)
+    adjoint: dfx.AbstractAdjoint | None = None
+    progress: bool = eqx.field(static=True, default=False)
+    audit: bool = eqx.field(static=True, default=False)
+
+    @classmethod
+    def of(cls, solver, *rest) -> "How":
+        return cls(solver or Dop853(), *rest)
+
+
+def tolerances_of(rtol, atol, dtype) -> tuple[Array, Array]:
+    """Those given, or what the precision allows."""
+    single = jnp.finfo(dtype).bits < 64
+    if single:
+        _warn_of_single_precision()
+    defaults = (1e-4, 1e-6) if single else (1e-8, 1e-10)
+    rtol, atol = (jnp.asarray(default if given is None else given, dtype) for given, default in zip((rtol, atol), defaults, strict=True))
+    return rtol, atol
+
+
+@functools.cache
+def _warn_of_single_precision() -> None:
+    warnings.warn(
+        "jaxlag runs in single precision: tolerances below 1e-5 are out of reach. "
+        'For double precision: jax.config.update("jax_enable_x64", True).',
+        stacklevel=5,
+    )
+
+
+class Begun(NamedTuple):
+    """y at the start, the velocities that count as rest, how far the start was off, and what may be wrong with it."""
+
+    y: Array
+    slack: Array
+    moved: Array
+    obstacles: tuple[tuple[Bool[Array, ""], RESULTS], ...]
+
+
+def begun(equations: Equations, t0, q, v, params, tolerances) -> Begun:
+    """The start, put on the constraints."""
+    nearest = nearest_state(equations.flat(params), t0, q, v)
+    start = equations.start(t0, nearest.q, nearest.v, params)
+    moved = jax.lax.stop_gradient(jnp.max(jnp.abs(jnp.concatenate([nearest.q - q, nearest.v - v]))))
+    obstacles = (
+        (start.has_mode, RESULTS.no_friction),
+        (start.has_bounds, RESULTS.negative_bound),
+        (nearest.reached, RESULTS.impossible_start),
+        (nearest.determined, RESULTS.no_inertia),
+    )
+    return Begun(start.y, slack_of(tolerances, nearest.v), moved, obstacles)
+
+
+def judged(ys, result, obstacles, inputs) -> tuple[Array, RESULTS]:
+    """States that were not reached as NaN; and the reason that the motion ended, the start or the input included."""
+    finite = jnp.all(jnp.array([jnp.all(jnp.isfinite(x)) for x in jax.tree.leaves(inputs) if eqx.is_inexact_array(x)]))
+    obstacles = (*obstacles, (finite, RESULTS.not_finite))
+    for passed, reason in obstacles:
+        result = RESULTS.where(passed, result, reason)
+    started = jnp.all(jnp.stack([passed for passed, _ in obstacles]))
+    return jnp.where(started & jnp.isfinite(ys), ys, jnp.nan), result
+
+
+def states_at(equations: Any, how: How, adjoint: dfx.AbstractAdjoint, t0, y0, ts, args, tolerances) -> tuple[Array, RESULTS, dict]:
+    """States at the samples, by diffrax, and the reason it stopped."""
+    rtol, atol = tolerances
+    rounding = jnp.finfo(y0.dtype).eps * jnp.maximum(jnp.abs(ts[0]), jnp.abs(ts[-1]))
+    controller = dfx.PIDController(rtol, atol, dtmin=4 * rounding, force_dtmin=False, norm=root_mean_square)
+    end, jumps, behind = ts[-1], jump_times(args[0], ts.dtype), None
+    if jumps is not None:
+        controller = dfx.ClipStepSizeController(Resuming(rtol, atol, smallest=4 * rounding, norm=root_mean_square), jump_ts=jumps)
+        end = end + 256 * rounding  # a jump at the last sample is stepped on too: diffrax rounds what is within 100 ulp of the end
+        behind = functools.partial(behind_a_jump, equations)
+    kept = equations.kept if equations.projection else None
+    solver = how.solver
+    if equations.rows:
+        solver = StickSlipSolver(how.solver, kept, 2 * equations.size, behind, equations)
+    elif kept is not None or behind is not None or how.audit:
+        solver = Kept(how.solver, kept, 2 * equations.size, behind)
+    solution = dfx.diffeqsolve(
+        dfx.ODETerm(equations.rates),
+        solver,
+        t0,
+        end,
+        None,
+        y0,
+        args,
+        saveat=dfx.SaveAt(t1=True),
+        stepsize_controller=controller,
+        adjoint=AtSamples(adjoint, ts),
+        max_steps=how.max_steps,
+        throw=False,
+        progress_meter=Meter() if how.progress else dfx.NoProgressMeter(),
+    )
+    ys = solution.ys if kept is None else jax.vmap(lambda t, y: kept(t, y, args))(ts, solution.ys)
+    stats = {key: solution.stats[key] for key in ("num_steps", "num_accepted_steps", "num_rejected_steps")}
+    result = RESULTS.promote(solution.result)
+    result = RESULTS.where(result == RESULTS.internal_error, RESULTS.no_friction, result)  # as StickSlipSolver says it
+    return ys, RESULTS.where(result == RESULTS.max_steps_rejected, RESULTS.chattering, result), stats
+
+
+def root_mean_square(x) -> Array:
+    """The norm of an error, of members abreast that of the worst. It is not differentiated, as the length of a step is not, and made
+    without a dot product, which would be a library's.
+    """
+    square = sum(row**2 for row in jax.lax.stop_gradient(x)) / len(x)
+    return jnp.sqrt(jnp.max(square))
+
+
+class Meter(dfx.TextProgressMeter):
+    """diffrax's meter, which keeps count inside the compiled loop, with a bar in place of its printing."""
+
+    @staticmethod
+    def _init_bar():
+        return Bar()
+
+    @staticmethod
+    def _step_bar(bar, progress):
+        bar(float(progress))
+
+    @staticmethod
+    def _close_bar(bar):
+        bar.end()
+
+
+def raise_failure(trajectory: Trajectory) -> None:
+    """Raises the reason of a failed motion, outside what is compiled; under `jit` the reason stays in the result."""
+    if not is_concrete(trajectory.result) or np.all(trajectory.succeeded):
+        return
+    reason = reason_of(trajectory.result)
+    if reason in map(reason_of, OF_THE_INPUT):
+        raise ValueError(reason)
+    reached = np.asarray(jnp.sum(jnp.isfinite(jax.tree.leaves(trajectory.q)[0].reshape(trajectory.ts.size, -1)[:, 0])))
+    raise RuntimeError(
+        f"the motion must reach t = {trajectory.ts[-1]:g}, but stopped after {reached} of {trajectory.ts.size} samples: {reason} "
+        "Allow more `max_steps`, look at what was computed with `throw=False`, or take a solver for stiff systems, "
+        "`solver=diffrax.Kvaerno5()`."
+    )
