@@ -283,7 +283,8 @@ class Tidy:
 
     def _saving(self, group: list, factor: dict[int, Any]) -> tuple[Any, bool]:
         terms = sum(_divides(factor, powers) for powers, _ in group)
-        return (terms - 1) * sum(map(abs, factor.values())), all(self.atoms[a] in self.parameters for a in factor)
+        size = sum(abs(e) if isinstance(e, int) or e.is_Rational else 1 for e in factor.values())  # e of exp(e) may be a formula
+        return (terms - 1) * size, all(self.atoms[a] in self.parameters for a in factor)
 
     def _leading(self, group: list) -> Expr:
         """The number of the first term that is not made of parameters alone."""

@@ -13,15 +13,15 @@ NOTEBOOKS = sorted(FOLDER.glob("*.ipynb"))
 each_notebook = pytest.mark.parametrize("file", NOTEBOOKS, ids=lambda file: file.stem)
 
 
-def test_there_are_notebooks():
+def test_the_notebooks_are_numbered_from_one():
+    assert [file.stem[:3] for file in NOTEBOOKS] == [f"{number:02d}_" for number in range(1, len(NOTEBOOKS) + 1)]
     assert NOTEBOOKS
 
 
 @each_notebook
-def test_it_is_numbered_and_short_and_says_x64_first(file):
+def test_it_is_short_and_says_x64_first(file):
     notebook = nbformat.read(file, as_version=4)
     nbformat.validate(notebook)
-    assert re.match(r"\d\d_", file.name)
     assert len(notebook.cells) <= 15
     assert notebook.cells[0].cell_type == "markdown"
     first = next(cell for cell in notebook.cells if cell.cell_type == "code")
@@ -34,7 +34,18 @@ def test_its_outputs_are_stored_and_small(file):
     outputs = [output for cell in notebook.cells if cell.cell_type == "code" for output in cell.outputs]
     assert any(output.output_type == "display_data" for output in outputs)
     assert not any(output.output_type == "error" for output in outputs)
-    assert file.stat().st_size < 500_000
+    assert file.stat().st_size < 250_000
+
+
+@each_notebook
+def test_it_ends_with_what_was_learnt_and_a_link_to_the_documentation(file):
+    last = nbformat.read(file, as_version=4).cells[-1]
+    assert last.cell_type == "markdown" and last.source.startswith("## What was learnt\n")
+    links = re.findall(r"\]\((\S+?)#(\S+?)\)", last.source)
+    assert links
+    for page, section in links:
+        headings = re.findall(r"^#+ (.*)$", (FOLDER / page).read_text(), re.M)
+        assert section in {re.sub(r"[^\w\- ]", "", heading).lower().replace(" ", "-") for heading in headings}, section
 
 
 @pytest.mark.slow
