@@ -7,7 +7,7 @@ data costs nothing, and what is left is folded (`_folding`). Over JAX scalars th
 import functools
 import math
 import operator
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import jax
@@ -90,7 +90,7 @@ class Reader(Folding):
             raise UnknownPrimitive(equation.primitive, self.where)
         return self.block(function, operands, equation.outvars)
 
-    def block(self, function: Callable[..., Arrays], operands: Arrays, outvars: Any) -> Arrays:
+    def block(self, function: Callable[..., Arrays], operands: Sequence[np.ndarray], outvars: Any) -> Arrays:
         """The outputs of a function of arrays over the algebra."""
         shapes, avals = [x.shape for x in operands], [variable.aval for variable in outvars]
         on_flat = lambda *flat: [x for array in function(*shaped(flat, shapes)) for x in array.flat]

@@ -6,7 +6,7 @@ from typing import Any
 import diffrax as dfx
 import equinox as eqx
 import jax
-from jaxtyping import PyTree
+from jaxtyping import Array, PyTree
 
 from ._checks import checked, parameters, sample_times, state
 from ._friction import Regularised, StickSlip
@@ -27,8 +27,8 @@ def simulate(
     params: PyTree = None,
     *,
     solver: dfx.AbstractSolver | None = None,
-    rtol: float | None = None,
-    atol: float | None = None,
+    rtol: float | Array | None = None,
+    atol: float | Array | None = None,
     stabilisation: Projection | Baumgarte | NoStabilisation = Projection(),
     friction: StickSlip | Regularised = StickSlip(),
     max_steps: int = 100_000,

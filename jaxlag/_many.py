@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
 from jax.sharding import Mesh, PartitionSpec
-from jaxtyping import PyTree
+from jaxtyping import Array, PyTree
 
 from ._checks import checked, coordinates, parameters, sample_times, state
 from ._experiment import is_within
@@ -40,8 +40,8 @@ def simulate_many(
     over: Sequence[str],
     steps: str | None = None,
     solver: dfx.AbstractSolver | None = None,
-    rtol: float | None = None,
-    atol: float | None = None,
+    rtol: float | Array | None = None,
+    atol: float | Array | None = None,
     stabilisation: Projection | Baumgarte | NoStabilisation = Projection(),
     friction: StickSlip | Regularised = StickSlip(),
     max_steps: int = 100_000,
@@ -197,7 +197,7 @@ def _motions(equations, how, inputs, ts):
     args = (shared["params"], own["params"]), None
     ys, result, stats = states_at(Abreast(equations), how, dfx.ForwardMode(), t0, y0, ts, args, tolerances)
     result = jax.vmap(lambda started: RESULTS.where(started == RESULTS.successful, result, started))(started)
-    return jnp.where((started == RESULTS.successful) & jnp.isfinite(ys), ys, jnp.nan), (result, stats, moved)
+    return jnp.where((started == RESULTS.successful)[None, None] & jnp.isfinite(ys), ys, jnp.nan), (result, stats, moved)
 
 
 def _drift(equations, inputs, ts, ys):

@@ -32,8 +32,9 @@ OF_THE_INPUT = (RESULTS.not_finite, RESULTS.no_inertia, RESULTS.impossible_start
 
 
 def reason_of(result: Any) -> str:
-    """What a result says; of a batch, what the first failure says."""
+    """What a result says; of a batch, what the first failure says, and before all others one of the input, which may bring these about."""
     successful: Any = RESULTS.successful
-    failed = np.ravel(result._value)[np.ravel(result != successful)]
-    one = eqx.tree_at(lambda r: r._value, successful, jnp.asarray(failed[0])) if failed.size else successful
-    return RESULTS[one]  # type: ignore[misc]
+    named = lambda value: RESULTS[eqx.tree_at(lambda r: r._value, successful, jnp.asarray(value))]  # type: ignore[misc]
+    reasons = [named(value) for value in dict.fromkeys(np.ravel(result._value)[np.ravel(result != successful)].tolist())]
+    of_input = [reason for reason in reasons if reason in [RESULTS[given] for given in OF_THE_INPUT]]  # type: ignore[misc]
+    return [*of_input, *reasons, RESULTS[successful]][0]  # type: ignore[misc]

@@ -26,10 +26,11 @@ class Polynomial(dfx.AbstractLocalInterpolation):
     def evaluate(self, t0, t1=None, left=True):
         if t1 is not None:
             return jax.tree.map(jnp.subtract, self.evaluate(t1), self.evaluate(t0))
-        s = (t0 - self.t0) / (self.t1 - self.t0)
+        length = self.t1 - self.t0
+        s = jnp.where(length == 0, 0, (t0 - self.t0) / jnp.where(length == 0, 1, length))
 
         def at_s(y0, y1, k):
-            change, begin, end, *higher = y1 - y0, *k
+            change, (begin, end, *higher) = y1 - y0, k
             terms, sum_ = [change, begin - change, 2 * change - begin - end, *higher], 0.0
             for power in reversed(range(len(terms))):
                 sum_ = (sum_ + terms[power]) * (1 - s if power % 2 else s)
@@ -62,7 +63,8 @@ class ExplicitRungeKutta(dfx.AbstractAdaptiveSolver):
 
         def stage(f, row):
             i, c, weights = row
-            new = terms.vf(t0 + c * (t1 - t0), jax.tree.map(jnp.add, y0, changed(weights, f)), args)
+            t = jnp.where(c == 1, t1, t0 + c * (t1 - t0))  # not rounded beyond t1, where an input may jump
+            new = terms.vf(t, jax.tree.map(jnp.add, y0, changed(weights, f)), args)
             return jax.tree.map(lambda f, new: jax.lax.dynamic_update_index_in_dim(f, new, i, 0), f, new), None
 
         # One loop, so that the equations are compiled once. All rows are as long as the last: what is not there yet counts as nothing.

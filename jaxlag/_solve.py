@@ -63,7 +63,7 @@ class Begun(NamedTuple):
     y: Array
     slack: Array
     moved: Array
-    obstacles: tuple[tuple[Bool[Array, ""], RESULTS], ...]
+    obstacles: tuple[tuple[Bool[Array, ""], Any], ...]
 
 
 def begun(equations: Equations, t0, q, v, params, tolerances) -> Begun:
@@ -159,9 +159,10 @@ def raise_failure(trajectory: Trajectory) -> None:
     reason = reason_of(trajectory.result)
     if reason in map(reason_of, OF_THE_INPUT):
         raise ValueError(reason)
-    reached = np.asarray(jnp.sum(jnp.isfinite(jax.tree.leaves(trajectory.q)[0].reshape(trajectory.ts.size, -1)[:, 0])))
+    samples, coordinate = trajectory.ts.shape[-1], np.asarray(jax.tree.leaves(trajectory.q)[0])
+    reached = np.isfinite(coordinate.reshape(-1, samples, coordinate.size // trajectory.ts.size)[..., 0]).sum(1).min()
     raise RuntimeError(
-        f"the motion must reach t = {trajectory.ts[-1]:g}, but stopped after {reached} of {trajectory.ts.size} samples: {reason} "
+        f"the motion must reach t = {np.ravel(trajectory.ts)[-1]:g}, but stopped after {reached} of {samples} samples: {reason} "
         "Allow more `max_steps`, look at what was computed with `throw=False`, or take a solver for stiff systems, "
         "`solver=diffrax.Kvaerno5()`."
     )

@@ -539,7 +539,7 @@ def test_bead_on_a_turned_rod():
     ends = [motion.q["r"][-1], motion.multipliers["drive"][-1]]
     np.testing.assert_allclose(ends, [1.1286587073250893, 9.824370190965992], rtol=SHORT)
     work = 0.5 * 0.3**2 * 2.0**2 * (np.cosh(4 * np.asarray(motion.ts)) - 1)
-    np.testing.assert_allclose(motion.work()["drive"], work, rtol=0, atol=SHORT * work[-1])
+    np.testing.assert_allclose(motion.work()["drive"], work, rtol=0, atol=2 * SHORT * work[-1])  # works do not set the steps
 
 
 def test_bead_on_a_rotating_hoop():

@@ -12,7 +12,7 @@ from scipy.interpolate import CubicSpline, interp1d
 from scipy.linalg import expm
 
 import jaxlag as jl
-from jaxlag import Signal, _integrate
+from jaxlag import Signal, _integrate, _solve
 
 RNG = np.random.default_rng(3)
 TS = np.cumsum(RNG.uniform(0.05, 0.4, 40)) - 0.3
@@ -131,7 +131,7 @@ def test_jumps_are_stepped_on():
     assert seeing.stats["num_rejected_steps"] <= TS.size < 1000 < blind.stats["num_rejected_steps"]
     assert 7 * seeing.stats["num_steps"] < blind.stats["num_steps"]
     exact = exact_states(TS, FORCE, samples)[0][:, 0]
-    assert 50 * np.max(np.abs(seeing.q - exact)) < np.max(np.abs(blind.q - exact))
+    assert 30 * np.max(np.abs(seeing.q - exact)) < np.max(np.abs(blind.q - exact))
 
 
 def test_jumps_that_coincide_or_nearly_do_cost_nothing():
@@ -332,8 +332,8 @@ def test_new_values_trace_nothing(monkeypatch):
 
 
 def test_without_held_signals_nothing_changes(monkeypatch):
-    monkeypatch.setattr(_integrate, "Resuming", None)
-    monkeypatch.setattr(_integrate, "behind_a_jump", None)
+    monkeypatch.setattr(_solve, "Resuming", None)
+    monkeypatch.setattr(_solve, "behind_a_jump", None)
     cart = jl.System(lambda qdot: 0.5 * qdot**2, force={"linear": lambda t, u: u(t)})
     end = jl.simulate(cart, 0.0, 0.0, [0.0, 1.0], {"u": Signal([0, 1], [0, 6], "linear")}).q[-1]
     np.testing.assert_allclose(end, 1.0, rtol=1e-12)

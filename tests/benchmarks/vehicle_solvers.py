@@ -69,11 +69,9 @@ def stacked(*parts):
 
 
 def jaxlag_many(spread, ts, tolerance):
-    """By `simulate_many` where the package has it, or by `vmap`."""
-    if not hasattr(jl, "simulate_many"):
-        return jax.vmap(lambda theta: stacked(*simulated(theta, ts, tolerance)))(spread)
-    params = P | dict(zip("bck", spread.T, strict=True))
-    found = jl.simulate_many(vehicle.system, vehicle.q0, vehicle.qdot0, ts, params, rtol=tolerance, atol=0.01 * tolerance)
+    """By `simulate_many`."""
+    params, numerics = P | dict(zip("bck", spread.T, strict=True)), {"rtol": tolerance, "atol": 0.01 * tolerance}
+    found = jl.simulate_many(vehicle.system, vehicle.q0, vehicle.qdot0, ts, params, over=("b", "c", "k"), **numerics)
     return stacked(found.q, found.qdot)
 
 
