@@ -1,6 +1,6 @@
 """Differentiable mechanics: from energies, dissipation functions and constraints to motions and identified machines."""
 
-from . import dissipation as dissipation, learnt as learnt
+from . import dissipation as dissipation, learnt as learnt, plot as plot
 from ._acceleration import Acceleration as Acceleration, acceleration as acceleration, constraint_force as constraint_force
 from ._animate import animate as animate
 from ._equations import Equations as Equations, equations as equations, to_sympy as to_sympy

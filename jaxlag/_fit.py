@@ -236,8 +236,10 @@ class Fit:
 
     def _correlation_rows(self):
         pairs = itertools.combinations(range(min(len(self.names), SHOWN)), 2)
-        strong = [f"{self.names[i]}, {self.names[j]}: {self.correlation[i, j]:+.2f}" for i, j in pairs if abs(self.correlation[i, j]) > 0.5]
-        return [f"  correlation  {'; '.join(strong)}"] if strong else []
+        strong = sorted((pair for pair in pairs if abs(self.correlation[pair]) > 0.5), key=lambda pair: -abs(self.correlation[pair]))
+        shown = [f"{self.names[i]}, {self.names[j]}: {self.correlation[i, j]:+.2f}" for i, j in strong[:STRONGEST]]
+        more = [f"{len(strong) - STRONGEST} more above 0.5"] if len(strong) > STRONGEST else []
+        return [f"  correlation  {'; '.join([*shown, *more])}"] if strong else []
 
 
 @eqx.filter_jit
@@ -247,6 +249,7 @@ def _motion(model, params, e):
 
 FAR = 50  # times the linearised interval, within which an end is looked for
 SHOWN = 40  # rows of a table at most
+STRONGEST = 6  # correlations on the card
 MANY = 16  # numbers of one name, beyond which they are counted only
 
 

@@ -27,7 +27,7 @@ from ._solve import How, begun, judged, raise_failure, states_at, tolerances_of
 from ._system import System, leaf_names
 from ._trajectory import Trajectory
 
-ABREAST = 64  # members that share their steps: as many as the cache holds the stages of (tests/benchmarks/bench_many.py)
+ABREAST = 64  # members that share their steps: as many as the cache holds the stages of
 
 
 def simulate_many(

@@ -58,6 +58,11 @@ def report(problem: Problem, experiments: Sequence[Experiment], outcome: Outcome
     errors = np.sqrt(np.diag(covariance))
     if outcome.best.jacobian is not None:
         remarks += _at_bounds(free, theta, errors)
+    if absolute and sigma > UNEXPLAINED:
+        remarks.append(
+            f"the model does not explain the measurements, off by {sigma:.2g} times their noise: look for another start, "
+            "`pieces=`, or what the model lacks; the errors above mean little"
+        )
     first = [whole.of.index(i) for i in range(len(experiments))]
     own = [_own_of(problem, x, rows, k, e, known, scale) for k, e in zip(first, experiments, strict=True)]
     residuals, predictions, spreads = _whole(problem, rows, experiments, whole, known.covariance)
@@ -92,6 +97,7 @@ def report(problem: Problem, experiments: Sequence[Experiment], outcome: Outcome
     )
 
 
+UNEXPLAINED = 3.0  # residuals of so many times the noise are none
 NO_ERRORS = "standard errors are not computed for so many parameters"
 
 

@@ -108,6 +108,7 @@ class Trajectory(eqx.Module):
         slip = jax.vmap(kinks.slip)(self.ts, q, v)
         return {name: slip[:, rows].reshape(self.friction[name].force.shape) for name, rows in kinks.rows_of_term.items()}
 
+    @eqx.filter_jit
     def _energy_turnover(self):
         return jax.vmap(functools.partial(energy_turnover, self._flat()))(self.ts, *self._vectors())
 

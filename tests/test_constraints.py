@@ -458,6 +458,12 @@ def test_rolling_disc_upright():
     np.testing.assert_allclose(np.linalg.matrix_power(critical, 2)[1, 1], 0, rtol=0, atol=1e-12)  # λ² = 4g/5r − 12w²/5
 
 
+def test_a_disc_that_rolls_is_not_called_stiff():
+    """Where it rolls to and turns to are double eigenvalues 0: no time constants, though rounding makes some 1e-8 of them."""
+    found = jl.examine(disc, *disc_state(0.0, 0.1, 0.2, 0.0, 2.0), UNITS)
+    assert found.time_constants[1] < 1e3 and not any("stiff" in finding for finding in found.findings)
+
+
 def test_rolling_disc_turns_steadily():
     """cf_rolling_disc: lean −0.3, q1' = 0.5, q3' = 0.5355817522550558; and a fast one, which is stable, for 100 s."""
     state = disc_state(0.0, -0.3, 0.5, 0.0, 0.5355817522550558)

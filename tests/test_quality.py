@@ -297,6 +297,14 @@ def test_an_estimate_at_a_bound_is_remarked():
     assert found.interval("c").upper <= 3.5
 
 
+def test_a_model_that_does_not_explain_the_data_is_remarked():
+    """Without the damper: residuals of some twenty times the noise. With it there is nothing to say."""
+    record = osc.record(0, sigma=0.01)
+    without = jl.fit(osc.SYSTEM, record, osc.START | {"b": 0.0}, free=("c",))
+    assert without.sigma > 10 and "does not explain the measurements" in repr(without)
+    assert not any("explain" in remark for remark in jl.fit(osc.SYSTEM, record, osc.START, free=("c", "b")).remarks)
+
+
 def test_what_trades_with_the_unknown_start_is_said():
     """A sliding mass whose sensor has an offset: only offset + x₀ shows."""
     system = jl.System(lambda qdot: 0.5 * qdot**2, dissipation=lambda qdot, b: 0.5 * b * qdot**2)
