@@ -4,12 +4,12 @@ from typing import Any
 
 import numpy as np
 
-from ._canvas import COLOURS, pyplot
+from ._canvas import COLOURS as COLOURS, pyplot
 from ._equations import Equations
 from ._plot_fit import convergence, fit, parameters
 from ._plot_motion import balance, energy, forces, friction, motion, phase
 
-__all__ = ["COLOURS", "balance", "convergence", "energy", "equations", "fit", "forces", "friction", "motion", "parameters", "phase"]
+__all__ = ["balance", "convergence", "energy", "equations", "fit", "forces", "friction", "motion", "parameters", "phase"]
 
 
 def equations(on_paper: Equations, *, ax: Any = None) -> Any:
