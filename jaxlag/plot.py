@@ -4,7 +4,8 @@ from typing import Any
 
 import numpy as np
 
-from ._canvas import COLOURS as COLOURS, pyplot
+from ._canvas import COLOURS as COLOURS
+from ._canvas import pyplot
 from ._equations import Equations
 from ._plot_fit import convergence, fit, parameters
 from ._plot_motion import balance, energy, forces, friction, motion, phase
