@@ -22,7 +22,7 @@ from ._manifold import Baumgarte, NoStabilisation, Projection
 from ._motion import Equations
 from ._results import RESULTS
 from ._sensitivities import differentiable_abreast
-from ._signal import Signal, jump_times, solved
+from ._signal import is_signal, jump_times, solved
 from ._solve import How, begun, judged, raise_failure, states_at, tolerances_of
 from ._system import System, leaf_names
 from ._trajectory import Trajectory
@@ -127,14 +127,14 @@ def _simulate_many(system, how, steps, own, shared, ts, tolerances):
             batch = lambda own, *given: jax.vmap(lambda own: one(own, *given))(own)
     if min(members, jax.device_count()) > 1:
         devices = Mesh(np.array(jax.devices()), "members")
-        own = jax.tree.map(lambda leaf: _filled(leaf, devices.size), own)
+        own = jax.tree.map(lambda leaf: filled_up(leaf, devices.size), own)
         along, all_ = PartitionSpec("members"), PartitionSpec()
         batch = jax.shard_map(batch, mesh=devices, in_specs=(along, all_, all_, all_), out_specs=along, check_vma=False)
     return jax.tree.map(lambda leaf: leaf[:members], batch(own, numbers, ts, tolerances))
 
 
 def _common(steps, equations, params, own):
-    signals = [leaf for leaf in jax.tree.leaves(own, is_leaf=_is_signal) if _is_signal(leaf) and jax.tree.leaves(leaf)]
+    signals = [leaf for leaf in jax.tree.leaves(own, is_leaf=is_signal) if is_signal(leaf) and jax.tree.leaves(leaf)]
     obstacle = equations.rows or signals or jump_times(params, float) is not None
     if steps == "common" and obstacle:
         raise ValueError(
@@ -144,11 +144,7 @@ def _common(steps, equations, params, own):
     return steps != "own" and not obstacle
 
 
-def _is_signal(node):
-    return isinstance(node, Signal)
-
-
-def _filled(leaf, size):
+def filled_up(leaf, size):
     """With copies of the last member, to a multiple of a size."""
     return jnp.concatenate([leaf, jnp.repeat(leaf[-1:], -len(leaf) % size, axis=0)])
 
@@ -164,7 +160,7 @@ def _side_by_side(system, equations, how, own, shared, ts, tolerances):
     """Members in groups of those that share their steps."""
     members = jax.tree.leaves(own)[0].shape[0]
     size = min(members, ABREAST)
-    groups = jax.tree.map(lambda leaf: (x := _filled(leaf, size)).reshape(-1, size, *x.shape[1:]), own)
+    groups = jax.tree.map(lambda leaf: (x := filled_up(leaf, size)).reshape(-1, size, *x.shape[1:]), own)
     found = jax.lax.map(lambda own: _group(system, equations, how, own, shared, ts, tolerances), groups)
     return jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:])[:members], found)
 

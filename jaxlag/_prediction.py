@@ -18,6 +18,7 @@ from ._experiment import Experiment, is_within, start_entries
 from ._free import Free
 from ._integrate import simulate
 from ._manifold import consistent_state
+from ._many import filled_up
 from ._mechanics import constraint_rows, position_residual
 from ._results import RESULTS
 from ._system import System
@@ -108,11 +109,7 @@ def _spread(stack):
         return stack
     stack = dataclasses.replace(stack, mesh=Mesh(np.array(jax.devices()), "experiments"))
     along = NamedSharding(stack.mesh, ALONG)
-    return jax.tree.map(lambda x: jax.device_put(_filled_up(x, devices), along) if eqx.is_array(x) else x, stack)
-
-
-def _filled_up(x, devices):
-    return jnp.concatenate([x, jnp.repeat(x[-1:], -len(x) % devices, axis=0)])
+    return jax.tree.map(lambda x: jax.device_put(filled_up(x, devices), along) if eqx.is_array(x) else x, stack)
 
 
 def _ways(system, params, e):
@@ -232,7 +229,7 @@ def side_by_side(of_one: Callable[..., Any], stack: Stack, z: Any, *common: Any)
     if stack.mesh is None:
         return batch(arrays, z, numbers)
     batch = jax.shard_map(batch, mesh=stack.mesh, in_specs=(ALONG, ALONG, PartitionSpec()), out_specs=ALONG, check_vma=False)
-    return jax.tree.map(lambda x: x[: len(z)], batch(arrays, _filled_up(z, stack.mesh.size), numbers))
+    return jax.tree.map(lambda x: x[: len(z)], batch(arrays, filled_up(z, stack.mesh.size), numbers))
 
 
 class Linearised(NamedTuple):

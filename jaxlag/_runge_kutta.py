@@ -95,12 +95,38 @@ def combined(error, lower=None):
 
 
 class Dopri5(ExplicitRungeKutta):
-    """Dormand and Prince's scheme of order 5, dense output of order 4."""
+    r"""Dormand and Prince's scheme of order 5, with dense output of order 4.
+
+    $$ y_1 = y_0 + h \sum_i b_i f_i, \qquad f_i = f\Bigl(t_0 + c_i h,\; y_0 + h \sum_{j<i} a_{ij} f_j\Bigr) $$
+
+    For `simulate(solver=...)`, and for any `diffrax.diffeqsolve`; the state is any pytree. No arguments.
+
+    **Source:** Hairer, Nørsett & Wanner, Solving Ordinary Differential Equations I, table II.5.2 and section II.6.
+
+    ```python
+    import jaxlag as jl
+    fall = jl.System(lambda q, qdot: 0.5 * qdot**2 - 9.81 * q)
+    jl.simulate(fall, 0.0, 0.0, [0.0, 1.0], solver=jl.Dopri5()).q[-1]  # −9.81/2 = −4.905
+    ```
+    """
 
     tableau: ClassVar = DOPRI5
 
 
 class Dop853(ExplicitRungeKutta):
-    """Dormand and Prince's scheme of order 8 with errors of orders 5 and 3, dense output of order 7."""
+    r"""Dormand and Prince's scheme of order 8, its errors of orders 5 and 3, with dense output of order 7.
+
+    $$ y_1 = y_0 + h \sum_i b_i f_i, \qquad f_i = f\Bigl(t_0 + c_i h,\; y_0 + h \sum_{j<i} a_{ij} f_j\Bigr) $$
+
+    For `simulate(solver=...)`, and for any `diffrax.diffeqsolve`; the state is any pytree. No arguments.
+
+    **Source:** Hairer, Nørsett & Wanner, Solving Ordinary Differential Equations I, section II.10.
+
+    ```python
+    import jaxlag as jl
+    fall = jl.System(lambda q, qdot: 0.5 * qdot**2 - 9.81 * q)
+    jl.simulate(fall, 0.0, 0.0, [0.0, 1.0], solver=jl.Dop853()).q[-1]  # −9.81/2 = −4.905
+    ```
+    """
 
     tableau: ClassVar = DOP853

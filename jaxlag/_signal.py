@@ -101,22 +101,22 @@ def solved(params: PyTree) -> PyTree:
     """`params` with the u'' of its cubic signals, so that these are solved for once a motion and not once a step."""
 
     def with_bends(node):
-        if not (_is_signal(node) and node.kind == "cubic"):
+        if not (is_signal(node) and node.kind == "cubic"):
             return node
         return eqx.tree_at(lambda signal: signal.bends, node, _bends(node.ts, node.values), is_leaf=lambda x: x is None)
 
-    return jax.tree.map(with_bends, params, is_leaf=_is_signal)
+    return jax.tree.map(with_bends, params, is_leaf=is_signal)
 
 
 def jump_times(params: PyTree, dtype: Any) -> Float[Array, " jumps"] | None:
     """Where the held signals in `params` jump, not differentiated; None where there are no such signals."""
-    held = [leaf for leaf in jax.tree.leaves(params, is_leaf=_is_signal) if _is_signal(leaf) and leaf.kind == "hold"]
+    held = [leaf for leaf in jax.tree.leaves(params, is_leaf=is_signal) if is_signal(leaf) and leaf.kind == "hold"]
     return jax.lax.stop_gradient(jnp.concatenate([signal.ts[1:] for signal in held]).astype(dtype)) if held else None
 
 
 def delayed(params: PyTree, by: Float[Array, ""]) -> PyTree:
     """`params` with the held signals as they were a time ago."""
-    return jax.tree.map(lambda node: _Delayed(node, by) if _is_signal(node) and node.kind == "hold" else node, params, is_leaf=_is_signal)
+    return jax.tree.map(lambda node: _Delayed(node, by) if is_signal(node) and node.kind == "hold" else node, params, is_leaf=is_signal)
 
 
 class _Delayed(eqx.Module):
@@ -127,7 +127,8 @@ class _Delayed(eqx.Module):
         return self.signal(t - self.by)
 
 
-def _is_signal(node: Any) -> bool:
+def is_signal(node: Any) -> bool:
+    """Whether a node of a pytree is a `Signal`."""
     return isinstance(node, Signal)
 
 

@@ -129,11 +129,8 @@ def states_at(equations: Any, how: How, adjoint: dfx.AbstractAdjoint, t0, y0, ts
 
 
 def root_mean_square(x) -> Array:
-    """The norm of an error, of members abreast that of the worst. It is not differentiated, as the length of a step is not, and made
-    without a dot product, which would be a library's.
-    """
-    square = sum(row**2 for row in jax.lax.stop_gradient(x)) / len(x)
-    return jnp.sqrt(jnp.max(square))
+    """The norm of an error, of members abreast that of the worst; not differentiated, as the length of a step is not."""
+    return jnp.sqrt(jnp.max(jnp.mean(jax.lax.stop_gradient(x) ** 2, axis=0)))
 
 
 class Meter(dfx.TextProgressMeter):
