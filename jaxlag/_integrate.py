@@ -6,15 +6,16 @@ from typing import Any
 import diffrax as dfx
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 from jaxtyping import Array, PyTree
 
 from ._checks import checked, parameters, sample_times, state
 from ._friction import Regularised, StickSlip
 from ._manifold import Baumgarte, NoStabilisation, Projection
 from ._motion import Equations
-from ._sensitivities import differentiable
+from ._sensitivities import differentiable, pushed
 from ._signal import solved
-from ._solve import How, begun, judged, raise_failure, states_at, tolerances_of
+from ._solve import How, begun, can_be_varied, judged, raise_failure, states_at, states_varied, tolerances_of
 from ._system import System
 from ._trajectory import Rubbing, Stated, Trajectory
 
@@ -93,7 +94,7 @@ def _simulate(system, how, q0, qdot0, ts, params, tolerances):
     if how.adjoint is None:
         drift = lambda inputs, ts, ys: jax.vmap(lambda t, y: equations.rates(t, y, inputs[3:]))(ts, ys)
         forward, reverse = (functools.partial(solve, adjoint) for adjoint in (dfx.ForwardMode(), dfx.RecursiveCheckpointAdjoint()))
-        run = differentiable(forward, reverse, drift)
+        run = differentiable(forward, reverse, drift, functools.partial(_varied_motion, equations, how))
     else:
         run = functools.partial(solve, how.adjoint)
     ys, (result, stats) = run((t0, q, v, params, tolerances), ts)
@@ -116,3 +117,20 @@ def _motion(equations, how, adjoint, inputs, ts):
     ys, result, stats = states_at(equations, how, adjoint, t0, start.y, ts, (params, start.slack), tolerances)
     ys, result = judged(ys, result, start.obstacles, (inputs, ts))
     return ys, (result, stats | {"start_moved": start.moved})
+
+
+def _varied_motion(equations, how, moving, still, directions, ts):
+    """The same with derivatives along directions of what moves, by the variational equations where they hold."""
+    inputs = *_, params, tolerances = eqx.combine(moving, still)
+    if not can_be_varied(equations, how, moving[3], params):
+        return pushed(functools.partial(_motion, equations, how, dfx.ForwardMode()))(moving, still, directions, ts)
+
+    def started(moving):
+        t0, q, v, params, tolerances = eqx.combine(moving, still)
+        start = begun(equations, t0, q, v, solved(params), tolerances)
+        return (t0, start.y), start
+
+    found = states_varied(equations, how, started, moving, directions, ts, solved(params), directions[3], tolerances)
+    ys, change, result, stats, start = found
+    ys, result = judged(ys, result, start.obstacles, (inputs, ts))
+    return ys, jnp.where(jnp.isfinite(ys)[..., None], change, 0), (result, stats | {"start_moved": start.moved})

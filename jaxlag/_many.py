@@ -21,9 +21,9 @@ from ._integrate import simulate, trajectory_of
 from ._manifold import Baumgarte, NoStabilisation, Projection
 from ._motion import Equations
 from ._results import RESULTS
-from ._sensitivities import differentiable_abreast
+from ._sensitivities import differentiable_abreast, pushed
 from ._signal import is_signal, jump_times, solved
-from ._solve import How, begun, judged, raise_failure, states_at, tolerances_of
+from ._solve import How, begun, can_be_varied, judged, raise_failure, states_at, states_varied, tolerances_of
 from ._system import System, leaf_names
 from ._trajectory import Trajectory
 
@@ -167,7 +167,8 @@ def _side_by_side(system, equations, how, own, shared, ts, tolerances):
 
 def _group(system, equations, how, own, shared, ts, tolerances):
     """Members that share their steps."""
-    run = differentiable_abreast(functools.partial(_motions, equations, how), functools.partial(_drift, equations))
+    solve = functools.partial(_motions, equations, how)
+    run = differentiable_abreast(solve, functools.partial(_drift, equations), functools.partial(_varied_motions, equations, how))
     last = jax.tree.map(lambda leaf: jnp.moveaxis(leaf, 0, -1), own)
     ys, (result, stats, moved) = run(((ts[0], tolerances, shared), last), ts)
 
@@ -180,6 +181,28 @@ def _group(system, equations, how, own, shared, ts, tolerances):
 
 def _motions(equations, how, inputs, ts):
     """States at the samples, (T, size, members); and, not differentiated, why each motion ended, the counts, how far starts were off."""
+    (_, tolerances, shared), own = inputs
+    (t0, y0), start = _started(equations, inputs, ts)
+    args = (solved(shared["params"]), own["params"]), None
+    ys, result, stats = states_at(Abreast(equations), how, dfx.ForwardMode(), t0, y0, ts, args, tolerances)
+    return _judged(ys, result, stats, start)
+
+
+def _varied_motions(equations, how, moving, still, directions, ts):
+    """The same with derivatives along directions of what moves, by the variational equations where they hold."""
+    (_, tolerances, shared), own = eqx.combine(moving, still)
+    if not can_be_varied(equations, how, moving[0][2]["params"], shared["params"]):
+        return pushed(functools.partial(_motions, equations, how))(moving, still, directions, ts)
+    started = lambda moving: _started(equations, eqx.combine(moving, still), ts)
+    params, d_params = (solved(shared["params"]), own["params"]), (directions[0][2]["params"], directions[1]["params"])
+    found = states_varied(Abreast(equations), how, started, moving, directions, ts, params, d_params, tolerances)
+    ys, change, *rest = found
+    ys, aux = _judged(ys, *rest)
+    return ys, jnp.where(jnp.isfinite(ys)[..., None], change, 0), aux
+
+
+def _started(equations, inputs, ts):
+    """(t0, y0); and, not differentiated, how far starts were off and what is wrong with them."""
     (t0, tolerances, shared), own = inputs
     shared = shared | {"params": solved(shared["params"])}
 
@@ -187,11 +210,14 @@ def _motions(equations, how, inputs, ts):
         member = eqx.combine(own, shared)
         q, v = (ravel_pytree(member[name])[0] for name in ("q0", "qdot0"))
         found = begun(equations, t0, q, v, member["params"], tolerances)
-        return found.y, found.moved, judged(found.y, RESULTS.successful, found.obstacles, (member, ts))[1]
+        return found.y, (found.moved, judged(found.y, RESULTS.successful, found.obstacles, (member, ts))[1])
 
-    y0, moved, started = jax.vmap(start, in_axes=-1, out_axes=(-1, 0, 0))(own)
-    args = (shared["params"], own["params"]), None
-    ys, result, stats = states_at(Abreast(equations), how, dfx.ForwardMode(), t0, y0, ts, args, tolerances)
+    y0, start = jax.vmap(start, in_axes=-1, out_axes=(-1, 0))(own)
+    return (t0, y0), start
+
+
+def _judged(ys, result, stats, start):
+    moved, started = start
     result = jax.vmap(lambda started: RESULTS.where(started == RESULTS.successful, result, started))(started)
     return jnp.where((started == RESULTS.successful)[None, None] & jnp.isfinite(ys), ys, jnp.nan), (result, stats, moved)
 
@@ -216,6 +242,10 @@ class Abreast:
     @property
     def projection(self) -> Projection | None:
         return self.equations.projection
+
+    def error_norm(self, error):
+        """That of the worst."""
+        return jnp.max(self.equations.error_norm(error))
 
     def rates(self, t, y, args):
         return self._each(self.equations.rates, t, y, args)

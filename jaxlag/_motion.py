@@ -147,6 +147,10 @@ class Equations:
         """y, put back on the constraints."""
         return _kept(self, t, y, args[0])
 
+    def error_norm(self, error):
+        """The size of an error."""
+        return root_mean_square(error)
+
     def margins(self, t, y, args):
         """Per element of dry friction, how far its mode is from its end; negative beyond."""
         return _margins(self, t, y, args[0])
@@ -215,6 +219,11 @@ def _kept(equations: Equations, t, y, params):
     if kinks is not None:
         sigma = jax.lax.stop_gradient(redirected(kinks, sigma, kinks.slip(t, on_q, on_v)))
     return jnp.concatenate([on_q, on_v, works, sigma, *counts])
+
+
+def root_mean_square(x) -> Array:
+    """Of each column; not differentiated, as the length of a step is not."""
+    return jnp.sqrt(jnp.mean(jax.lax.stop_gradient(x) ** 2, axis=0))
 
 
 def slack_of(tolerances: tuple[Any, Any], v) -> Any:

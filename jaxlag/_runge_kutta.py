@@ -10,6 +10,8 @@ from jaxtyping import PyTree
 
 from ._tableaux import DOP853, DOPRI5, Tableau
 
+LARGE = 128  # entries, above which a product by a library is faster than a sum of the compiler's own
+
 
 class Polynomial(dfx.AbstractLocalInterpolation):
     """Dense output y₀ + s (F₁ + (1 − s) (F₂ + s (F₃ + (1 − s) (F₄ + …)))), s = (t − t₀)/(t₁ − t₀); k holds h ẏ₀, h ẏ₁, F₄, …
@@ -59,31 +61,45 @@ class ExplicitRungeKutta(dfx.AbstractAdaptiveSolver):
         scheme, h = self.tableau, terms.contr(t0, t1)
         if made_jump is not False:
             solver_state = jax.lax.cond(made_jump, lambda: terms.vf(t0, y0, args), lambda: solver_state)
-        changed = lambda weights, f: jax.tree.map(lambda f: terms.prod(weighted(weights, f), h), f)
+        changes = lambda weights, f: jax.tree.map(lambda f: terms.prod(weighted(weights, f), h), f)
 
         def stage(f, row):
             i, c, weights = row
             t = jnp.where(c == 1, t1, t0 + c * (t1 - t0))  # not rounded beyond t1, where an input may jump
-            new = terms.vf(t, jax.tree.map(jnp.add, y0, changed(weights, f)), args)
+            new = terms.vf(t, jax.tree.map(jnp.add, y0, changes(weights, f)), args)
             return jax.tree.map(lambda f, new: jax.lax.dynamic_update_index_in_dim(f, new, i, 0), f, new), None
 
-        # One loop, so that the equations are compiled once. All rows are as long as the last: what is not there yet counts as nothing.
+        # One loop, so that the equations are compiled once. What is not there yet counts as nothing.
         size, dtype = len(scheme.c), jnp.result_type(*jax.tree.leaves(y0))
-        rows = [[*row, *[0.0] * (size - len(row))] for row in scheme.a]
         first = jax.tree.map(lambda x: jnp.concatenate([x[None], jnp.zeros((size - 1, *x.shape), x.dtype)]), solver_state)
-        f, _ = jax.lax.scan(stage, first, (np.arange(1, size), np.array(scheme.c[1:], dtype), np.array(rows, dtype)))
+        rows = np.arange(1, size), np.array(scheme.c[1:], dtype), filled_up(scheme.a, size, dtype)
+        f, _ = jax.lax.scan(stage, first, rows)
 
-        y1 = jax.tree.map(jnp.add, y0, changed(scheme.a[scheme.stages - 2], f))
-        error = jax.tree.map(combined, *(changed(row, f) for row in scheme.errors))
-        last = jax.tree.map(lambda f: f[scheme.stages - 1], f)
-        ends = [terms.prod(of_end, h) for of_end in (solver_state, last)]
-        series = jax.tree.map(lambda *terms: jnp.stack(terms), *ends, *(changed(row, f) for row in scheme.dense))
-        return y1, error, {"y0": y0, "y1": y1, "k": series}, last, dfx.RESULTS.successful
+        last = scheme.stages - 1
+        ends, estimates = np.eye(size)[[0, last]], len(scheme.errors)
+        every = changes(filled_up([*scheme.errors, scheme.a[last - 1], *ends, *scheme.dense], size, dtype), f)
+        error = jax.tree.map(lambda every: combined(*every[:estimates]), every)
+        y1 = jax.tree.map(lambda y0, every: y0 + every[estimates], y0, every)
+        series = jax.tree.map(lambda every: every[estimates + 1 :], every)
+        return y1, error, {"y0": y0, "y1": y1, "k": series}, jax.tree.map(lambda f: f[last], f), dfx.RESULTS.successful
+
+
+def is_explicit(solver: dfx.AbstractSolver) -> bool:
+    """Whether a solver solves no equations for its stages."""
+    return isinstance(solver, (ExplicitRungeKutta, dfx.AbstractERK))
+
+
+def filled_up(rows, size, dtype) -> np.ndarray:
+    """Rows of weights, all as long as the longest."""
+    return np.array([[*row, *[0.0] * (size - len(row))] for row in rows], dtype)
 
 
 def weighted(weights, f):
-    """Σ wᵢ fᵢ; written as a sum, because a product of arrays would be a call of a library."""
-    return sum(w * f[i] for i, w in enumerate(weights) if not (isinstance(w, float) and w == 0))
+    """Σ wᵢ fᵢ, for one row of weights or several."""
+    if f[0].size > LARGE:
+        return jnp.tensordot(weights, f, 1, precision=jax.lax.Precision.HIGHEST)
+    terms = jnp.expand_dims(weights, range(-f.ndim + 1, 0)) * f
+    return jnp.sum(terms, axis=-f.ndim)
 
 
 def combined(error, lower=None):

@@ -1,7 +1,6 @@
 """Derivatives of a whole motion: one rule that serves forward and reverse mode, to any order."""
 
 from collections.abc import Callable
-from typing import Any
 
 import equinox as eqx
 import jax
@@ -9,12 +8,14 @@ import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
 
+from ._variations import along
+
 # Up to this many perturbed numbers the Jacobian comes whole out of one vectorised forward pass; beyond it a tangent is
 # pushed forward, or a cotangent pulled back, alone. Where the two cross: tests/benchmarks/bench_gradient.py.
 FORWARD_LIMIT = 48
 
 
-def differentiable(solve: Callable[..., Any], pull_back: Callable[..., Any], drift: Callable[..., Any]) -> Callable[..., Any]:
+def differentiable(solve: Callable, pull_back: Callable, drift: Callable, push: Callable | None = None) -> Callable:
     """`solve(inputs, ts) -> (y, aux)` with a derivative rule that needs no setting and no choice of mode.
 
     The rule's tangent is J dx, with the Jacobian J from the same pass as the value: linear in dx, so that it can be
@@ -24,7 +25,9 @@ def differentiable(solve: Callable[..., Any], pull_back: Callable[..., Any], dri
     - `solve`: has forward-mode derivatives in `inputs`, a pytree. `aux` is not differentiated.
     - `pull_back`: the same function with reverse-mode derivatives, for many inputs.
     - `drift(inputs, ts, y)`: dy/dts, each sample to its own time.
+    - `push(moving, still, directions, ts)`: y, its derivatives along directions of what moves, and aux; by default what `solve` gives.
     """
+    push = push or pushed(solve)
 
     @eqx.filter_custom_jvp
     def motion(inputs, ts):
@@ -43,7 +46,7 @@ def differentiable(solve: Callable[..., Any], pull_back: Callable[..., Any], dri
         if x.size == 0:
             y, aux = motion(inputs, ts)
         elif x.size <= FORWARD_LIMIT:
-            (y, J), aux = differentiable(*_with_jacobian(*at_x))((x, still), ts)
+            (y, J), aux = differentiable(*_with_jacobian(push, pushed(pull_back), at_x[2], unravel))((x, still), ts)
             change = jax.tree.map(lambda rows: rows @ dx, J)
         else:
             y, aux = motion(inputs, ts)
@@ -56,7 +59,7 @@ def differentiable(solve: Callable[..., Any], pull_back: Callable[..., Any], dri
     return motion
 
 
-def differentiable_abreast(solve: Callable[..., Any], drift: Callable[..., Any]) -> Callable[..., Any]:
+def differentiable_abreast(solve: Callable, drift: Callable, push: Callable) -> Callable:
     """The same for members side by side that do not touch one another: `solve((common, own), ts) -> (y, aux)`.
 
     Leaves of `own`, and y, have the members as their last axis: one pass along e perturbs that number of every member, and gives each
@@ -74,24 +77,23 @@ def differentiable_abreast(solve: Callable[..., Any], drift: Callable[..., Any])
         x, unravel = ravel_pytree(moving[0])
         flat, structure = jax.tree.flatten(moving[1])
         sizes = [leaf[..., 0].size for leaf in flat]
-
-        def of_rows(x, rows):
-            own = [part.reshape(leaf.shape) for part, leaf in zip(jnp.split(rows, np.cumsum(sizes)[:-1]), flat, strict=True)]
-            return solve(eqx.combine((unravel(x), jax.tree.unflatten(structure, own)), still), ts)
-
         members = jax.tree.leaves(inputs[1])[0].shape[-1]
+
+        def direction(e):
+            of_own = zip(jnp.split(e[x.size :], np.cumsum(sizes)[:-1]), flat, strict=True)
+            own = [jnp.broadcast_to(part.reshape(*leaf.shape[:-1], 1), leaf.shape).astype(leaf.dtype) for part, leaf in of_own]
+            return unravel(e[: x.size].astype(x.dtype)), jax.tree.unflatten(structure, own)
+
         joined = lambda leaves: jnp.concatenate([jnp.zeros((0, members), ts.dtype), *(leaf.reshape(-1, members) for leaf in leaves)])
-        rows, count = joined(flat), x.size + sum(sizes)
+        count = x.size + sum(sizes)
         change = None
         if count == 0:
             y, aux = motions(inputs, ts)
         else:
-            along = lambda e: jax.jvp(
-                of_rows, (x, rows), (e[: x.size].astype(x.dtype), jnp.broadcast_to(e[x.size :, None], rows.shape)), has_aux=True
-            )
-            y, J, aux = jax.vmap(along, out_axes=(None, 0, None))(jnp.eye(count, dtype=ts.dtype))
+            directions = jax.vmap(direction, out_axes=-1)(jnp.eye(count, dtype=ts.dtype))
+            y, J, aux = push(moving, still, directions, ts)
             dx = jnp.broadcast_to(ravel_pytree(d_inputs[0])[0][:, None], (x.size, members))
-            change = jnp.einsum("p...m,pm->...m", J, jnp.concatenate([dx, joined(jax.tree.leaves(d_inputs[1]))]))
+            change = jnp.einsum("...mp,pm->...m", J, jnp.concatenate([dx, joined(jax.tree.leaves(d_inputs[1]))]))
         if d_ts is not None:
             shift = drift(inputs, ts, y) * d_ts[:, None, None]
             change = shift if change is None else change + shift
@@ -100,25 +102,33 @@ def differentiable_abreast(solve: Callable[..., Any], drift: Callable[..., Any])
     return motions
 
 
-def _with_jacobian(solve, pull_back, drift):
+def pushed(solve: Callable) -> Callable:
+    """How `solve` itself differentiates forward: y, its derivatives along directions, which come last in their leaves, and aux."""
+
+    def push(moving, still, directions, ts):
+        return along(lambda moving: solve(eqx.combine(moving, still), ts), moving, directions)
+
+    return push
+
+
+def _with_jacobian(push, push_back, drift, unravel):
     """The three functions of `differentiable` for (y, ∂y/∂x) in place of y, where inputs = (x, still)."""
 
-    def both(f):
+    def both(push):
         def value_and_jacobian(inputs, ts):
             x, still = inputs
-            along = lambda e: jax.jvp(lambda x: f((x, still), ts), (x,), (e,), has_aux=True)
-            y, J, aux = jax.vmap(along, out_axes=(None, -1, None))(jnp.eye(x.size, dtype=x.dtype))
+            y, J, aux = push(unravel(x), still, jax.vmap(unravel, out_axes=-1)(jnp.eye(x.size, dtype=x.dtype)), ts)
             return (y, J), aux
 
         return value_and_jacobian
 
     def drift_of_both(inputs, ts, y_and_J):
         (x, still), (y, J) = inputs, y_and_J
-        along = lambda e, column: jax.jvp(lambda x, y: drift((x, still), ts, y), (x, y), (e, column))
-        return jax.vmap(along, in_axes=(0, -1), out_axes=(None, -1))(jnp.eye(x.size, dtype=x.dtype), J)
+        rate, change, _ = along(lambda both: (drift((both[0], still), ts, both[1]), None), (x, y), (jnp.eye(x.size, dtype=x.dtype), J))
+        return rate, change
 
     # A Jacobian of more columns than FORWARD_LIMIT never comes here, and solve has forward mode: it serves as both.
-    return both(solve), both(pull_back), drift_of_both
+    return both(push), both(push_back), drift_of_both
 
 
 def _jacobian_product(solve, pull_back, inputs, ts, y, dx):

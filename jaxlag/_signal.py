@@ -114,6 +114,12 @@ def jump_times(params: PyTree, dtype: Any) -> Float[Array, " jumps"] | None:
     return jax.lax.stop_gradient(jnp.concatenate([signal.ts[1:] for signal in held]).astype(dtype)) if held else None
 
 
+def moves_smoothly(moving: PyTree, still: PyTree) -> bool:
+    """Whether no signal moves, and none that stands still jumps."""
+    signals = [leaf for leaf in jax.tree.leaves(moving, is_leaf=is_signal) if is_signal(leaf)]
+    return not jax.tree.leaves(signals) and jump_times(still, float) is None
+
+
 def delayed(params: PyTree, by: Float[Array, ""]) -> PyTree:
     """`params` with the held signals as they were a time ago."""
     return jax.tree.map(lambda node: _Delayed(node, by) if is_signal(node) and node.kind == "hold" else node, params, is_leaf=is_signal)

@@ -16,10 +16,11 @@ from ._manifold import nearest_state
 from ._motion import Equations, slack_of
 from ._progress import Bar
 from ._results import OF_THE_INPUT, RESULTS, reason_of
-from ._runge_kutta import Dop853
-from ._signal import jump_times
+from ._runge_kutta import Dop853, is_explicit
+from ._signal import jump_times, moves_smoothly
 from ._steps import AtSamples, Kept, Resuming, StickSlipSolver, behind_a_jump
 from ._trajectory import Trajectory
+from ._variations import Varied, along, beside
 
 
 class How(eqx.Module):
@@ -94,10 +95,10 @@ def states_at(equations: Any, how: How, adjoint: dfx.AbstractAdjoint, t0, y0, ts
     """States at the samples, by diffrax, and the reason it stopped."""
     rtol, atol = tolerances
     rounding = jnp.finfo(y0.dtype).eps * jnp.maximum(jnp.abs(ts[0]), jnp.abs(ts[-1]))
-    controller = dfx.PIDController(rtol, atol, dtmin=4 * rounding, force_dtmin=False, norm=root_mean_square)
+    controller = dfx.PIDController(rtol, atol, dtmin=4 * rounding, force_dtmin=False, norm=equations.error_norm)
     end, jumps, behind = ts[-1], jump_times(args[0], ts.dtype), None
     if jumps is not None:
-        controller = dfx.ClipStepSizeController(Resuming(rtol, atol, smallest=4 * rounding, norm=root_mean_square), jump_ts=jumps)
+        controller = dfx.ClipStepSizeController(Resuming(rtol, atol, smallest=4 * rounding, norm=equations.error_norm), jump_ts=jumps)
         end = end + 256 * rounding  # a jump at the last sample is stepped on too: diffrax rounds what is within 100 ulp of the end
         behind = functools.partial(behind_a_jump, equations)
     kept = equations.kept if equations.projection else None
@@ -128,9 +129,18 @@ def states_at(equations: Any, how: How, adjoint: dfx.AbstractAdjoint, t0, y0, ts
     return ys, RESULTS.where(result == RESULTS.max_steps_rejected, RESULTS.chattering, result), stats
 
 
-def root_mean_square(x) -> Array:
-    """The norm of an error, of members abreast that of the worst; not differentiated, as the length of a step is not."""
-    return jnp.sqrt(jnp.max(jnp.mean(jax.lax.stop_gradient(x) ** 2, axis=0)))
+def states_varied(equations: Any, how: How, started, moving, directions, ts, params, d_params, tolerances):
+    """The same with derivatives along directions of what moves, by the variational equations; `started(moving) -> ((t0, y0), aux)`."""
+    (t0, y0), (dt0, dy0), aux = along(started, moving, directions)
+    dy0 = dy0 - equations.rates(t0, y0, (params, None))[..., None] * dt0  # a start that is later by dt0 lies that far back at t0
+    y0, args = beside(y0, dy0), (params, d_params)
+    ys, result, stats = states_at(Varied(equations), how, dfx.ForwardMode(), t0, y0, ts, args, tolerances)
+    return ys[..., 0], ys[..., 1:], result, stats, aux
+
+
+def can_be_varied(equations: Any, how: How, moving_params, params) -> bool:
+    """Whether differentiating the motion comes to the variational equations: no mode, jump or solution of equations within a step."""
+    return not equations.rows and is_explicit(how.solver) and moves_smoothly(moving_params, params)
 
 
 class Meter(dfx.TextProgressMeter):

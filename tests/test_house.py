@@ -36,6 +36,7 @@ ORDER = [
     "_trajectory",
     "_canvas",
     "_plot_motion",
+    "_variations",
     "_sensitivities",
     "_tableaux",
     "_runge_kutta",
