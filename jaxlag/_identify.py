@@ -15,7 +15,7 @@ from ._fit import Fit
 from ._free import Free
 from ._least_squares import INTERRUPTED, MAX_STEPS, Iterate, Outcome, levenberg_marquardt
 from ._prediction import Huber, Model
-from ._problem import Problem, check_observations, failure_of, linearise, linearise_each, linearise_starts, look
+from ._problem import Problem, failure_of, linearise, linearise_each, linearise_starts, look
 from ._progress import Steps
 from ._regress import regress
 from ._report import report, robust_scale
@@ -180,7 +180,6 @@ def _stated(system, experiments, params, free, bounds, priors, loss, relative, n
     problem = Problem.of(Model(system, tuple(sorted(numerics.items())), loss), named, experiments)
     if problem.size == 0:
         raise ValueError("`free` must name at least one entry of params, but is empty. Say which parameters to identify.")
-    check_observations(problem, experiments)
     known = int(np.sum(np.isfinite(named.spread)))
     most = min(map(_measurements, experiments)) if apart else sum(map(_measurements, experiments))
     unknown = named.size + problem.stacks[0].unknowns if apart else problem.size

@@ -121,16 +121,16 @@ def _motion(equations, how, adjoint, inputs, ts):
 
 def _varied_motion(equations, how, moving, still, directions, ts):
     """The same with derivatives along directions of what moves, by the variational equations where they hold."""
-    inputs = *_, params, tolerances = eqx.combine(moving, still)
+    inputs = t0, *_, params, tolerances = eqx.combine(moving, still)
     if not can_be_varied(equations, how, moving[3], params):
         return pushed(functools.partial(_motion, equations, how, dfx.ForwardMode()))(moving, still, directions, ts)
 
     def started(moving):
         t0, q, v, params, tolerances = eqx.combine(moving, still)
         start = begun(equations, t0, q, v, solved(params), tolerances)
-        return (t0, start.y), start
+        return start.y, start
 
-    found = states_varied(equations, how, started, moving, directions, ts, solved(params), directions[3], tolerances)
-    ys, change, result, stats, start = found
+    along_all = moving, directions, t0, directions[0], ts, (solved(params), directions[3])
+    ys, change, result, stats, start = states_varied(equations, how, started, *along_all, tolerances)
     ys, result = judged(ys, result, start.obstacles, (inputs, ts))
     return ys, jnp.where(jnp.isfinite(ys)[..., None], change, 0), (result, stats | {"start_moved": start.moved})

@@ -181,8 +181,8 @@ def _group(system, equations, how, own, shared, ts, tolerances):
 
 def _motions(equations, how, inputs, ts):
     """States at the samples, (T, size, members); and, not differentiated, why each motion ended, the counts, how far starts were off."""
-    (_, tolerances, shared), own = inputs
-    (t0, y0), start = _started(equations, inputs, ts)
+    (t0, tolerances, shared), own = inputs
+    y0, start = _started(equations, inputs, ts)
     args = (solved(shared["params"]), own["params"]), None
     ys, result, stats = states_at(Abreast(equations), how, dfx.ForwardMode(), t0, y0, ts, args, tolerances)
     return _judged(ys, result, stats, start)
@@ -190,19 +190,19 @@ def _motions(equations, how, inputs, ts):
 
 def _varied_motions(equations, how, moving, still, directions, ts):
     """The same with derivatives along directions of what moves, by the variational equations where they hold."""
-    (_, tolerances, shared), own = eqx.combine(moving, still)
+    (t0, tolerances, shared), own = eqx.combine(moving, still)
     if not can_be_varied(equations, how, moving[0][2]["params"], shared["params"]):
         return pushed(functools.partial(_motions, equations, how))(moving, still, directions, ts)
     started = lambda moving: _started(equations, eqx.combine(moving, still), ts)
-    params, d_params = (solved(shared["params"]), own["params"]), (directions[0][2]["params"], directions[1]["params"])
-    found = states_varied(Abreast(equations), how, started, moving, directions, ts, params, d_params, tolerances)
-    ys, change, *rest = found
+    args = (solved(shared["params"]), own["params"]), (directions[0][2]["params"], directions[1]["params"])
+    along_all = moving, directions, t0, directions[0][0], ts, args
+    ys, change, *rest = states_varied(Abreast(equations), how, started, *along_all, tolerances)
     ys, aux = _judged(ys, *rest)
     return ys, jnp.where(jnp.isfinite(ys)[..., None], change, 0), aux
 
 
 def _started(equations, inputs, ts):
-    """(t0, y0); and, not differentiated, how far starts were off and what is wrong with them."""
+    """y0; and, not differentiated, how far starts were off and what is wrong with them."""
     (t0, tolerances, shared), own = inputs
     shared = shared | {"params": solved(shared["params"])}
 
@@ -213,7 +213,7 @@ def _started(equations, inputs, ts):
         return found.y, (found.moved, judged(found.y, RESULTS.successful, found.obstacles, (member, ts))[1])
 
     y0, start = jax.vmap(start, in_axes=-1, out_axes=(-1, 0))(own)
-    return (t0, y0), start
+    return y0, start
 
 
 def _judged(ys, result, stats, start):

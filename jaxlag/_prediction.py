@@ -202,6 +202,7 @@ class Member(NamedTuple):
 def member(model: Model, free: Free, e: Stack, y, z, scale=1.0) -> Member:
     """The residuals of one experiment as a function of the variables y of the free parameters and z of its own unknowns."""
     channels, motion = model.predicted(free.insert(free.theta(y)), e, z)
+    _check(e, channels)
 
     def weighted(p, v, s):
         there = jnp.isfinite(v)
@@ -211,6 +212,22 @@ def member(model: Model, free: Free, e: Stack, y, z, scale=1.0) -> Member:
     r = ravel_pytree(jax.tree.map(weighted, channels, e.values, e.sigma))[0]
     ends = ravel_pytree([jax.tree.map(lambda x, i=i: x[i], (motion.q, motion.qdot)) for i in (0, -1)])[0]
     return Member(jnp.where(motion.succeeded, r, jnp.inf), ends, channels, motion.result)
+
+
+def _check(e, channels):
+    """Refuses an `observe` that does not see what was measured; shapes only, while it is traced."""
+    of = f"`observe` of experiment {e.members[0]}"
+    if jax.tree.structure(channels) != jax.tree.structure(e.values):
+        raise ValueError(
+            f"{of} must return what `values` holds, {jax.tree.structure(e.values)}, but returns {jax.tree.structure(channels)}. "
+            "Give both the same names."
+        )
+    for (path, seen), v in zip(jax.tree_util.tree_flatten_with_path(channels)[0], jax.tree.leaves(e.values), strict=True):
+        if seen.shape != v.shape or not jnp.issubdtype(seen.dtype, jnp.floating):
+            raise ValueError(
+                f"{of} must return real numbers of shape {v.shape[1:]} for `values{jax.tree_util.keystr(path)}`, "
+                f"but returns shape {seen.shape[1:]} and dtype {seen.dtype}. Compare what was measured with what is seen."
+            )
 
 
 def members(model: Model, free: Free, stack: Stack, y, z, scale=1.0) -> Member:

@@ -164,25 +164,6 @@ def _linearise_each(problem, xs):
     return side_by_side(alone, stack, xs, dataclasses.replace(problem, stacks=()))
 
 
-def check_observations(problem: Problem, experiments: Sequence[Experiment]) -> None:
-    """Refuses an `observe` that does not see what was measured. Shapes only."""
-    for stack in problem.stacks:
-        one = jax.tree.map(lambda x: x[0] if eqx.is_array(x) else x, stack)
-        seen = eqx.filter_eval_shape(lambda e: problem.model.predicted(problem.free.params, e, jnp.zeros(stack.unknowns))[0], one)  # noqa: B023
-        of = f" of experiment {stack.members[0]}" if len(experiments) > 1 else ""
-        if jax.tree.structure(seen) != jax.tree.structure(stack.values):  # type: ignore[operator]
-            raise ValueError(
-                f"`observe`{of} must return what `values` holds, {jax.tree.structure(stack.values)}, but returns "
-                f"{jax.tree.structure(seen)}. Give both the same names."
-            )
-        for (path, s), v in zip(jax.tree_util.tree_flatten_with_path(seen)[0], jax.tree.leaves(stack.values), strict=True):
-            if s.shape != v.shape[1:] or not jnp.issubdtype(s.dtype, jnp.floating):
-                raise ValueError(
-                    f"`observe`{of} must return real numbers of shape {v.shape[2:]} for `values{jax.tree_util.keystr(path)}`, "
-                    f"but returns shape {s.shape[1:]} and dtype {s.dtype}. Compare what was measured with what is seen."
-                )
-
-
 def blank(model: Model, free: Free, experiment: Experiment) -> Experiment:
     """The experiment with zeros measured by sensors of unit noise: its residuals are what its sensors see."""
     bare = eqx.tree_at(lambda e: (e.values, e.sigma), experiment, (None, None), is_leaf=lambda x: x is None)

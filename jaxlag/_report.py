@@ -35,7 +35,7 @@ def report(problem: Problem, experiments: Sequence[Experiment], outcome: Outcome
     """The answer that an outcome of the iteration means."""
     x, rows, free = np.asarray(outcome.best.y), outcome.best.rest, problem.free
     p, y = free.size, jnp.asarray(outcome.best.y[: free.size])
-    theta, slope = np.asarray(free.theta(y)), np.asarray(free.slope(y))
+    theta, slope = map(np.asarray, _theta_and_slope(free, y))
     weighted = np.concatenate([np.ravel(r) for r in _weighted(problem, rows)])
     there = np.isfinite(weighted)
     count, absolute = int(there.sum()), all(e.sigma is not None for e in experiments)
@@ -95,6 +95,11 @@ def report(problem: Problem, experiments: Sequence[Experiment], outcome: Outcome
         x=x,
         x_covariance=known.covariance,
     )
+
+
+@eqx.filter_jit
+def _theta_and_slope(free, y):
+    return free.theta(y), free.slope(y)
 
 
 UNEXPLAINED = 3.0  # residuals of so many times the noise are none

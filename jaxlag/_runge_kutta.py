@@ -96,10 +96,10 @@ def filled_up(rows, size, dtype) -> np.ndarray:
 
 def weighted(weights, f):
     """Σ wᵢ fᵢ, for one row of weights or several."""
-    if f[0].size > LARGE:
+    if f.size > LARGE * len(f):
         return jnp.tensordot(weights, f, 1, precision=jax.lax.Precision.HIGHEST)
-    terms = jnp.expand_dims(weights, range(-f.ndim + 1, 0)) * f
-    return jnp.sum(terms, axis=-f.ndim)
+    weights = weights.reshape(*weights.shape, *[1] * (f.ndim - 1))
+    return jnp.sum(weights * f.reshape(*[1] * (weights.ndim - f.ndim), *f.shape), axis=weights.ndim - f.ndim)
 
 
 def combined(error, lower=None):

@@ -129,12 +129,15 @@ def states_at(equations: Any, how: How, adjoint: dfx.AbstractAdjoint, t0, y0, ts
     return ys, RESULTS.where(result == RESULTS.max_steps_rejected, RESULTS.chattering, result), stats
 
 
-def states_varied(equations: Any, how: How, started, moving, directions, ts, params, d_params, tolerances):
-    """The same with derivatives along directions of what moves, by the variational equations; `started(moving) -> ((t0, y0), aux)`."""
-    (t0, y0), (dt0, dy0), aux = along(started, moving, directions)
-    dy0 = dy0 - equations.rates(t0, y0, (params, None))[..., None] * dt0  # a start that is later by dt0 lies that far back at t0
-    y0, args = beside(y0, dy0), (params, d_params)
-    ys, result, stats = states_at(Varied(equations), how, dfx.ForwardMode(), t0, y0, ts, args, tolerances)
+def states_varied(equations: Any, how: How, started, moving, directions, t0, dt0, ts, args, tolerances):
+    """The same with derivatives along directions of what moves, by the variational equations; `started(moving) -> (y0, aux)`.
+
+    `args` are (params, δparams), and δt0 is None where it stands still.
+    """
+    y0, dy0, aux = along(started, moving, directions)
+    if dt0 is not None:  # a start that is later lies further back at t0
+        dy0 = dy0 - jnp.multiply.outer(equations.rates(t0, y0, (args[0], None)), dt0)
+    ys, result, stats = states_at(Varied(equations), how, dfx.ForwardMode(), t0, beside(y0, dy0), ts, args, tolerances)
     return ys[..., 0], ys[..., 1:], result, stats, aux
 
 

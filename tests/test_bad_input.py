@@ -122,9 +122,9 @@ FITS = {
     "unknown free name": ({}, {"free": ("k",)}, "`free` must name entries of params, but holds 'k'. There are c"),
     "nothing free": ({}, {"free": ()}, "`free` must name at least one entry"),
     "free as text": ({}, {"free": "c"}, "`free` must be a list of names, but is the string 'c'"),
-    "observe of a wrong structure": ({"observe": lambda q: {"y": q}}, {"free": ("c",)}, "`observe` must return what `values` holds"),
-    "observe of a wrong shape": ({"observe": lambda q: jnp.stack([q, q])}, {"free": ("c",)}, r"`observe` must return real numbers of shape \(\)"),
-    "observe of a wrong kind": ({"observe": lambda q: q > 0}, {"free": ("c",)}, "`observe` must return real numbers.*dtype bool"),
+    "observe of a wrong structure": ({"observe": lambda q: {"y": q}}, {"free": ("c",)}, "`observe` of experiment 0 must return what `values` holds"),
+    "observe of a wrong shape": ({"observe": lambda q: jnp.stack([q, q])}, {"free": ("c",)}, r"`observe` of experiment 0 must return real numbers of shape \(\)"),
+    "observe of a wrong kind": ({"observe": lambda q: q > 0}, {"free": ("c",)}, "`observe` of experiment 0 must return real numbers.*dtype bool"),
     "observe that names nothing there is": ({"observe": lambda x: x}, {"free": ("c",)}, "`observe` must name arguments that exist, but it names 'x'"),
 }  # fmt: skip
 

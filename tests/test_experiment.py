@@ -83,7 +83,10 @@ BAD_FITS = {
     "a plan": (lambda: fit(experiments=jl.Experiment(T, None, 1.0, 0.0)), "must have been measured, but number 0 has no values"),
     "params that are no mapping": (lambda: fit(params=[1.0]), "params"),
     "an integer to be fitted": (lambda: fit(params=osc.START | {"c": np.array(3)}), "must name real numbers, but 'c' holds none"),
-    "sensors that see something else": (lambda: fit(observe=lambda q: {"y": q}), "`observe` must return what `values` holds"),
+    "sensors that see something else": (
+        lambda: fit(observe=lambda q: {"y": q}),
+        "`observe` of experiment 0 must return what `values` holds",
+    ),
     "sensors of another shape": (lambda: fit(observe=lambda q: {"x": q * np.ones(2)}), "must return real numbers of shape ()"),
 }
 
