@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
 
-from ._variations import along
+from ._variations import along, parted
 
 # Up to this many perturbed numbers the Jacobian comes whole out of one vectorised forward pass; beyond it a tangent is
 # pushed forward, or a cotangent pulled back, alone. Where the two cross: tests/benchmarks/bench_gradient.py.
@@ -36,8 +36,7 @@ def differentiable(solve: Callable, pull_back: Callable, drift: Callable, push: 
     @motion.def_jvp
     def rule(primals, tangents):
         (inputs, ts), (d_inputs, d_ts) = primals, tangents
-        perturbed = jax.tree.map(lambda d: d is not None, d_inputs, is_leaf=lambda d: d is None)
-        moving, still = eqx.partition(inputs, perturbed)
+        moving, still = parted(inputs, d_inputs)
         x, unravel = ravel_pytree(moving)
         dx = ravel_pytree(d_inputs)[0]
         of_x = lambda f: lambda x_and_still, *rest: f(eqx.combine(unravel(x_and_still[0]), x_and_still[1]), *rest)
@@ -73,7 +72,7 @@ def differentiable_abreast(solve: Callable, drift: Callable, push: Callable) -> 
     @motions.def_jvp
     def rule(primals, tangents):
         (inputs, ts), (d_inputs, d_ts) = primals, tangents
-        moving, still = eqx.partition(inputs, jax.tree.map(lambda d: d is not None, d_inputs, is_leaf=lambda d: d is None))
+        moving, still = parted(inputs, d_inputs)
         x, unravel = ravel_pytree(moving[0])
         flat, structure = jax.tree.flatten(moving[1])
         sizes = [leaf[..., 0].size for leaf in flat]

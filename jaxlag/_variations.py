@@ -22,6 +22,11 @@ def along(function: Callable, x: Any, directions: Any) -> tuple[Any, Any, Any]:
     return jax.vmap(one, in_axes=-1, out_axes=(None, -1, None))(directions)
 
 
+def parted(x: Any, dx: Any) -> tuple[Any, Any]:
+    """What moves of x, and what stands still, whose dx is None."""
+    return eqx.partition(x, jax.tree.map(lambda d: d is not None, dx, is_leaf=lambda d: d is None))
+
+
 def beside(y: Array, dy: Array) -> Array:
     """y and its variations, as one array with the variations last."""
     return jnp.concatenate([y[..., None], dy], axis=-1)
@@ -54,7 +59,7 @@ class Varied:
 
     def _varied(self, function, t, y, args):
         params, d_params = args
-        moving, still = eqx.partition(params, jax.tree.map(lambda d: d is not None, d_params, is_leaf=lambda d: d is None))
+        moving, still = parted(params, d_params)
         of_both = lambda both: (function(t, both[0], (eqx.combine(both[1], still), None)), None)
         value, change, _ = along(of_both, (y[..., 0], moving), (y[..., 1:], d_params))
         return beside(value, change)

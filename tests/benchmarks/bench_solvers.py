@@ -1,6 +1,6 @@
 """Work and precision: the time of a motion against its error, by the solvers one would choose, at tolerances from 1e-4 to 1e-12.
 
-The lecture's vehicle over 20 s against its exact solution. Draws work_precision.png beside this file.
+The lecture's vehicle over 20 s against its exact solution. Draws notebooks/work_precision.png.
 Run: python tests/benchmarks/bench_solvers.py
 """
 
@@ -57,7 +57,7 @@ def main():
     ax.invert_xaxis()
     ax.set(xlabel="largest error of a coordinate (m, rad)", ylabel="time of a motion (ms)")
     ax.legend(frameon=False)
-    figure.savefig(Path(__file__).with_name("work_precision.png"), dpi=110)
+    figure.savefig(Path(__file__).parents[2] / "notebooks" / "work_precision.png", dpi=110)
 
 
 if __name__ == "__main__":
