@@ -107,12 +107,23 @@ def pseudo_inverse(S: Float[Array, "m m"]) -> Float[Array, "m m"]:
         return jnp.where(S > 0, 1 / jnp.where(S > 0, S, 1), 0)
     size = jnp.diagonal(S)
     D = jnp.where(size > 0, jax.lax.rsqrt(jnp.where(size > 0, size, 1)), 1)
-    values, U = jnp.linalg.eigh(S * jnp.outer(D, D))
-    kept = values > jnp.finfo(S.dtype).eps ** 0.625 * values[-1]
+    scaled = S * jnp.outer(D, D)
+    # Where no row is redundant, by Cholesky's factor: of the eigenvalues the least is at least 1/|L⁻¹|², the largest at most m.
+    root = jax.scipy.linalg.solve_triangular(jnp.linalg.cholesky(scaled), jnp.eye(m, dtype=S.dtype), lower=True)
+    regular = 1 / jnp.sum(root**2) > jnp.finfo(S.dtype).eps ** 0.625 * m
+    inverse = root.T @ root * jnp.outer(D, D)
+    return jax.lax.cond(regular, lambda: inverse, lambda: _by_eigenvalues(scaled, D))
+
+
+def _by_eigenvalues(scaled, D):
+    """(D⁻¹ A D⁻¹)⁺ with what counts as zero of A taken out."""
+    values, U = jnp.linalg.eigh(scaled)
+    kept = values > jnp.finfo(scaled.dtype).eps ** 0.625 * values[-1]
     inverse = U @ (jnp.where(kept, 1 / jnp.where(kept, values, 1), 0)[:, None] * U.T) * jnp.outer(D, D)
     # Least norm in the units given: take out of range and domain what lies in the null space of S, spanned by V.
     V = D[:, None] * U * ~kept[None, :]
-    out = jnp.eye(m, dtype=S.dtype) - V @ jnp.linalg.solve(V.T @ V + jnp.diag(kept.astype(S.dtype)), V.T)
+    null = jnp.linalg.solve(V.T @ V + jnp.diag(kept.astype(scaled.dtype)), V.T)
+    out = jnp.eye(len(D), dtype=scaled.dtype) - V @ null
     return out @ inverse @ out
 
 
