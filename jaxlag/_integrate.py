@@ -50,8 +50,8 @@ def simulate(
     - `q0`, `qdot0`: the state at ts[0]; pytrees of one structure. Any consistent units.
     - `ts`: sample times, increasing, at least two.
     - `params`: what the functions of the system name; measured inputs among them are `Signal`s.
-    - `solver`: any explicit or diagonally implicit Runge–Kutta solver of diffrax. Default `jaxlag.Dop853()`; low
-      accuracy wants `jaxlag.Dopri5()`, stiff systems `diffrax.Kvaerno5()`.
+    - `solver`: any explicit or diagonally implicit Runge–Kutta solver of diffrax. Default `jaxlag.Dop853()`; forces
+      that are not smooth want `jaxlag.Dopri5()`, stiff systems `diffrax.Kvaerno5()`.
     - `rtol`, `atol`: tolerances of the step size control. Defaults 1e-8 and 1e-10 in double, 1e-4 and 1e-6 in single precision.
     - `stabilisation`: how the constraints are kept, `Projection()`, `Baumgarte(...)` or `NoStabilisation()`.
     - `friction`: how kinks of D are taken, `StickSlip()` (exactly) or `Regularised(width)`.

@@ -173,12 +173,12 @@ class Equations:
     def sample(self, t, y, params) -> Sample:
         """One sample, from y on the constraints."""
         q, v, works, sigma, transitions, time_stuck = self.parts(y)
-        flat, mode, kinks = self.mode(t, q, v, sigma, params)
-        feedback, rubbing, counts = self.stabilisation.feedback(), {}, {}
+        flat, _, kinks = self.mode(t, q, v, sigma, params)
+        rubbing, counts = {}, {}
         if kinks is None:
-            qddot, multipliers, _ = constrained_acceleration(mode, t, q, v, feedback)
+            qddot, multipliers, _ = _accelerated(self, t, y, params)
         else:
-            found = friction(flat, kinks, sigma, t, q, v, feedback)
+            found = friction(flat, kinks, sigma, t, q, v, self.stabilisation.feedback())
             qddot, multipliers = found.qddot, found.multipliers
             rubbing = friction_by_term(kinks, sigma, t, q, v, found)
             counts = {"transitions": transitions[0], "time_stuck": time_stuck}
@@ -188,11 +188,18 @@ class Equations:
 
 
 @eqx.filter_jit  # so that diffrax's many calls trace it once
+def _accelerated(equations: Equations, t, y, params):
+    q, v, _, sigma, *_ = equations.parts(y)
+    _, mode, _ = equations.mode(t, q, v, sigma, params)
+    feedback = equations.stabilisation.feedback()
+    return scalarised(lambda t, q, v: constrained_acceleration(mode, t, q, v, feedback))(t, q, v)
+
+
+@eqx.filter_jit
 def _rates(equations: Equations, t, y, params):
     q, v, works, sigma, transitions, time_stuck = equations.parts(y)
     _, mode, kinks = equations.mode(t, q, v, sigma, params)
-    feedback = equations.stabilisation.feedback()
-    qddot = scalarised(lambda t, q, v: constrained_acceleration(mode, t, q, v, feedback).x)(t, q, v)
+    qddot = _accelerated(equations, t, y, params).x
     powers = listed_powers(mode, t, q, v) if equations.audit else works
     stuck = time_stuck if kinks is None else sticking(kinks, sigma).astype(y.dtype)
     return jnp.concatenate([v, qddot, powers, 0 * sigma, 0 * transitions, stuck])
