@@ -232,7 +232,7 @@ class Fit:
         if not np.isfinite(error):
             return "not determined by these measurements" if np.isinf(error) else f"{value:.6g}"
         t = self._quantile(0.95)
-        return f"{plus_minus(value, error):<24} 95 %: {value - t * error:.6g} … {value + t * error:.6g}"
+        return f"{plus_minus(value, error):<24} 95 %: {rounded(value - t * error, error)} … {rounded(value + t * error, error)}"
 
     def _correlation_rows(self):
         pairs = itertools.combinations(range(min(len(self.names), SHOWN)), 2)
@@ -284,7 +284,14 @@ def plus_minus(value: float, error: float) -> str:
         return f"{value:.3g} ± {error:.2g}"
     if error == 0:
         return f"{value:.6g} ± 0"
-    digits = 1 - int(np.floor(np.log10(error)))
-    if digits > 8 or (value and abs(value) >= 1e7):
+    if error < 1e-7 or abs(value) >= 1e7:
         return f"{value:.8g} ± {error:.2g}"
-    return f"{round(value, digits):.{max(digits, 0)}f} ± {round(error, digits):.{max(digits, 0)}f}"
+    return f"{rounded(value, error)} ± {rounded(error, error)}"
+
+
+def rounded(x: float, error: float) -> str:
+    """`x` to the second digit of an error; of an error that is too small for that, as it is."""
+    if error < 1e-7:
+        return f"{x:.6g}"
+    digits = 1 - int(np.floor(np.log10(error)))
+    return f"{round(x, digits) + 0.0:.{max(digits, 0)}f}"
