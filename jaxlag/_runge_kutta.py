@@ -72,12 +72,12 @@ class ExplicitRungeKutta(dfx.AbstractAdaptiveSolver):
         # One loop, so that the equations are compiled once. What is not there yet counts as nothing.
         size, dtype = len(scheme.c), jnp.result_type(*jax.tree.leaves(y0))
         first = jax.tree.map(lambda x: jnp.concatenate([x[None], jnp.zeros((size - 1, *x.shape), x.dtype)]), solver_state)
-        rows = np.arange(1, size), np.array(scheme.c[1:], dtype), filled_up(scheme.a, size, dtype)
+        rows = np.arange(1, size), np.array(scheme.c[1:], dtype), as_rows(scheme.a, size, dtype)
         f, _ = jax.lax.scan(stage, first, rows)
 
         last = scheme.stages - 1
         ends, estimates = np.eye(size)[[0, last]], len(scheme.errors)
-        every = changes(filled_up([*scheme.errors, scheme.a[last - 1], *ends, *scheme.dense], size, dtype), f)
+        every = changes(as_rows([*scheme.errors, scheme.a[last - 1], *ends, *scheme.dense], size, dtype), f)
         error = jax.tree.map(lambda every: combined(*every[:estimates]), every)
         y1 = jax.tree.map(lambda y0, every: y0 + every[estimates], y0, every)
         series = jax.tree.map(lambda every: every[estimates + 1 :], every)
@@ -89,13 +89,16 @@ def is_explicit(solver: dfx.AbstractSolver) -> bool:
     return isinstance(solver, (ExplicitRungeKutta, dfx.AbstractERK))
 
 
-def filled_up(rows, size, dtype) -> np.ndarray:
-    """Rows of weights, all as long as the longest."""
+def as_rows(rows, size, dtype) -> np.ndarray:
+    """Weights as an array, each row with zeros up to `size`."""
     return np.array([[*row, *[0.0] * (size - len(row))] for row in rows], dtype)
 
 
 def weighted(weights, f):
-    """Σ wᵢ fᵢ, for one row of weights or several."""
+    """Σ wᵢ fᵢ, for one row of weights or several.
+
+    A reduction, or a product: a sum of slices XLA would fuse into what uses it, and compute anew for each use.
+    """
     if f.size > LARGE * len(f):
         return jnp.tensordot(weights, f, 1, precision=jax.lax.Precision.HIGHEST)
     weights = weights.reshape(*weights.shape, *[1] * (f.ndim - 1))

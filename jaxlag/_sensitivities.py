@@ -11,7 +11,7 @@ from jax.flatten_util import ravel_pytree
 from ._variations import along, parted
 
 # Up to this many perturbed numbers the Jacobian comes whole out of one vectorised forward pass; beyond it a tangent is
-# pushed forward, or a cotangent pulled back, alone. Where the two cross: tests/benchmarks/bench_gradient.py.
+# pushed forward, or a cotangent pulled back, alone. The two cross near 100 for a small system (tests/benchmarks/bench_gradient.py).
 FORWARD_LIMIT = 48
 
 

@@ -114,10 +114,10 @@ def jump_times(params: PyTree, dtype: Any) -> Float[Array, " jumps"] | None:
     return jax.lax.stop_gradient(jnp.concatenate([signal.ts[1:] for signal in held]).astype(dtype)) if held else None
 
 
-def moves_smoothly(moving: PyTree, still: PyTree) -> bool:
-    """Whether no signal moves, and none that stands still jumps."""
+def moves_smoothly(moving: PyTree, params: PyTree) -> bool:
+    """Whether no signal in `params` is among what moves, and none jumps."""
     signals = [leaf for leaf in jax.tree.leaves(moving, is_leaf=is_signal) if is_signal(leaf)]
-    return not jax.tree.leaves(signals) and jump_times(still, float) is None
+    return not jax.tree.leaves(signals) and jump_times(params, float) is None
 
 
 def delayed(params: PyTree, by: Float[Array, ""]) -> PyTree:
