@@ -13,6 +13,7 @@ from ._checks import at_state, is_concrete
 from ._friction import settled
 from ._mechanics import constraint_rows
 from ._multipliers import NO_INERTIA, constrained_acceleration, pseudo_inverse
+from ._scalarised import scalarised
 from ._system import Flat, System, rows_by_name
 
 
@@ -57,7 +58,8 @@ def acceleration(system: System, q: PyTree, qdot: PyTree, params: PyTree = None,
 
 
 def _acceleration(flat, t, q, v):
-    qddot, multipliers, determined = constrained_acceleration(settled(flat, t, q, v), t, q, v)
+    mode = settled(flat, t, q, v)
+    qddot, multipliers, determined = scalarised(lambda t, q, v: constrained_acceleration(mode, t, q, v))(t, q, v)
     multipliers = jnp.where(determined, multipliers, jnp.nan)
     qddot = jnp.where(determined, qddot, jnp.nan)
     return Acceleration(flat.unravel(qddot), flat.unravel_multipliers(multipliers)), determined

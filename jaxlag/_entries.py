@@ -14,7 +14,7 @@ import jax
 import numpy as np
 from jax.extend import core
 
-from ._folding import ELEMENTWISE, Algebra, Arrays, Entry, Folding, UnknownPrimitive, filled, folded, is_number, objects
+from ._folding import ELEMENTWISE, Algebra, Arrays, Entry, Folding, TooLong, UnknownPrimitive, filled, folded, is_number, objects
 from ._primitives import RULES, each
 
 
@@ -37,6 +37,21 @@ def evaluate(closed: Any, algebra: Algebra, *arguments: Any, limit: int | float 
         else:
             inputs.append(reader.known(array))
     return reader.values(reader.inner(closed, inputs), values)
+
+
+def opened(closed: Any, reader: "Reader") -> tuple[Arrays, Arrays]:
+    """Inputs and outputs of a jaxpr in which all but known numbers is an argument: what it closes over, traced, comes first."""
+    jaxpr = closed.jaxpr.replace(constvars=[], invars=[*closed.jaxpr.constvars, *closed.jaxpr.invars])
+    if closed.effects or any(map(is_extended, jaxpr.invars)):
+        raise TooLong
+    given = [*closed.consts, *([None] * len(closed.jaxpr.invars))]
+    inputs = [
+        np.asarray(x)
+        if isinstance(x, (np.ndarray, jax.Array)) and not isinstance(x, jax.core.Tracer)
+        else filled(v.aval.shape, [reader.argument(v.aval.dtype) for _ in range(v.aval.size)])
+        for x, v in zip(given, jaxpr.invars, strict=True)
+    ]
+    return inputs, reader.inner(jaxpr, [settled(x, v.aval.dtype) for x, v in zip(inputs, jaxpr.invars, strict=True)])
 
 
 class Reader(Folding):

@@ -138,7 +138,7 @@ def _measure(flat: Flat, t, q, v):
     split = rows_by_name(flat)
     psi, _, _ = constraint_rows(flat, t, q, v)
     return {
-        "M": inertia(flat, t, q, v)[0],
+        "M": inertia(flat, t, q, v)[0].as_matrix(),
         "G": G,
         "A": jax.jacfwd(rates)(jnp.concatenate([q, v])),
         "rows": {name: jnp.asarray(rows) for name, rows in split.items()},

@@ -6,6 +6,7 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import lineax as lx
 import numpy as np
 from jaxtyping import Array, Bool, Float, PyTree
 
@@ -109,7 +110,7 @@ def nearest_state(flat: Flat, t, q0, v0, free: Sequence[int] | None = None) -> C
     """
     moving = np.arange(q0.size) if free is None else np.asarray(free, int)
     both = np.ix_(moving, moving)
-    M = inertia(flat, t, q0, v0)[0][both]
+    M = inertia(flat, t, q0, v0)[0].as_matrix()[both]
     tolerance = jnp.finfo(q0.dtype).eps ** 0.5
     rows = velocity_residual(flat, t, q0, v0).size
     if rows == 0:  # nothing to satisfy: spares the compilation of the search
@@ -120,14 +121,15 @@ def nearest_state(flat: Flat, t, q0, v0, free: Sequence[int] | None = None) -> C
         g, G = position_residual(flat, t, q)
         bend = jax.hessian(lambda q: multipliers @ flat.holonomic(t, q))(q)[both]
         curved = jnp.where(is_determined(M - bend, G[:, moving]), M - bend, M)
-        step, multipliers, _ = saddle_point(curved, G[:, moving], M @ (q0 - q)[moving], -g)
+        step, multipliers, _ = saddle_point(lx.MatrixLinearOperator(curved), G[:, moving], M @ (q0 - q)[moving], -g)
         return (q.at[moving].add(step), multipliers), None
 
     start = q0, jnp.zeros(flat.holonomic(t, q0).size, q0.dtype)
     (q, _), _ = jax.lax.scan(newton, start, length=NEWTON_STEPS)
 
     psi, G, _ = constraint_rows(flat, t, q, v0)
-    nearest = saddle_point(inertia(flat, t, q, v0)[0][both], G[:, moving], jnp.zeros_like(v0[moving]), -psi)
+    M = inertia(flat, t, q, v0)[0].as_matrix()[both]
+    nearest = saddle_point(lx.MatrixLinearOperator(M), G[:, moving], jnp.zeros_like(v0[moving]), -psi)
     v = v0.at[moving].add(nearest.x)
     off = jnp.maximum(_off(*position_residual(flat, t, q), q), _off(velocity_residual(flat, t, q, v), G, v))
     return Consistent(q, v, off < tolerance, nearest.determined)

@@ -8,22 +8,20 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import lineax as lx
 from jaxtyping import Array, Float, PyTree
 
 from ._checks import at_state
+from ._jacobian import jacobian
 from ._system import Flat, System
 
 
-def inertia(flat: Flat, t, q, v) -> tuple[Float[Array, "n n"], Float[Array, " n"]]:
+def inertia(flat: Flat, t, q, v) -> tuple[lx.AbstractLinearOperator, Float[Array, " n"]]:
     """M and the force of the Lagrangian alone, ∂L/∂q − (∂²L/∂q̇∂q) q̇ − ∂²L/∂q̇∂t."""
-
-    def momentum_and_slope(t, q, v):
-        dL_dq, p = jax.grad(flat.lagrangian, argnums=(1, 2))(t, q, v)
-        return p, dL_dq
-
-    _, dp, dL_dq = jax.linearize(momentum_and_slope, t, q, v, has_aux=True)
-    M = jax.vmap(lambda e: dp(jnp.zeros_like(t), jnp.zeros_like(q), e))(jnp.eye(v.size, dtype=v.dtype))
-    return M, dL_dq - dp(jnp.ones_like(t), v, jnp.zeros_like(v))
+    momentum = jax.grad(flat.lagrangian, argnums=2)
+    _, M = jacobian(lambda v: momentum(t, q, v), v)
+    _, carried = jax.jvp(lambda t, q: momentum(t, q, v), (t, q), (jnp.ones_like(t), v))
+    return M, jax.grad(flat.lagrangian, argnums=1)(t, q, v) - carried
 
 
 def applied_force(flat: Flat, t, q, v, multipliers) -> Float[Array, " n"]:
@@ -35,8 +33,8 @@ def applied_force(flat: Flat, t, q, v, multipliers) -> Float[Array, " n"]:
 
 def position_residual(flat: Flat, t, q) -> tuple[Float[Array, " h"], Float[Array, "h n"]]:
     """g and its Jacobian ∂g/∂q."""
-    g, dg = jax.linearize(lambda q: flat.holonomic(t, q), q)
-    return g, jax.vmap(dg, out_axes=1)(jnp.eye(q.size, dtype=q.dtype))
+    g, G = jacobian(lambda q: flat.holonomic(t, q), q)
+    return g, G.as_matrix()
 
 
 def velocity_residual(flat: Flat, t, q, v) -> Float[Array, " m"]:
@@ -47,9 +45,9 @@ def velocity_residual(flat: Flat, t, q, v) -> Float[Array, " m"]:
 
 def constraint_rows(flat: Flat, t, q, v) -> tuple[Float[Array, " m"], Float[Array, "m n"], Float[Array, " m"]]:
     """ψ, G and γ, such that dψ/dt = G q̈ + γ."""
-    psi, dpsi = jax.linearize(lambda t, q, v: velocity_residual(flat, t, q, v), t, q, v)
-    G = jax.vmap(lambda e: dpsi(jnp.zeros_like(t), jnp.zeros_like(q), e), out_axes=1)(jnp.eye(v.size, dtype=v.dtype))
-    return psi, G, dpsi(jnp.ones_like(t), v, jnp.zeros_like(v))
+    psi, G = jacobian(lambda v: velocity_residual(flat, t, q, v), v)
+    _, gamma = jax.jvp(lambda t, q: velocity_residual(flat, t, q, v), (t, q), (jnp.ones_like(t), v))
+    return psi, G.as_matrix(), gamma
 
 
 def mass_matrix(system: System, q: PyTree, qdot: PyTree, params: PyTree = None, *, t: Any = 0.0) -> Float[Array, "n n"]:
@@ -73,7 +71,7 @@ def mass_matrix(system: System, q: PyTree, qdot: PyTree, params: PyTree = None, 
 
 
 def _mass_matrix(flat, t, q, v):
-    return inertia(flat, t, q, v)[0]
+    return inertia(flat, t, q, v)[0].as_matrix()
 
 
 def momentum(system: System, q: PyTree, qdot: PyTree, params: PyTree = None, *, t: Any = 0.0) -> PyTree:

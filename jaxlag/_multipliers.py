@@ -4,6 +4,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import lineax as lx
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
@@ -19,45 +20,61 @@ class SaddlePoint(NamedTuple):
     determined: Bool[Array, ""]
 
 
-@jax.custom_jvp
-def saddle_point(M: Float[Array, "n n"], G: Float[Array, "m n"], f, c) -> SaddlePoint:
+def saddle_point(M: lx.AbstractLinearOperator, G: Float[Array, "m n"], f, c) -> SaddlePoint:
     """The unique x and the λ of least norm with M x = f + Gᵀλ and G x = c.
 
-    M need be positive definite on the null space of G only, and rows of G may depend on each other: on the
-    constraint M + GᵀWG says the same as M, with GᵀWc added to f, and is positive definite, so one Cholesky
-    factorisation and the pseudo-inverse of the small matrix S = G (M + GᵀWG)⁻¹ Gᵀ serve every case.
-    Source: Benzi, Golub & Liesen, Numerical solution of saddle point problems, Acta Numerica 2005, sections 5 and 6.
+    M need be positive definite on the null space of G only, and rows of G may depend on each other. Where M is seen to be
+    diagonal, as of points in Cartesian coordinates, it is divided by, unless a mass is zero.
     """
+    if not isinstance(M, lx.DiagonalLinearOperator):
+        return _saddle_point(M, G, f, c)
+    there = M.diagonal > 0
+    divided = _saddle_point(lx.DiagonalLinearOperator(jnp.where(there, M.diagonal, 1)), G, f, c)
+    full = lambda: _saddle_point(lx.MatrixLinearOperator(M.as_matrix()), G, f, c)
+    return jax.lax.cond(everywhere(jnp.all(there)), lambda: divided, full)
+
+
+@jax.custom_jvp
+def _saddle_point(M, G, f, c) -> SaddlePoint:
     solve, _, determined = _solver(M, G)
     x, multipliers = solve(f, c)
     return SaddlePoint(x, multipliers, determined)
 
 
-@saddle_point.defjvp
+@_saddle_point.defjvp
 def _saddle_point_jvp(primals, tangents):
     """One more solve:  M dx = df − dM x + dGᵀλ + Gᵀdλ,  G dx = dc − dG x.
 
     Through the formula, the derivative of the pseudo-inverse would cancel where a mechanism passes a singular position.
     """
     (M, G, f, c), (dM, dG, df, dc) = primals, tangents
-    x, multipliers, determined = saddle_point(M, G, f, c)
+    x, multipliers, determined = _saddle_point(M, G, f, c)
     solve, turned, _ = _solver(M, G)
-    dx, d_multipliers = solve(df + dG.T @ multipliers - dM @ x, dc - dG @ x)
+    dx, d_multipliers = solve(df + dG.T @ multipliers - dM.mv(x), dc - dG @ x)
     return SaddlePoint(x, multipliers, determined), SaddlePoint(
         dx, d_multipliers + turned(dG, multipliers), np.zeros(jnp.shape(determined), jax.dtypes.float0)
     )
 
 
 def _solver(M, G):
-    """(f, c) ↦ (x, λ); (dG, λ) ↦ how λ turns with the null space of Gᵀ to stay of least norm; whether M is positive there."""
-    augmented, W = _augmented(M, G)
-    factor = jnp.linalg.cholesky(jax.lax.stop_gradient(augmented))
-    mobility = _solve(augmented, factor, G.T)
+    """(f, c) ↦ (x, λ); (dG, λ) ↦ how λ turns with the null space of Gᵀ to stay of least norm; whether M is positive there.
+
+    On the constraint M + GᵀWG says the same as M, with GᵀWc added to f, and is positive definite: so one factorisation and the
+    pseudo-inverse of the small matrix S = G (M + GᵀWG)⁻¹ Gᵀ serve every case. W = 0 where M is diagonal, and positive itself.
+    Source: Benzi, Golub & Liesen, Numerical solution of saddle point problems, Acta Numerica 2005, sections 5 and 6.
+    """
+    if isinstance(M, lx.DiagonalLinearOperator):
+        W, by_inertia, determined = jnp.zeros_like(G[:, 0]), lambda B: B / M.diagonal[:, None], jnp.array(True)
+    else:
+        augmented, W = _augmented(M.as_matrix(), G)
+        factor = jnp.linalg.cholesky(jax.lax.stop_gradient(augmented))
+        by_inertia, determined = lambda B: _solve(augmented, factor, B), _is_positive(factor, augmented)
+    mobility = by_inertia(G.T)
     S = G @ mobility
     inverse = pseudo_inverse(S)
 
     def solve(f, c):
-        free = _solve(augmented, factor, (f + G.T @ (W * c))[:, None])[:, 0]
+        free = by_inertia((f + G.T @ (W * c))[:, None])[:, 0]
         multipliers = inverse @ (c - G @ free)
         return free + mobility @ multipliers, multipliers
 
@@ -65,7 +82,18 @@ def _solver(M, G):
         change = dG @ (mobility @ (inverse @ multipliers))
         return change - S @ (inverse @ change)
 
-    return solve, turned, _is_positive(factor, augmented)
+    return solve, turned, determined
+
+
+@jax.custom_batching.custom_vmap
+def everywhere(condition: Bool[Array, ""]) -> Bool[Array, ""]:
+    """A condition; in a batch, whether it holds for all members, so that a `cond` on it stays one and not the work of both branches."""
+    return condition
+
+
+@everywhere.def_vmap
+def _for_all_members(axis_size, in_batched, conditions):
+    return everywhere(jnp.all(conditions)), False
 
 
 def is_determined(M: Float[Array, "n n"], G: Float[Array, "m n"]) -> Bool[Array, ""]:
@@ -112,7 +140,7 @@ def pseudo_inverse(S: Float[Array, "m m"]) -> Float[Array, "m m"]:
     root = jax.scipy.linalg.solve_triangular(jnp.linalg.cholesky(scaled), jnp.eye(m, dtype=S.dtype), lower=True)
     regular = 1 / jnp.sum(root**2) > jnp.finfo(S.dtype).eps ** 0.625 * m
     inverse = root.T @ root * jnp.outer(D, D)
-    return jax.lax.cond(regular, lambda: inverse, lambda: _by_eigenvalues(scaled, D))
+    return jax.lax.cond(everywhere(regular), lambda: inverse, lambda: _by_eigenvalues(scaled, D))
 
 
 def _by_eigenvalues(scaled, D):

@@ -145,7 +145,7 @@ class _Equations(eqx.Module):
         flat = bind(self.system, self.like, {**params, **self.own})
         M, inertial = inertia(flat, t, q, v)
         _, G, _ = constraint_rows(flat, t, q, v)
-        force = lambda multipliers: M @ a - inertial - applied_force(flat, t, q, v, multipliers)
+        force = lambda multipliers: M.mv(a) - inertial - applied_force(flat, t, q, v, multipliers)
         spread = pseudo_inverse(G @ G.T) @ G if len(G) else G
         off = force(jnp.zeros(len(G), q.dtype))
         if flat.needs_multipliers:

@@ -13,7 +13,7 @@ import numpy as np
 from jax import lax
 from jax.extend import core
 
-from ._entries import Reader, evaluate, is_extended, on_arrays, settled, shaped
+from ._entries import Reader, evaluate, on_arrays, opened, shaped
 from ._folding import Algebra, Arrays, TooLong, UnknownPrimitive, filled, is_number, objects
 
 
@@ -48,26 +48,16 @@ def scalarised(function: Callable, *, limit: int = 1500) -> Callable:
 def _written_out(function: Callable, limit: int | float = math.inf) -> Callable:
     def in_scalars(*arguments):
         closed, shapes = jax.make_jaxpr(function, return_shape=True)(*arguments)
-        leaves = jax.tree.leaves(arguments)
-        # What the function closes over, traced, is one more argument.
-        arrays = [*closed.consts, *leaves]
-        jaxpr: Any = closed.jaxpr.replace(constvars=[], invars=[*closed.jaxpr.constvars, *closed.jaxpr.invars])
-        reader = Reader(JAX_ALGEBRA, limit)
+        leaves, reader = jax.tree.leaves(arguments), Reader(JAX_ALGEBRA, limit)
         try:
-            if closed.effects or any(map(is_extended, jaxpr.invars)):
-                raise TooLong
-            known = [isinstance(x, (np.ndarray, jax.Array)) and not isinstance(x, jax.core.Tracer) for x in closed.consts]
-            inputs = [
-                np.asarray(x) if is_known else filled(v.aval.shape, [reader.argument(v.aval.dtype) for _ in range(v.aval.size)])
-                for x, v, is_known in zip(arrays, jaxpr.invars, [*known, *(False for _ in leaves)], strict=True)
-            ]
-            outputs = reader.inner(jaxpr, [settled(x, v.aval.dtype) for x, v in zip(inputs, jaxpr.invars, strict=True)])
+            inputs, outputs = opened(closed, reader)
         except (TooLong, UnknownPrimitive):
             results = core.jaxpr_as_fun(closed)(*leaves)
         else:
+            arrays = [*closed.consts, *leaves]
             pairs = [(entries, array) for entries, array in zip(inputs, arrays, strict=True) if entries.dtype == object]
             given = {entry: x for entries, array in pairs for entry, x in zip(entries.flat, _apart(array).flat, strict=True)}
-            results = [_together(x, atom.aval.dtype) for x, atom in zip(reader.values(outputs, given), jaxpr.outvars, strict=True)]
+            results = [_together(x, atom.aval.dtype) for x, atom in zip(reader.values(outputs, given), closed.jaxpr.outvars, strict=True)]
         return jax.tree.unflatten(jax.tree.structure(shapes), results)
 
     return in_scalars

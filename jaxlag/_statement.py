@@ -156,7 +156,7 @@ def check_against_simulation(system: System, s: Statement, steps: Steps, q: Name
         flat = _bound(system, like, params_, params)
         M, force = inertia(flat, t, q_, v)
         _, G, gamma = constraint_rows(flat, t, q_, v)
-        return M, force + applied_force(flat, t, q_, v, multipliers), G, gamma
+        return M.as_matrix(), force + applied_force(flat, t, q_, v, multipliers), G, gamma
 
     draw = np.random.default_rng(0).uniform
     state = [draw(0.2, 0.8, shape) for shape in ((), len(s.q), len(s.q), len(s.multipliers))]

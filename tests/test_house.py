@@ -22,6 +22,7 @@ ORDER = [
     "_checks",
     "_signal",
     "_kinematics",
+    "_jacobian",
     "_mechanics",
     "_multipliers",
     "_kinks",

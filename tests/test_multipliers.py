@@ -2,6 +2,7 @@
 
 import jax
 import jax.numpy as jnp
+import lineax as lx
 import numpy as np
 import pytest
 
@@ -22,7 +23,7 @@ def test_solution_and_least_norm_multipliers(n, m, rank):
     rng = np.random.default_rng(n + 10 * m)
     for _ in range(5):
         M, G, f, c = random_problem(rng, n, m, rank)
-        found = saddle_point(*map(jnp.asarray, (M, G, f, c)))
+        found = saddle_point(lx.MatrixLinearOperator(jnp.asarray(M)), *map(jnp.asarray, (G, f, c)))
         u, s, vt = np.linalg.svd(G)
         N = vt[(s > 1e-10).sum() :].T
         particular = np.linalg.lstsq(G, c, rcond=1e-10)[0] if m else np.zeros(n)

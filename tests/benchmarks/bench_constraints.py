@@ -79,7 +79,7 @@ def table(name):
 
 
 def main(*names):
-    record("constraints", {f"{name} rods" if name.isdigit() else name: table(name) for name in names or MECHANISMS})
+    record("constraints", ((f"{name} rods" if name.isdigit() else name, table(name)) for name in names or MECHANISMS))
 
 
 if __name__ == "__main__":

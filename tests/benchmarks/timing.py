@@ -109,11 +109,12 @@ def duration(seconds: float | None) -> str:
     return f"{seconds / size:.3g} {unit}"
 
 
-def record(topic: str, tables: Mapping[str, Iterable[Row]]) -> None:
-    """Shows the tables and keeps them in `results.json`, in place of the topic's older ones."""
-    for task, rows in tables.items():
+def record(topic: str, tables: Mapping[str, Iterable[Row]] | Iterable[tuple[str, Iterable[Row]]]) -> None:
+    """Shows each table as soon as it is there, and keeps it in `results.json` in place of its older one."""
+    for task, rows in tables.items() if isinstance(tables, Mapping) else tables:
+        rows = list(rows)
         show(f"{topic}: {task}", rows)
-    kept = json.loads(RESULTS.read_text()) if RESULTS.exists() else {}
-    kept["machine"] = {"cores": os.cpu_count(), "processor": platform.machine(), "jax": jax.__version__}
-    kept[topic] = {task: [dataclasses.asdict(row) for row in rows] for task, rows in tables.items()}
-    RESULTS.write_text(json.dumps(kept, indent=1, ensure_ascii=False, allow_nan=True))
+        kept = json.loads(RESULTS.read_text()) if RESULTS.exists() else {}
+        kept["machine"] = {"cores": os.cpu_count(), "processor": platform.machine(), "jax": jax.__version__}
+        kept.setdefault(topic, {})[task] = [dataclasses.asdict(row) for row in rows]
+        RESULTS.write_text(json.dumps(kept, indent=1, ensure_ascii=False, allow_nan=True))
