@@ -1,5 +1,6 @@
 """The constrained solve: x and λ of  M x = f + Gᵀλ,  G x = c."""
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import jax
@@ -71,16 +72,16 @@ def _solver(M, G):
         by_inertia, determined = lambda B: _solve(augmented, factor, B), _is_positive(factor, augmented)
     mobility = by_inertia(G.T)
     S = G @ mobility
-    inverse = pseudo_inverse(S)
+    inverse = least_norm(S)
 
     def solve(f, c):
         free = by_inertia((f + G.T @ (W * c))[:, None])[:, 0]
-        multipliers = inverse @ (c - G @ free)
+        multipliers = inverse(c - G @ free)
         return free + mobility @ multipliers, multipliers
 
     def turned(dG, multipliers):
-        change = dG @ (mobility @ (inverse @ multipliers))
-        return change - S @ (inverse @ change)
+        change = dG @ (mobility @ inverse(multipliers))
+        return change - S @ inverse(change)
 
     return solve, turned, determined
 
@@ -121,26 +122,34 @@ def _solve(A, factor, B):
     return jax.lax.custom_linear_solve(lambda X: A @ X, B, by_factor, symmetric=True)
 
 
-@jax.custom_jvp
-def pseudo_inverse(S: Float[Array, "m m"]) -> Float[Array, "m m"]:
-    """Moore–Penrose inverse of a symmetric positive semidefinite S.
+def least_norm(S: Float[Array, "m m"]) -> Callable[[Array], Array]:
+    """r ↦ S⁺r with the Moore–Penrose inverse of a symmetric positive semidefinite S.
 
-    The rank is judged on S scaled to a unit diagonal, so that it does not depend on the units of the constraints:
-    eigenvalues below eps^(5/8) (1.6e-10 in double precision) of the largest count as zero.
+    The rank is judged on S scaled to a unit diagonal, so that it does not depend on the units of the constraints: eigenvalues
+    below τ = eps^(5/8) (1.6e-10 in double precision) of the largest, which is at most m, count as zero. None does where S − m τ 1
+    has a Cholesky factorisation, and then that of S serves.
     """
     m = S.shape[0]
     if m == 0:
-        return S
+        return lambda r: r
     if m == 1:
-        return jnp.where(S > 0, 1 / jnp.where(S > 0, S, 1), 0)
+        inverse = jnp.where(S > 0, 1 / jnp.where(S > 0, S, 1), 0)
+        return lambda r: inverse @ r
     size = jnp.diagonal(S)
     D = jnp.where(size > 0, jax.lax.rsqrt(jnp.where(size > 0, size, 1)), 1)
     scaled = S * jnp.outer(D, D)
-    # Where no row is redundant, by Cholesky's factor: of the eigenvalues the least is at least 1/|L⁻¹|², the largest at most m.
-    root = jax.scipy.linalg.solve_triangular(jnp.linalg.cholesky(scaled), jnp.eye(m, dtype=S.dtype), lower=True)
-    regular = 1 / jnp.sum(root**2) > jnp.finfo(S.dtype).eps ** 0.625 * m
-    inverse = root.T @ root * jnp.outer(D, D)
-    return jax.lax.cond(everywhere(regular), lambda: inverse, lambda: _by_eigenvalues(scaled, D))
+    least = m * jnp.finfo(S.dtype).eps ** 0.625
+    regular = everywhere(jnp.all(jnp.diagonal(jnp.linalg.cholesky(scaled - least * jnp.eye(m, dtype=S.dtype))) > 0))
+    factor = jnp.linalg.cholesky(scaled)
+    singular = jax.lax.cond(regular, lambda: jnp.zeros_like(S), lambda: _by_eigenvalues(scaled, D))
+    of_columns = lambda R: jnp.where(regular, D[:, None] * jax.scipy.linalg.cho_solve((factor, True), D[:, None] * R), singular @ R)
+    return lambda r: of_columns(r) if r.ndim == 2 else of_columns(r[:, None])[:, 0]
+
+
+@jax.custom_jvp
+def pseudo_inverse(S: Float[Array, "m m"]) -> Float[Array, "m m"]:
+    """Moore–Penrose inverse of a symmetric positive semidefinite S, by `least_norm`."""
+    return least_norm(S)(jnp.eye(len(S), dtype=S.dtype))
 
 
 def _by_eigenvalues(scaled, D):

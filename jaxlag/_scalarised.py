@@ -6,7 +6,6 @@ The same values and the same derivatives. Small systems run several times as fas
 import functools
 import math
 from collections.abc import Callable, Iterable
-from typing import Any
 
 import jax
 import numpy as np

@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Array, Bool
 
 from ._checks import is_concrete
+from ._kernel import in_one_kernel
 from ._manifold import nearest_state
 from ._motion import Equations, slack_of
 from ._progress import Bar
@@ -101,14 +102,15 @@ def states_at(equations: Any, how: How, adjoint: dfx.AbstractAdjoint, t0, y0, ts
         controller = dfx.ClipStepSizeController(Resuming(rtol, atol, smallest=4 * rounding, norm=equations.error_norm), jump_ts=jumps)
         end = end + 256 * rounding  # a jump at the last sample is stepped on too: diffrax rounds what is within 100 ulp of the end
         behind = functools.partial(behind_a_jump, equations)
-    kept = equations.kept if equations.projection else None
+    alone = in_one_kernel if isinstance(adjoint, dfx.ForwardMode) else lambda function: function
+    kept = alone(equations.kept) if equations.projection else None
     solver = how.solver
     if equations.rows:
         solver = StickSlipSolver(how.solver, kept, 2 * equations.size, behind, equations)
     elif kept is not None or behind is not None or how.audit:
         solver = Kept(how.solver, kept, 2 * equations.size, behind)
     solution = dfx.diffeqsolve(
-        dfx.ODETerm(equations.rates),
+        dfx.ODETerm(alone(equations.rates)),
         solver,
         t0,
         end,

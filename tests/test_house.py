@@ -17,6 +17,7 @@ ORDER = [
     "_primitives",
     "_entries",
     "_scalarised",
+    "_kernel",
     "_arguments",
     "_system",
     "_checks",
