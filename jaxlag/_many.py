@@ -52,7 +52,7 @@ def simulate_many(
     $$ M(q_i; p_i)\,\ddot q_i = f(q_i, \dot q_i; p_i) + G^T\lambda_i, \qquad i = 1 \dots B $$
 
     What `over` names has the members as its first axis. The result is that of `simulate` for each of them, within the tolerances, with
-    the members as first axis of every field; derivatives are those of `simulate`, with up to 48 numbers of a member differentiated in
+    the members as first axis of every field; derivatives are those of `simulate`, with up to 96 numbers of a member differentiated in
     one pass. With several devices each takes its part of the members.
 
     **Arguments:**

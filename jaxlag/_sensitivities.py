@@ -11,8 +11,8 @@ from jax.flatten_util import ravel_pytree
 from ._variations import along, parted
 
 # Up to this many perturbed numbers the Jacobian comes whole out of one vectorised forward pass; beyond it a tangent is
-# pushed forward, or a cotangent pulled back, alone. The two cross near 100 for a small system (tests/benchmarks/bench_gradient.py).
-FORWARD_LIMIT = 48
+# pushed forward, or a cotangent pulled back, alone. The two cross near 100 (tests/benchmarks/bench_gradient.py).
+FORWARD_LIMIT = 96
 
 
 def differentiable(solve: Callable, pull_back: Callable, drift: Callable, push: Callable | None = None) -> Callable:
