@@ -268,7 +268,7 @@ def _by_optax(problem, method, x, more):
         raise ValueError(f"{AT_THE_START}, but was not. Start from other parameters.")
     rows = linearise(problem, best) if problem.size <= FORWARD_LIMIT else look(problem, best)
     none = jnp.zeros(0)
-    return Outcome(Iterate(best, rows.residuals, rows.jacobian, rows, none, none, jnp.asarray(ended)), len(costs), np.array(costs))
+    return Outcome(Iterate(best, rows.residuals, rows.jacobian, rows, lowest, none, none, np.asarray(ended)), len(costs), np.array(costs))
 
 
 @eqx.filter_jit

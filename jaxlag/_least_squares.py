@@ -28,6 +28,7 @@ class Iterate(NamedTuple):
     residuals: Any
     jacobian: Any
     rest: Any
+    cost: Any  # ½|r|²
     damping: Any
     scale: Any  # largest norm each column of the Jacobian has had
     status: Any
@@ -58,23 +59,23 @@ def levenberg_marquardt(
     **Source:** Moré, The Levenberg-Marquardt algorithm, Lecture Notes in Mathematics 630 (1978); Madsen, Nielsen & Tingleff,
     Methods for Non-Linear Least Squares Problems (2004), section 3.2.
     """
-    begin, propose, judge = ONE if y.ndim == 1 else MANY
-    now = begin(y, linearise(y))
-    costs = [np.asarray(_cost(now.residuals))]
+    begin, advance = ONE if y.ndim == 1 else MANY
+    now, trial, predicted = begin(y, linearise(y))
+    costs = [now.cost]
     step, limits = 0, (jnp.full(y.shape[:-1], tolerance, y.dtype), jnp.full(y.shape[:-1], freedom, y.dtype))
     try:
         for step in range(1, max_steps + 1):
-            trial, predicted = propose(now)
-            now = judge(now, trial, predicted, linearise(trial), *limits)
-            costs.append(np.asarray(_cost(now.residuals)))
+            now, trial, predicted = advance(now, trial, predicted, linearise(trial), *limits)
+            costs.append(now.cost)
             if progress:
-                progress(step, float(np.min(costs[-1])))
+                progress(step, float(np.min(now.cost)))
             if np.all(np.asarray(now.status) != RUNNING):
                 break
         ended = MAX_STEPS
     except KeyboardInterrupt:
         ended = INTERRUPTED
-    return Outcome(now._replace(status=jnp.where(now.status == RUNNING, ended, now.status)), step, np.array(costs))
+    status = np.asarray(now.status)
+    return Outcome(now._replace(status=np.where(status == RUNNING, ended, status)), step, np.array(costs))
 
 
 def _cost(r):
@@ -87,7 +88,8 @@ def _norms(J):
 
 def _begin(y, first):
     r, J, rest = first
-    return Iterate(y, r, J, rest, jnp.asarray(1e-2, y.dtype), _norms(J), jnp.asarray(RUNNING))
+    now = Iterate(y, r, J, rest, _cost(r), jnp.asarray(1e-2, y.dtype), _norms(J), jnp.asarray(RUNNING))
+    return now, *_propose(now)
 
 
 def _propose(now):
@@ -100,29 +102,31 @@ def _propose(now):
     return now.y + step / scale, J.mv(step)
 
 
-def _judge(now, trial, predicted, seen, tolerance, freedom):
-    """Takes the trial where it is better, and sets the damping by how much it is."""
+def _advance(now, trial, predicted, seen, tolerance, freedom):
+    """Takes the trial where it is better, sets the damping by how much it is, and proposes the next."""
     r, J, rest = seen
-    before, after = _cost(now.residuals), _cost(r)
-    better = after <= before
-    took = lambda new, old: jax.tree.map(lambda a, b: jnp.where(better, a, b), new, old)
-    # What was expected of the step: ½|r|² − ½|r + J step|²; and its length in terms of the noise.
+    before, after = now.cost, _cost(r)
+    # What was expected of the step: ½|r|² − ½|r + J step|². Too little to be seen above the rounding of what is integrated, it is trusted.
     expected = -predicted @ now.residuals - 0.5 * predicted @ predicted
+    newton_like, unseen = now.damping < 0.5, jnp.finfo(r.dtype).eps ** 0.5 * before
+    better = after <= before
+    taken = better | (newton_like & (expected <= unseen) & (after - before <= unseen))
+    took = lambda new, old: jax.tree.map(lambda a, b: jnp.where(taken, a, b), new, old)
     well = (before - after) > 0.25 * expected
     damping = now.damping * jnp.where(better, jnp.where(well, 0.1, 1.0), 10.0)
     damping = jnp.clip(damping, 1e-14, 1e14)
     least = jnp.finfo(r.dtype).eps ** 0.625 * jnp.max(now.scale)  # below the rounding of what is integrated
     short = predicted @ predicted <= jnp.maximum(tolerance**2 * 2 * before / jnp.maximum(freedom, 1), least**2)
-    newton_like = now.damping < 0.5
     flat = jnp.linalg.norm(jnp.where(now.scale > 0, now.residuals @ now.jacobian / now.scale, 0)) <= 1e-4 * jnp.sqrt(2 * before)
     status = jnp.where((short & newton_like) | (before == 0), CONVERGED, RUNNING)
-    status = jnp.where(~better & (now.damping >= 1e8), jnp.where(flat, CONVERGED, STALLED), status)
+    status = jnp.where(~taken & (now.damping >= 1e8), jnp.where(flat, CONVERGED, STALLED), status)
     status = jnp.where(jnp.isfinite(before), status, FAILED)
     status = jnp.where(now.status == RUNNING, status, now.status)
     done = now.status != RUNNING
-    chosen = Iterate(*took((trial, r, J, rest), now[:4]), damping, jnp.maximum(now.scale, _norms(jnp.where(better, J, 0))), status)
-    return jax.tree.map(lambda a, b: jnp.where(done, b, a), chosen, now)
+    chosen = Iterate(*took((trial, r, J, rest, after), now[:5]), damping, jnp.maximum(now.scale, _norms(jnp.where(taken, J, 0))), status)
+    now = jax.tree.map(lambda a, b: jnp.where(done, b, a), chosen, now)
+    return now, *_propose(now)
 
 
-ONE = tuple(eqx.filter_jit(f) for f in (_begin, _propose, _judge))
-MANY = tuple(eqx.filter_jit(jax.vmap(f)) for f in (_begin, _propose, _judge))
+ONE = tuple(eqx.filter_jit(f) for f in (_begin, _advance))
+MANY = tuple(eqx.filter_jit(jax.vmap(f)) for f in (_begin, _advance))

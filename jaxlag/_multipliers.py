@@ -25,14 +25,14 @@ def saddle_point(M: lx.AbstractLinearOperator, G: Float[Array, "m n"], f, c) -> 
     """The unique x and the λ of least norm with M x = f + Gᵀλ and G x = c.
 
     M need be positive definite on the null space of G only, and rows of G may depend on each other. Where M is seen to be
-    diagonal, as of points in Cartesian coordinates, it is divided by, unless a mass is zero.
+    diagonal, as of points in Cartesian coordinates, it is divided by, unless a mass is (next to) nothing beside another.
     """
     if not isinstance(M, lx.DiagonalLinearOperator):
         return _saddle_point(M, G, f, c)
-    there = M.diagonal > 0
-    divided = _saddle_point(lx.DiagonalLinearOperator(jnp.where(there, M.diagonal, 1)), G, f, c)
+    heavy = M.diagonal > jnp.finfo(f.dtype).eps ** 0.25 * jnp.max(jnp.abs(M.diagonal))
+    divided = _saddle_point(lx.DiagonalLinearOperator(jnp.where(heavy, M.diagonal, 1)), G, f, c)
     full = lambda: _saddle_point(lx.MatrixLinearOperator(M.as_matrix()), G, f, c)
-    return jax.lax.cond(everywhere(jnp.all(there)), lambda: divided, full)
+    return jax.lax.cond(everywhere(jnp.all(heavy)), lambda: divided, full)
 
 
 @jax.custom_jvp

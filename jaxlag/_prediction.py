@@ -13,7 +13,7 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from jaxtyping import PyTree
 
 from ._arguments import call
-from ._checks import at_state
+from ._checks import at_state, is_concrete
 from ._experiment import Experiment, is_within, start_entries
 from ._free import Free
 from ._integrate import simulate
@@ -51,6 +51,8 @@ class Stack(eqx.Module):
 
     def started(self, z):
         """The start and the experiment's own parameters, of one member without its first axis, at its unknowns z."""
+        if self.unknowns == 0:  # what moves with nothing is not to be differentiated
+            return self.q0, self.qdot0, self.params
         start, unravel = ravel_pytree((self.q0, self.qdot0))
         k = self.ways.shape[-1]
         q0, qdot0 = unravel(start + self.ways @ z[:k])
@@ -79,9 +81,11 @@ def _own(e):
 
 def _stack(experiments, ways, members):
     longest = max(e.ts.size for e in experiments)
+    xnp: Any = np if is_concrete(experiments, ways) else jnp  # NumPy is quicker where it will do
 
     def fill(x, e, filling=None):
-        return jnp.concatenate([x, jnp.broadcast_to(x[-1] if filling is None else filling, (longest - e.ts.size, *x.shape[1:]))])
+        x = xnp.asarray(x)
+        return xnp.concatenate([x, xnp.broadcast_to(x[-1] if filling is None else filling, (longest - e.ts.size, *x.shape[1:]))])
 
     sigma = lambda e: e.sigma if e.sigma is not None else jax.tree.map(jnp.ones_like, e.values)
     filled = [
@@ -96,8 +100,8 @@ def _stack(experiments, ways, members):
         )
         for e, way in zip(experiments, ways, strict=True)
     ]
-    arrays, others = eqx.partition(filled, eqx.is_array)
-    together = eqx.combine(jax.tree.map(lambda *leaves: jnp.stack(leaves), *arrays), others[0])
+    arrays, others = eqx.partition(filled, lambda x: isinstance(x, (np.ndarray, jax.Array)))
+    together = eqx.combine(jax.tree.map(lambda *leaves: jnp.asarray(xnp.stack(leaves)), *arrays), others[0])
     first = experiments[0]
     return _spread(Stack(*together, first.observe, first.delay, _own(first), tuple(members)))
 

@@ -191,7 +191,7 @@ def _whole(problem, rows, experiments, whole, covariance):
         for j, n in [(j, n) for j, (of, n) in enumerate(zip(whole.of, samples, strict=True)) if of == i]:
             k, row = _place(problem, j)
             cut = lambda tree, n=n: jax.tree.map(lambda x: x[:n], tree)
-            seen.append(cut(jax.tree.map(lambda x, row=row: np.asarray(x[row]), rows.of_stacks[k].channels)))
+            seen.append(cut(jax.tree.map(lambda x, row=row: np.asarray(x)[row], rows.of_stacks[k].channels)))
             spread.append(cut(_spread(problem, rows, k, row, covariance)))
         predictions.append(together(seen))
         spreads.append(together(spread))
@@ -202,15 +202,17 @@ def _whole(problem, rows, experiments, whole, covariance):
 def _spread(problem, rows, k, row, covariance):
     """√(J cov Jᵀ) of what the sensors of one experiment should see; NaN where nothing was measured, for there J is not at hand."""
     stack, part, loss = problem.stacks[k], rows.of_stacks[k], problem.model.loss
-    values, sigma, seen = (jax.tree.map(lambda x: np.asarray(x[row]), tree) for tree in (stack.values, stack.sigma, part.channels))
+    values, sigma, seen = (jax.tree.map(lambda x: np.asarray(x)[row], tree) for tree in (stack.values, stack.sigma, part.channels))
     if part.jacobian is None:
         return jax.tree.map(lambda z: np.full(z.shape, np.nan), values)
     flat = lambda tree: np.concatenate([np.ravel(leaf) for leaf in jax.tree.leaves(tree)])
     columns = np.r_[0 : problem.free.size, problem.own_columns(k, np.array([row]))[0]]
-    J = np.asarray(part.jacobian[row]) * flat(sigma)[:, None]
+    J = np.asarray(part.jacobian)[row] * flat(sigma)[:, None]
     if loss is not None:
         weighted = np.nan_to_num((flat(values) - flat(seen)) / flat(sigma))
         J = J / np.asarray(loss.slope(weighted / problem.scale))[:, None]
     spread = np.sqrt(np.maximum(np.einsum("ij,jk,ik->i", J, covariance[np.ix_(columns, columns)], J), 0))
     there = np.where(np.isfinite(flat(values)), spread, np.nan)
-    return jax.tree.map(np.asarray, ravel_pytree(values)[1](jnp.asarray(there)))
+    leaves, structure = jax.tree.flatten(values)
+    parts = np.split(there, np.cumsum([leaf.size for leaf in leaves])[:-1])
+    return jax.tree.unflatten(structure, [part.reshape(leaf.shape) for part, leaf in zip(parts, leaves, strict=True)])
