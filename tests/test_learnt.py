@@ -18,8 +18,8 @@ from jax.flatten_util import ravel_pytree
 from scipy.optimize import isotonic_regression
 
 import jaxlag as jl
-from jaxlag.examples import stribeck
 from jaxlag._sensitivities import FORWARD_LIMIT
+from jaxlag.examples import stribeck
 from jaxlag.learnt import ConvexDissipation, ConvexPotential, PassiveDissipation, Potential
 
 sys.path.insert(0, str(Path(__file__).parent / "data"))

@@ -236,7 +236,7 @@ def test_an_interrupted_fit_returns_the_best_so_far(monkeypatch):
             raise KeyboardInterrupt
         return original(*args)
 
-    monkeypatch.setattr(_least_squares, "ONE", (_least_squares.ONE[0], interrupting, _least_squares.ONE[2]))
+    monkeypatch.setattr(_least_squares, "ONE", (_least_squares.ONE[0], interrupting))
     found = fit(osc.record(0))
     assert not found.converged and "interrupted by the keyboard" in found.reason and "interrupted" in repr(found)
     assert found.cost < found.costs[0]
