@@ -4,13 +4,15 @@ import re
 import sys
 from pathlib import Path
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
-from scipy.optimize import curve_fit
+from scipy.optimize import curve_fit, least_squares
 
 import jaxlag as jl
 from jaxlag._fit import plus_minus
+from jaxlag._least_squares import CONVERGED, levenberg_marquardt
 from jaxlag.examples import vehicle
 
 sys.path.insert(0, str(Path(__file__).parent / "data"))
@@ -147,3 +149,20 @@ def test_a_second_fit_traces_nothing(monkeypatch):
 )
 def test_plus_minus(value, error, said):
     assert plus_minus(value, error) == said
+
+
+def test_a_step_too_small_to_be_seen_is_taken():
+    """Where each look at the residuals adds 1e-9 of them, no last step lowers the cost. It ends all the same; against SciPy."""
+    ts, looks = np.linspace(0.0, 1.0, 50), []
+    data = np.exp(-1.3 * ts) + 0.01 * np.sin(40 * ts)
+
+    def seen(y):
+        looks.append(1)
+        model = jnp.exp(-y[0] * ts)
+        return (model - data) * (1 + 1e-9 * len(looks)), (-ts * model)[:, None], None
+
+    outcome = levenberg_marquardt(seen, jnp.array([3.0]), freedom=49, max_steps=50, tolerance=1e-6)
+    expected = least_squares(lambda y: np.exp(-y[0] * ts) - data, [3.0], xtol=1e-15, ftol=1e-15, gtol=1e-15)
+    error = np.sqrt(2 * expected.cost / 49 / (expected.jac.T @ expected.jac)[0, 0])
+    assert int(outcome.best.status) == CONVERGED and len(looks) <= 9
+    np.testing.assert_allclose(outcome.best.y[0], expected.x[0], atol=1e-4 * error)
