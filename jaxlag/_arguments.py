@@ -64,6 +64,16 @@ def check_entries(params: Any) -> None:
             )
 
 
+def missing(role: str, key: Any, q: Any, params: Any) -> str:
+    """What to say where a function asks for an entry of q or params that is not there."""
+    entries = {"q": q, "params": params}
+    there = {name: sorted(map(str, tree)) for name, tree in entries.items() if isinstance(tree, Mapping)}
+    close = difflib.get_close_matches(str(key), [entry for keys in there.values() for entry in keys], n=1)
+    cure = f"Did you mean {close[0]!r}?" if close else f"Add {key!r} where it belongs."
+    have = "; ".join(f"{name} has {', '.join(keys) or 'none'}" for name, keys in there.items())
+    return f"{role} must ask for entries that exist, but asks for {key!r}. {have}. {cure}"
+
+
 def _unknown(role: str, name: str, state: Mapping[str, Any], params: Any) -> str:
     own = [known for known in STATE_NAMES if known in (*state, "params")]
     if isinstance(params, Mapping):

@@ -1,6 +1,6 @@
 """The border: what a user hands over becomes arrays once, and is checked once, free of run time."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import equinox as eqx
@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, PyTree
 
-from ._arguments import call, check_entries
+from ._arguments import call, check_entries, missing
 from ._system import Flat, System, bind, role
 
 
@@ -143,7 +143,12 @@ def _multipliers(system, t, q, qdot, params):
 
 
 def _shape_of(function, spoken, params, **state):
-    return eqx.filter_eval_shape(lambda params, state: call(function, spoken, params, **state), params, state)
+    try:
+        return eqx.filter_eval_shape(lambda params, state: call(function, spoken, params, **state), params, state)
+    except KeyError as error:
+        if not (isinstance(state["q"], Mapping) or isinstance(params, Mapping)):
+            raise
+        raise ValueError(missing(spoken, error.args[0] if error.args else "", state["q"], params)) from error
 
 
 def _is_real(leaf: Any) -> bool:

@@ -52,7 +52,7 @@ class Regression:
         width = max(map(len, self.names))
         spoken = lambda v, e: plus_minus(v, e) if np.isfinite(e) else "not determined by these measurements"
         rows = [f"  {n:<{width}}  {spoken(v, e)}" for n, v, e in zip(self.names, values, errors, strict=True)]
-        return "\n".join([f"Regression: {len(self.names)} parameters, {how}", *rows])
+        return "\n".join([f"Regression: {len(self.names)} parameters, {how}; starting values for `fit`, biased by the noise", *rows])
 
 
 def regress(

@@ -37,6 +37,8 @@ WRONG = {
     "mismatched structures": (lambda: run(q0={"x": 1.0}, qdot0={"y": 0.0}), "`qdot0` must be structured like `q0`"),
     "mismatched shapes": (lambda: run(q0=np.ones(2), qdot0=np.ones(3)), r"`qdot0` must have the shape of `q0`, \(2,\), but has \(3,\)"),
     "unknown argument name": (lambda: run(jl.System(lambda q, qdto, c: 0.5 * qdto**2)), "`lagrangian` must name arguments that exist, but it names 'qdto'. There are t, q, qdot, params; the entries of params: c. Did you mean 'qdot'"),
+    "misspelt coordinate in q0": (lambda: run(jl.System(lambda q, qdot: 0.5 * qdot["theta"] ** 2), {"teta": 0.0}, {"teta": 0.0}), "`lagrangian` must ask for entries that exist, but asks for 'theta'. q has teta; params has c. Did you mean 'teta'?"),
+    "entry of params that is not there": (lambda: run(jl.System(energy, dissipation={"oil": lambda qdot, params: params["b"] * qdot**2})), "`dissipation` 'oil' must ask for entries that exist, but asks for 'b'. params has c. Add 'b' where it belongs"),
     "missing parameter": (lambda: run(params={"b": 1.0}), "it names 'c'. There are .*; the entries of params: b. Add 'c' to params"),
     "no params": (lambda: run(params=None), "it names 'c'.*params was not given"),
     "velocity in g": (lambda: run(jl.System(energy, holonomic=lambda q, qdot: q)), "`holonomic` must name arguments that exist, but it names 'qdot'"),
