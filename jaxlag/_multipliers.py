@@ -1,6 +1,5 @@
 """The constrained solve: x and λ of  M x = f + Gᵀλ,  G x = c."""
 
-from collections.abc import Callable
 from typing import NamedTuple
 
 import jax
@@ -72,7 +71,7 @@ def _solver(M, G):
         by_inertia, determined = lambda B: _solve(augmented, factor, B), _is_positive(factor, augmented)
     mobility = by_inertia(G.T)
     S = G @ mobility
-    inverse = least_norm(S)
+    inverse = lambda r: least_norm(S, r[:, None])[:, 0]
 
     def solve(f, c):
         free = by_inertia((f + G.T @ (W * c))[:, None])[:, 0]
@@ -122,34 +121,41 @@ def _solve(A, factor, B):
     return jax.lax.custom_linear_solve(lambda X: A @ X, B, by_factor, symmetric=True)
 
 
-def least_norm(S: Float[Array, "m m"]) -> Callable[[Array], Array]:
-    """r ↦ S⁺r with the Moore–Penrose inverse of a symmetric positive semidefinite S.
+@jax.custom_jvp
+def least_norm(S: Float[Array, "m m"], R: Float[Array, "m k"]) -> Float[Array, "m k"]:
+    """S⁺R with the Moore–Penrose inverse of a symmetric positive semidefinite S.
 
     The rank is judged on S scaled to a unit diagonal, so that it does not depend on the units of the constraints: eigenvalues
     below τ = eps^(5/8) (1.6e-10 in double precision) of the largest, which is at most m, count as zero. None does where S − m τ 1
     has a Cholesky factorisation, and then that of S serves.
     """
     m = S.shape[0]
-    if m == 0:
-        return lambda r: r
-    if m == 1:
-        inverse = jnp.where(S > 0, 1 / jnp.where(S > 0, S, 1), 0)
-        return lambda r: inverse @ r
+    if m < 2:
+        return jnp.where(S > 0, R / jnp.where(S > 0, S, 1), 0) if m else R
     size = jnp.diagonal(S)
     D = jnp.where(size > 0, jax.lax.rsqrt(jnp.where(size > 0, size, 1)), 1)
     scaled = S * jnp.outer(D, D)
-    least = m * jnp.finfo(S.dtype).eps ** 0.625
-    regular = everywhere(jnp.all(jnp.diagonal(jnp.linalg.cholesky(scaled - least * jnp.eye(m, dtype=S.dtype))) > 0))
-    factor = jnp.linalg.cholesky(scaled)
+    least, one = m * jnp.finfo(S.dtype).eps ** 0.625, jnp.eye(m, dtype=S.dtype)
+    regular = everywhere(jnp.all(jnp.diagonal(jnp.linalg.cholesky(scaled - least * one)) > 0))
     singular = jax.lax.cond(regular, lambda: jnp.zeros_like(S), lambda: _by_eigenvalues(scaled, D))
-    of_columns = lambda R: jnp.where(regular, D[:, None] * jax.scipy.linalg.cho_solve((factor, True), D[:, None] * R), singular @ R)
-    return lambda r: of_columns(r) if r.ndim == 2 else of_columns(r[:, None])[:, 0]
+    factor = jnp.linalg.cholesky(jnp.where(regular, scaled, one))
+    by_factor = D[:, None] * jax.scipy.linalg.cho_solve((factor, True), D[:, None] * R)
+    return jnp.where(regular, by_factor, singular @ R)
 
 
-@jax.custom_jvp
+@least_norm.defjvp
+def _least_norm_jvp(primals, tangents):
+    # Golub & Pereyra 1973, eq. 4.12, for constant rank: P = S⁺ turns with its null space, that of N = 1 − S P.
+    (S, R), (dS, dR) = primals, tangents
+    P = lambda X: least_norm(S, X)
+    N = lambda X: X - S @ P(X)
+    X = P(R)
+    return X, P(dR - dS @ X) + N(dS @ P(X)) + P(P(dS @ N(R)))
+
+
 def pseudo_inverse(S: Float[Array, "m m"]) -> Float[Array, "m m"]:
-    """Moore–Penrose inverse of a symmetric positive semidefinite S, by `least_norm`."""
-    return least_norm(S)(jnp.eye(len(S), dtype=S.dtype))
+    """Moore–Penrose inverse of a symmetric positive semidefinite S."""
+    return least_norm(S, jnp.eye(len(S), dtype=S.dtype))
 
 
 def _by_eigenvalues(scaled, D):
@@ -162,16 +168,6 @@ def _by_eigenvalues(scaled, D):
     null = jnp.linalg.solve(V.T @ V + jnp.diag(kept.astype(scaled.dtype)), V.T)
     out = jnp.eye(len(D), dtype=scaled.dtype) - V @ null
     return out @ inverse @ out
-
-
-@pseudo_inverse.defjvp
-def _pseudo_inverse_jvp(primals, tangents):
-    # Golub & Pereyra 1973, eq. 4.12, for constant rank.
-    (S,), (dS,) = primals, tangents
-    P = pseudo_inverse(S)
-    null = jnp.eye(S.shape[0], dtype=S.dtype) - P @ S
-    across = null @ dS @ P @ P
-    return P, across + across.T - P @ dS @ P
 
 
 def constrained_acceleration(flat: Flat, t, q, v, feedback=None) -> SaddlePoint:

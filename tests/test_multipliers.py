@@ -54,6 +54,28 @@ def test_pseudo_inverse_derivatives_at_constant_rank():
     np.testing.assert_allclose(second, (P(h) - 2 * P(0) + P(-h)) / h**2, rtol=1e-3, atol=1e-3)
 
 
+def test_second_derivatives_where_rows_depend_on_each_other():
+    """Along a curve of constant rank, forward over forward and reverse over forward, against central differences of NumPy's solution."""
+    rng = np.random.default_rng(5)
+    M, f = np.diag(rng.uniform(1, 2, 6)), rng.normal(size=6)
+    A, B, dB = rng.normal(size=(4, 2)), *rng.normal(size=(2, 2, 6))
+    rows = lambda s: A @ (B + s * dB)
+
+    def solution(s):
+        x = saddle_point(lx.MatrixLinearOperator(jnp.asarray(M)), rows(s), jnp.asarray(f), jnp.zeros(4))
+        return jnp.concatenate([x.x, x.multipliers])
+
+    def expected(s):
+        G = rows(s)
+        multipliers = -np.linalg.pinv(G @ np.linalg.solve(M, G.T), rcond=1e-10, hermitian=True) @ G @ np.linalg.solve(M, f)
+        return np.r_[np.linalg.solve(M, f + G.T @ multipliers), multipliers]
+
+    h = 1e-3
+    second = (-expected(2 * h) + 16 * expected(h) - 30 * expected(0.0) + 16 * expected(-h) - expected(-2 * h)) / (12 * h**2)
+    for outer in (jax.jacfwd, jax.jacrev):
+        np.testing.assert_allclose(outer(jax.jacfwd(solution))(0.0), second, rtol=1e-5, atol=1e-5)
+
+
 def test_a_constraint_written_twice():
     state = pendulum.cartesian_state(0.7, 1.3, 1.0)
     rod = pendulum.cartesian_rod
