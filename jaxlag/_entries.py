@@ -40,7 +40,10 @@ def evaluate(closed: Any, algebra: Algebra, *arguments: Any, limit: int | float 
 
 
 def opened(closed: Any, reader: "Reader") -> tuple[Arrays, Arrays]:
-    """Inputs and outputs of a jaxpr in which all but known numbers is an argument: what it closes over, traced, comes first."""
+    """Inputs and outputs of a jaxpr in which all but known numbers is an argument: what it closes over, traced, comes first.
+
+    **Raises:** as `evaluate`, and `TooLong` where it has effects, or arguments that are no numbers.
+    """
     jaxpr = closed.jaxpr.replace(constvars=[], invars=[*closed.jaxpr.constvars, *closed.jaxpr.invars])
     if closed.effects or any(map(is_extended, jaxpr.invars)):
         raise TooLong

@@ -11,7 +11,8 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
-LONG = 320  # operations: two links with one variation have 334, and take a seventh of the time; the vehicle's 206 would take twice as long
+# Operations. Two links with one variation have 334, and take a seventh of the time; the vehicle has 206, and would take over twice as long.
+LONG = 320
 SMALL = 1024  # bytes, in and out
 
 
@@ -39,6 +40,7 @@ def _bytes(tree: Any) -> int:
 
 
 def _is_long(function: Callable, *given: Any) -> bool:
+    """Whether it is worth a loop: never on a GPU, which would ask its host at each turn whether there is another."""
     if jax.default_backend() != "cpu":
         return False
     arrays, static = eqx.partition(given, eqx.is_array)

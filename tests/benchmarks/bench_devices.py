@@ -46,7 +46,7 @@ def main():
             times.append(seconds(devices))
     all_, one = (statistics.median(times) for times in taken.values())
     rows = [Row(f"{cores} devices, one for each core", seconds=all_, ratio=1.0), Row("one device", seconds=one, ratio=one / all_)]
-    record("devices", {"1024 parameter sets": rows})
+    record("devices", [("1024 parameter sets", rows)])
 
 
 if __name__ == "__main__":

@@ -85,7 +85,7 @@ def main(processes=7):
         for row in rows:
             row.ratio = row.seconds / rows[0].seconds
         tables[task] = rows
-    record("first use", tables)
+    record("first use", tables.items())
 
 
 if __name__ == "__main__":

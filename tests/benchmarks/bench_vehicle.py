@@ -135,7 +135,7 @@ def main():
     tables["1024 parameter sets, error ≤ 1e-6"] = many(found, missing)
     tables["value and gradient in b, c, k"] = gradient(found, missing, starts)
     tables["fit of b, c, k"] = fit(found, missing, starts)
-    record("vehicle", tables)
+    record("vehicle", tables.items())
 
 
 if __name__ == "__main__":

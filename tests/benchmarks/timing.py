@@ -109,10 +109,9 @@ def duration(seconds: float | None) -> str:
     return f"{seconds / size:.3g} {unit}"
 
 
-def record(topic: str, tables: Mapping[str, Iterable[Row]] | Iterable[tuple[str, Iterable[Row]]]) -> None:
+def record(topic: str, tables: Iterable[tuple[str, list[Row]]]) -> None:
     """Shows each table as soon as it is there, and keeps it in `results.json` in place of its older one."""
-    for task, rows in tables.items() if isinstance(tables, Mapping) else tables:
-        rows = list(rows)
+    for task, rows in tables:
         show(f"{topic}: {task}", rows)
         kept = json.loads(RESULTS.read_text()) if RESULTS.exists() else {}
         kept["machine"] = {"cores": os.cpu_count(), "processor": platform.machine(), "jax": jax.__version__}
