@@ -13,6 +13,8 @@ import numpy as np
 from jax.extend.core import ClosedJaxpr, Literal, jaxpr_as_fun
 from jaxtyping import Array, Float
 
+from ._entries import evaluate
+from ._folding import Algebra
 from ._system import Flat, role
 
 
@@ -111,24 +113,27 @@ class _Term(NamedTuple):
     def has_kink(self, arguments, key) -> bool:
         """Whether ∂D/∂u at u = 0 is anything but zero, judged at random numbers; refuses kinks of what is not affine in q̇."""
         rng = np.random.default_rng(0)
-        with jax.ensure_compile_time_eval():
-            consts, (t, q, v, multipliers) = jax.tree.map(lambda x: _drawn(rng, x), (list(self.closed.consts), arguments))
+        drawn = jax.tree.map(lambda x: _drawn(rng, x), (list(self.closed.consts), arguments))
+
+        def slope_and_bend(consts, arguments):
+            t, q, v, multipliers = arguments
             slip = lambda v: self.groups((t, q, v, multipliers), consts)[key].slip
-            at = jnp.zeros_like(self.groups((t, q, v, multipliers), consts)[key].slip[..., 0] if self._is_norm(arguments, key) else slip(v))
-            D = lambda u: self.evaluate((t, q, v, multipliers), lambda k, _: u if k == key else None, consts)
-            if not np.any(np.asarray(jax.grad(D)(at)) != 0):
-                return False
+            group = self.groups(arguments, consts)[key]
             along = lambda v, w: jax.jvp(slip, (v,), (w,))[1]
-            bend = jax.jvp(lambda v: along(v, v * 0 + 1), (v,), (jnp.asarray(rng.uniform(0.5, 1.5, v.shape), v.dtype),))[1]
-        if np.any(np.abs(np.asarray(bend)) > 1e-9):
+            D = lambda u: self.evaluate(arguments, lambda k, _: u if k == key else None, consts)
+            at_rest = jnp.zeros_like(group.slip[..., 0] if group.is_norm else group.slip)
+            bend = jax.jvp(lambda v: along(v, v * 0 + 1), (v,), (_drawn(rng, v),))[1]
+            return jax.grad(D)(at_rest), bend
+
+        slope, bend = evaluate(jax.make_jaxpr(slope_and_bend)(*drawn), Algebra(), *jax.tree.leaves(drawn))
+        if not np.any(slope != 0):
+            return False
+        if np.any(np.abs(bend) > 1e-9):
             raise ValueError(
                 f"{self.spoken} must have its kinks in slip velocities that are affine in qdot, but one is not. "
                 "Take the absolute value or norm of a relative velocity itself."
             )
         return True
-
-    def _is_norm(self, arguments, key):
-        return self.groups(arguments)[key].is_norm
 
     def evaluate(self, arguments, replaced: Callable[[int, _Group], Any], consts=None) -> Any:
         """D, with `replaced(number, group)` in place of each abs and norm of a velocity; None leaves it."""
@@ -182,8 +187,8 @@ def _apply(whole, eqn, values):
 
 def _drawn(rng, x):
     if jnp.issubdtype(x.dtype, jnp.floating):
-        return jnp.asarray(rng.uniform(0.5, 1.5, x.shape), x.dtype)
-    return jnp.ones(x.shape, x.dtype)
+        return np.asarray(rng.uniform(0.5, 1.5, x.shape), x.dtype)
+    return np.ones(x.shape, x.dtype)
 
 
 def _slip_in(eqn, ins) -> tuple[tuple[_Node, ...], bool] | None:

@@ -15,17 +15,20 @@ from ._system import Flat
 class SaddlePoint(NamedTuple):
     """Solution of the constrained solve; `determined` is false where M leaves a direction free that no constraint holds."""
 
-    x: Float[Array, " n"]
-    multipliers: Float[Array, " m"]
+    x: Float[Array, "n *k"]
+    multipliers: Float[Array, "m *k"]
     determined: Bool[Array, ""]
 
 
 def saddle_point(M: lx.AbstractLinearOperator, G: Float[Array, "m n"], f, c) -> SaddlePoint:
     """The unique x and the λ of least norm with M x = f + Gᵀλ and G x = c.
 
-    M need be positive definite on the null space of G only, and rows of G may depend on each other. Where M is seen to be
-    diagonal, as of points in Cartesian coordinates, it is divided by, unless a mass is (next to) nothing beside another.
+    f and c are vectors, or as many columns each. M need be positive definite on the null space of G only, and rows of G may depend on
+    each other. Where M is seen to be diagonal, as of points in Cartesian coordinates, it is divided by, unless a mass is (next to) nothing beside another.
     """
+    if f.ndim == 1:
+        x, multipliers, determined = saddle_point(M, G, f[:, None], c[:, None])
+        return SaddlePoint(x[:, 0], multipliers[:, 0], determined)
     if not isinstance(M, lx.DiagonalLinearOperator):
         return _saddle_point(M, G, f, c)
     heavy = M.diagonal > jnp.finfo(f.dtype).eps ** 0.25 * jnp.max(jnp.abs(M.diagonal))
@@ -50,7 +53,7 @@ def _saddle_point_jvp(primals, tangents):
     (M, G, f, c), (dM, dG, df, dc) = primals, tangents
     x, multipliers, determined = _saddle_point(M, G, f, c)
     solve, turned, _ = _solver(M, G)
-    dx, d_multipliers = solve(df + dG.T @ multipliers - dM.mv(x), dc - dG @ x)
+    dx, d_multipliers = solve(df + dG.T @ multipliers - jax.vmap(dM.mv, 1, 1)(x), dc - dG @ x)
     return SaddlePoint(x, multipliers, determined), SaddlePoint(
         dx, d_multipliers + turned(dG, multipliers), np.zeros(jnp.shape(determined), jax.dtypes.float0)
     )
@@ -71,10 +74,10 @@ def _solver(M, G):
         by_inertia, determined = lambda B: _solve(augmented, factor, B), _is_positive(factor, augmented)
     mobility = by_inertia(G.T)
     S = G @ mobility
-    inverse = lambda r: least_norm(S, r[:, None])[:, 0]
+    inverse = lambda r: least_norm(S, r)
 
     def solve(f, c):
-        free = by_inertia((f + G.T @ (W * c))[:, None])[:, 0]
+        free = by_inertia(f + G.T @ (W[:, None] * c))
         multipliers = inverse(c - G @ free)
         return free + mobility @ multipliers, multipliers
 
@@ -127,14 +130,14 @@ def least_norm(S: Float[Array, "m m"], R: Float[Array, "m k"]) -> Float[Array, "
 
     The rank is judged on S scaled to a unit diagonal, so that it does not depend on the units of the constraints: eigenvalues
     below τ = eps^(5/8) (1.6e-10 in double precision) of the largest, which is at most m, count as zero. None does where S − m τ 1
-    has a Cholesky factorisation, and then that of S serves.
+    has a Cholesky factorisation, and then that of S serves. A row of nothing but zeros has no part in it.
     """
     m = S.shape[0]
     if m < 2:
         return jnp.where(S > 0, R / jnp.where(S > 0, S, 1), 0) if m else R
-    size = jnp.diagonal(S)
-    D = jnp.where(size > 0, jax.lax.rsqrt(jnp.where(size > 0, size, 1)), 1)
-    scaled = S * jnp.outer(D, D)
+    there = jnp.diagonal(S) > 0
+    D = jnp.where(there, jax.lax.rsqrt(jnp.where(there, jnp.diagonal(S), 1)), 0)
+    scaled = S * jnp.outer(D, D) + jnp.diag(~there).astype(S.dtype)
     least, one = m * jnp.finfo(S.dtype).eps ** 0.625, jnp.eye(m, dtype=S.dtype)
     regular = everywhere(jnp.all(jnp.diagonal(jnp.linalg.cholesky(scaled - least * one)) > 0))
     singular = jax.lax.cond(regular, lambda: jnp.zeros_like(S), lambda: _by_eigenvalues(scaled, D))
@@ -175,11 +178,15 @@ def constrained_acceleration(flat: Flat, t, q, v, feedback=None) -> SaddlePoint:
     M, inertial = inertia(flat, t, q, v)
     _, G, gamma = constraint_rows(flat, t, q, v)
     c = -gamma if feedback is None else -gamma - feedback(flat, t, q, v)
-    solved = lambda multipliers: saddle_point(M, G, inertial + applied_force(flat, t, q, v, multipliers), c)
-    multipliers = jnp.zeros(G.shape[0], v.dtype)
-    if flat.needs_multipliers:
-        multipliers = _self_consistent(lambda multipliers: solved(multipliers).multipliers, multipliers)
-    return solved(multipliers)
+    force = lambda multipliers: applied_force(flat, t, q, v, multipliers)
+    if not flat.needs_multipliers:
+        return saddle_point(M, G, inertial + force(jnp.zeros_like(c)), c)
+    # The solution is affine in the force, which is part of it by λ: one solve says how.
+    beside = lambda vector, matrix: jnp.concatenate([vector[:, None], matrix], axis=1)
+    columns = saddle_point(M, G, beside(inertial, jnp.eye(v.size, dtype=v.dtype)), beside(c, jnp.zeros((c.size, v.size), v.dtype)))
+    affine = lambda columns, force: columns[:, 0] + columns[:, 1:] @ force
+    multipliers = _self_consistent(lambda multipliers: affine(columns.multipliers, force(multipliers)), jnp.zeros_like(c))
+    return SaddlePoint(affine(columns.x, force(multipliers)), multipliers, columns.determined)
 
 
 def _self_consistent(reaction, start):
