@@ -1,7 +1,7 @@
 """Steps of the integration: put back on the constraints, cut where friction changes its mode, and begun anew where an input jumps."""
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import diffrax as dfx
 import equinox as eqx
@@ -18,8 +18,9 @@ from ._signal import delayed
 from ._system import EXPLICIT_TIME
 
 LOOKS = 4  # how often a step looks for an end of the mode, at its end the last time
-BISECTIONS = 40
-NEWTON_STEPS = 3  # the first makes the time right, the second its derivative, the third its second derivative
+SECTIONS = 20  # of a step, each into as many parts: 4²⁰ = 10¹²
+NEWTON_STEPS = 3  # the first makes the time right and its derivative, the others its higher derivatives
+LAST = NEWTON_STEPS + 1  # pieces: the whole step, those up to the end of a mode, the rest
 
 
 class AtSamples(dfx.AbstractAdjoint):
@@ -140,11 +141,39 @@ class TwoPieces(dfx.AbstractLocalInterpolation):
         return jnp.where(before, self.first.evaluate(t0), self.second.evaluate(t0))
 
 
+class Piece(NamedTuple):
+    """A step or a part of one: its end, error, dense output, the state of the solver, and whether it succeeded."""
+
+    y: Any
+    error: Any
+    dense: Any
+    state: Any
+    result: dfx.RESULTS
+
+
+class Turn(NamedTuple):
+    """What is known of a step that may have the end of a mode in it: the pieces before and after it; where the first of them ends, and
+    would better have ended; the slopes of the margins; y in the next mode; whether a mode ends, the next agrees with its forces,
+    and the pieces can be used.
+    """
+
+    first: Piece
+    second: Piece
+    cut: Any
+    next_cut: Any
+    slope: Any
+    y_new: Any
+    ended: Any
+    possible: Any
+    usable: Any
+
+
 class StickSlipSolver(Kept):
     """A `Kept` solver that ends a mode of friction where it ends, inside the step.
 
-    The end of the mode is bracketed on the dense output, located by bisection, and made exact by Newton's step on the step itself,
-    so that it is differentiated. From there the step goes on in the new mode. A step with a second end is rejected.
+    The end of the mode is bracketed on the dense output, narrowed down there, and made exact by Newton's steps on the step itself, so
+    that it is differentiated; their slope is not, for it decides how fast they converge and not to what. From there the step goes on
+    in the new mode. A step with a second end is rejected. All pieces are turns of one loop, so that the equations are compiled once.
     """
 
     equations: Equations = eqx.field(static=True)
@@ -159,62 +188,75 @@ class StickSlipSolver(Kept):
 
     def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
         y0, begins = self._begun(t0, y0, args, made_jump)
-        piece = lambda *given: self._stepped(terms, *given[:3], args, *given[3:])
-        looked = lambda a, b, dense: self._looks(a, b, dense, args)
-        y1, error, dense, state, result = piece(t0, t1, y0, solver_state, made_jump)
-        ended = jnp.any(looked(t0, t1, dense) < 0, axis=1)
-        plain = y1, error, {"cut": t1, "first": dense, "second": dense}, state
+        piece = lambda *given: Piece(*self._stepped(terms, *given[:3], args, *given[3:]))
+        given = t0, t1, y0, solver_state, jnp.asarray(made_jump)
+        nothing = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), jax.eval_shape(piece, *given))
+        no = jnp.array(False)
+        start = Turn(nothing, nothing, t1, t1, jnp.zeros(self.equations.elements, y0.dtype), y0, no, no, no)
 
-        def newton(carry, _):
-            cut, _ = carry
-            done = piece(t0, cut, y0, solver_state, made_jump)
-            value, slope = jax.jvp(
-                lambda t, y: self.equations.margins(t, y, args),
-                (cut, done[0]),
-                (jnp.ones_like(cut), self.equations.rates(cut, done[0], args)),
-            )
-            falling = slope < 0
-            until = jnp.where(falling, jnp.abs(value) / jnp.where(falling, -slope, 1), jnp.inf)
-            nearest = jax.lax.stop_gradient(jnp.argmin(until))
-            better = cut - value[nearest] / jnp.where(falling[nearest], slope[nearest], -jnp.inf)
-            return (better, cut), (done, jnp.arange(value.size) == nearest, jnp.any(falling))
+        def turn(before, count):
+            """One piece of the step: the whole at first; if a mode ends in it, what comes before that; and what comes after."""
+            looks, after = (count == 0) | (count == LAST), count == LAST
+            begin, end = jnp.where(after, before.cut, t0), jnp.where(looks, t1, before.next_cut)
+            state = jax.tree.map(lambda new, old: jnp.where(after, new, old), before.first.state, solver_state)
+            done = piece(begin, end, jnp.where(after, before.y_new, y0), state, after | made_jump)
 
-        def cut_in_two(_):
-            rough = self._bisected(t0, t1, dense, ended, args)
-            (_, cut), done = jax.lax.scan(newton, (rough, rough), length=NEWTON_STEPS)
-            (y_cut, error_1, first, state_1, _), which, falling = jax.tree.map(lambda leaf: leaf[-1], done)
-            y_new, possible, ready = self.equations.changed(cut, y_cut, args, which)
-            y_end, error_2, second, state_2, _ = piece(cut, t1, y_new, state_1, True)
-            again = jnp.any(looked(cut, t1, second) < 0)
-            usable = ready & ~again & (cut >= t0) & (cut < t1) & falling
-            error = jnp.where(usable, jnp.maximum(jnp.abs(error_1), jnp.abs(error_2)), jnp.inf)
-            return (y_end, error, {"cut": cut, "first": first, "second": second}, state_2), possible | ~usable
+            def look():
+                found, time, slope = self._first_end(begin, end, done.dense, args)
+                return jax.lax.cond(
+                    after,
+                    lambda: before._replace(second=done, usable=before.usable & ~found),
+                    lambda: before._replace(first=done, second=done, ended=found, next_cut=time, slope=slope),
+                )
 
-        (y1, error, dense, state), possible = jax.lax.cond(jnp.any(ended), cut_in_two, lambda _: (plain, jnp.array(True)), None)
+            def locate():
+                value = self.equations.margins(end, done.y, args)
+                falling = before.slope < 0
+                until = jnp.where(falling, jnp.abs(value) / jnp.where(falling, -before.slope, 1), jnp.inf)
+                nearest = jax.lax.stop_gradient(jnp.argmin(until))
+                better = end - value[nearest] / jnp.where(falling[nearest], before.slope[nearest], -jnp.inf)
+                usable = jnp.any(falling) & (end >= t0) & (end < t1)
+                located = before._replace(first=done, cut=end, next_cut=better, usable=usable)
+                return jax.lax.cond(
+                    count == LAST - 1, lambda: self._changed(located, jnp.arange(value.size) == nearest, args), lambda: located
+                )
+
+            return jax.lax.cond(looks, look, locate)
+
+        step = lambda before, count: (jax.lax.cond((count == 0) | before.ended, turn, lambda before, _: before, before, count), None)
+        made, _ = jax.lax.scan(step, start, np.arange(LAST + 1))
+        first, second, ended = made.first, made.second, made.ended
+        cut = jnp.where(ended, made.cut, t1)
+        error = jnp.where(ended, jnp.maximum(jnp.abs(first.error), jnp.abs(second.error)), first.error)
+        error = jnp.where(~ended | made.usable, error, jnp.inf)
+        possible = ~ended | made.possible | ~made.usable
         refused = dfx.RESULTS.where(possible & begins, dfx.RESULTS.successful, dfx.RESULTS.internal_error)
-        refused = dfx.RESULTS.where(self.equations.exhausted(y1), dfx.RESULTS.max_steps_rejected, refused)
-        return y1, error, dense, state, dfx.RESULTS.where(result == dfx.RESULTS.successful, refused, result)
+        refused = dfx.RESULTS.where(self.equations.exhausted(second.y), dfx.RESULTS.max_steps_rejected, refused)
+        result = dfx.RESULTS.where(first.result == dfx.RESULTS.successful, refused, first.result)
+        return second.y, error, {"cut": cut, "first": first.dense, "second": second.dense}, second.state, result
 
-    def _looks(self, t0, t1, dense, args) -> Float[Array, "looks e"]:
-        """Margins at a few times within a step."""
+    def _changed(self, turn, which, args):
+        """With the state in the mode that follows the end of those `which`."""
+        y, possible, ready = self.equations.changed(turn.cut, turn.first.y, args, which)
+        return turn._replace(y_new=y, possible=possible, usable=turn.usable & ready)
+
+    def _first_end(self, t0, t1, dense, args):
+        """Whether a mode ends within a step, when the first does on the dense output, and the slopes of the margins there."""
+        t0, t1, dense, args = jax.lax.stop_gradient((t0, t1, dense, args))
         path = self.solver.interpolation_cls(t0=t0, t1=t1, **dense)
-        times = t0 + (t1 - t0) * jnp.arange(1, LOOKS + 1) / LOOKS
-        return jax.lax.stop_gradient(jax.vmap(lambda t: self.equations.margins(t, path.evaluate(t), args))(times))
+        margins = lambda t: self.equations.margins(t, path.evaluate(t), args)
 
-    def _bisected(self, t0, t1, dense, ended, args):
-        """The time at which the first margin crosses zero on the dense output."""
-        path = self.solver.interpolation_cls(t0=t0, t1=t1, **dense)
-        first = jnp.argmax(ended)
+        def narrower(carry):
+            turn, low, width, _ = carry
+            beyond = jnp.any(jax.vmap(margins)(low + width * np.arange(1, LOOKS + 1) / LOOKS) < 0, axis=1)
+            ended = jnp.any(beyond)
+            part = jnp.where(ended, jnp.argmax(beyond), LOOKS - 1)  # the end itself may be beyond by rounding alone
+            return turn + 1, low + part * width / LOOKS, width / LOOKS, carry[3] | ((turn == 0) & ended)
 
-        def halve(_, bracket):
-            low, high = bracket
-            middle = 0.5 * (low + high)
-            over = jnp.any(self.equations.margins(middle, path.evaluate(middle), args) < 0)
-            return jnp.where(over, low, middle), jnp.where(over, middle, high)
-
-        width = (t1 - t0) / LOOKS
-        bracket = jax.lax.stop_gradient((t0 + first * width, t0 + (first + 1) * width))
-        return jax.lax.stop_gradient(jax.lax.fori_loop(0, BISECTIONS, halve, bracket)[1])
+        going_on = lambda carry: (carry[0] == 0) | (carry[3] & (carry[0] < SECTIONS))
+        _, low, width, ended = jax.lax.while_loop(going_on, narrower, (0, t0, t1 - t0, jnp.array(False)))
+        _, slope = jax.jvp(margins, (low + width,), (jnp.ones_like(low),))
+        return ended, low + width, slope
 
 
 @eqx.filter_jit
