@@ -1,7 +1,8 @@
 """Long programs of few numbers as one kernel each.
 
 On a CPU, XLA runs what it has fused as kernels that are called one by one, at some 0.15 µs each, but compiles a loop whole if one turn
-of it reads and writes less than 1 kB. So a long program with few numbers in and out is put into a loop of its own, which turns once.
+of it reads and writes less than 1 kB. So a long program with few numbers in and out is put into a loop of its own, which turns once; and so is a short one among the
+stages of a step that are together too many numbers for a small loop.
 """
 
 from collections.abc import Callable
@@ -13,6 +14,7 @@ import jax.numpy as jnp
 
 # Operations. Two links with one variation have 334, and take a seventh of the time; the vehicle has 206, and would take over twice as long.
 LONG = 320
+WIDE = 16  # rows of the result. From here on the stages of a step are no small loop: 8 coordinates take 42 µs a step against 4.5
 SMALL = 1024  # bytes, in and out
 
 
@@ -21,7 +23,8 @@ def in_one_kernel(function: Callable) -> Callable:
 
     def turned(*given):
         value = eqx.filter_eval_shape(function, *given)
-        if _bytes((given, value)) > SMALL or not _is_long(function, *given):
+        pays = _bytes((given, value)) <= SMALL and (_rows(value) >= WIDE or _is_long(function, *given))
+        if jax.default_backend() != "cpu" or not pays:  # a GPU would ask its host at each turn whether there is another
             return function(*given)
         return _once(lambda: function(*given), value, given)
 
@@ -39,10 +42,11 @@ def _bytes(tree: Any) -> int:
     return sum(x.size * x.dtype.itemsize for x in jax.tree.leaves(tree) if eqx.is_array(x) or isinstance(x, jax.ShapeDtypeStruct))
 
 
+def _rows(tree: Any) -> int:
+    return max(x.shape[0] if x.ndim else 1 for x in jax.tree.leaves(tree))
+
+
 def _is_long(function: Callable, *given: Any) -> bool:
-    """Whether it is worth a loop: never on a GPU, which would ask its host at each turn whether there is another."""
-    if jax.default_backend() != "cpu":
-        return False
     arrays, static = eqx.partition(given, eqx.is_array)
     return _length(jax.make_jaxpr(lambda arrays: function(*eqx.combine(arrays, static)))(arrays).jaxpr) >= LONG
 

@@ -23,8 +23,9 @@ class SaddlePoint(NamedTuple):
 def saddle_point(M: lx.AbstractLinearOperator, G: Float[Array, "m n"], f, c) -> SaddlePoint:
     """The unique x and the λ of least norm with M x = f + Gᵀλ and G x = c.
 
-    f and c are vectors, or as many columns each. M need be positive definite on the null space of G only, and rows of G may depend on
-    each other. Where M is seen to be diagonal, as of points in Cartesian coordinates, it is divided by, unless a mass is (next to) nothing beside another.
+    f and c are vectors, or as many columns each. M need be positive definite on the null space of G only, and rows of G may
+    depend on each other. Where M is seen to be diagonal, as of points in Cartesian coordinates, it is divided by, unless a mass is
+    (next to) nothing beside another.
     """
     if f.ndim == 1:
         x, multipliers, determined = saddle_point(M, G, f[:, None], c[:, None])

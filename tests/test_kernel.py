@@ -1,4 +1,4 @@
-"""Long programs in a loop that turns once: the same values and derivatives, and only where it pays."""
+"""Programs in a loop that turns once: the same values and derivatives, and only where it pays."""
 
 import jax
 import jax.numpy as jnp
@@ -45,9 +45,15 @@ def test_a_number_that_is_none_gives_none_and_ends():
 
 @pytest.mark.parametrize(
     "function, y, turns",
-    [(long, jnp.arange(4.0), True), (lambda t, y, args: t * y, jnp.arange(4.0), False), (long, jnp.arange(200.0), False)],
+    [
+        (long, jnp.arange(4.0), True),
+        (lambda t, y, args: t * y, jnp.arange(4.0), False),
+        (lambda t, y, args: t * y, jnp.arange(16.0), True),
+        (long, jnp.arange(200.0), False),
+    ],
+    ids=["long", "short", "of many rows", "of too many numbers"],
 )
-def test_only_long_programs_of_few_numbers_turn(function, y, turns):
+def test_only_programs_that_gain_by_it_turn(function, y, turns):
     assert loops(in_one_kernel(function), GIVEN[0], y, GIVEN[2]) == turns
 
 
