@@ -1,8 +1,8 @@
 """Long programs of few numbers as one kernel each.
 
 On a CPU, XLA runs what it has fused as kernels that are called one by one, at some 0.15 µs each, but compiles a loop whole if one turn
-of it reads and writes less than 1 kB. So a long program with few numbers in and out is put into a loop of its own, which turns once; and so is a short one among the
-stages of a step that are together too many numbers for a small loop.
+of it reads and writes less than 1 kB. So a long program with few numbers in and out is put into a loop of its own, which turns once;
+and so is a short one among the stages of a step that are together too many numbers for a small loop.
 """
 
 from collections.abc import Callable

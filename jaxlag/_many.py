@@ -2,7 +2,7 @@
 
 import dataclasses
 import functools
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import diffrax as dfx
@@ -122,9 +122,7 @@ def _simulate_many(system, how, steps, own, shared, ts, tolerances):
         batch = lambda own, *given: _side_by_side(system, equations, how, own, eqx.combine(given[0], rest), *given[1:])
     else:
         one = lambda own, *given: _alone(system, how, eqx.combine(own, given[0], rest), *given[1:])
-        batch = lambda own, *given: jax.lax.map(lambda own: one(own, *given), own)
-        if jax.default_backend() != "cpu":
-            batch = lambda own, *given: jax.vmap(lambda own: one(own, *given))(own)
+        batch = lambda own, *given: of_each(lambda own: one(own, *given), own)
     if min(members, jax.device_count()) > 1:
         devices = Mesh(np.array(jax.devices()), "members")
         own = jax.tree.map(lambda leaf: filled_up(leaf, devices.size), own)
@@ -142,6 +140,14 @@ def _common(steps, equations, params, own):
             '"common". Leave it out.'
         )
     return steps != "own" and not obstacle
+
+
+def of_each(function: Callable, members: PyTree) -> PyTree:
+    """`function` of each member, each with steps of its own.
+
+    In turn on a CPU, where in a batch all would go on until the slowest has ended, and pay for both branches of every choice.
+    """
+    return jax.lax.map(function, members) if jax.default_backend() == "cpu" else jax.vmap(function)(members)
 
 
 def filled_up(leaf, size):

@@ -18,7 +18,7 @@ from ._experiment import Experiment, is_within, start_entries
 from ._free import Free
 from ._integrate import simulate
 from ._manifold import consistent_state
-from ._many import filled_up
+from ._many import filled_up, of_each
 from ._mechanics import constraint_rows, position_residual
 from ._results import RESULTS
 from ._system import System
@@ -240,13 +240,14 @@ def members(model: Model, free: Free, stack: Stack, y, z, scale=1.0) -> Member:
 
 
 def side_by_side(of_one: Callable[..., Any], stack: Stack, z: Any, *common: Any) -> Any:
-    """`of_one(e, z, *common)` of each experiment: plainly of one, of several in a batch, on several devices each its part of it."""
+    """`of_one(e, z, *common)` of each experiment; on several devices each its part of them."""
     arrays, others = eqx.partition(stack, eqx.is_array)
-    if len(z) == 1:  # spares `cond` its turning into `select`
+    if len(z) == 1:  # spares a batch of one
         first = lambda tree: jax.tree.map(lambda x: x[0], tree)
         return jax.tree.map(lambda x: x[None], of_one(eqx.combine(first(arrays), others), z[0], *common))
     numbers, rest = eqx.partition(common, eqx.is_array)
-    batch = lambda arrays, z, numbers: jax.vmap(lambda e, z: of_one(eqx.combine(e, others), z, *eqx.combine(numbers, rest)))(arrays, z)
+    one = lambda e, z, numbers: of_one(eqx.combine(e, others), z, *eqx.combine(numbers, rest))
+    batch = lambda arrays, z, numbers: of_each(lambda given: one(*given, numbers), (arrays, z))
     if stack.mesh is None:
         return batch(arrays, z, numbers)
     batch = jax.shard_map(batch, mesh=stack.mesh, in_specs=(ALONG, ALONG, PartitionSpec()), out_specs=ALONG, check_vma=False)

@@ -12,6 +12,7 @@ from jaxtyping import Array
 
 from ._experiment import Experiment
 from ._free import Free
+from ._many import of_each
 from ._prediction import Linearised, Model, Stack, linearised, members, side_by_side, stacked
 from ._results import reason_of
 
@@ -144,7 +145,7 @@ def look(problem: Problem, x: Array) -> Rows:
 @eqx.filter_jit
 def linearise_starts(problem: Problem, xs: Array) -> Rows:
     """One problem at many places."""
-    return jax.vmap(problem.linearise)(xs)
+    return of_each(problem.linearise, xs)
 
 
 def linearise_each(problem: Problem, xs: Array) -> Rows:
