@@ -1,5 +1,6 @@
 """Steps of the integration: put back on the constraints, cut where friction changes its mode, and begun anew where an input jumps."""
 
+import functools
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -194,37 +195,9 @@ class StickSlipSolver(Kept):
         no = jnp.array(False)
         start = Turn(nothing, nothing, t1, t1, jnp.zeros(self.equations.elements, y0.dtype), y0, no, no, no)
 
-        def turn(before, count):
-            """One piece of the step: the whole at first; if a mode ends in it, what comes before that; and what comes after."""
-            looks, after = (count == 0) | (count == LAST), count == LAST
-            begin, end = jnp.where(after, before.cut, t0), jnp.where(looks, t1, before.next_cut)
-            state = jax.tree.map(lambda new, old: jnp.where(after, new, old), before.first.state, solver_state)
-            done = piece(begin, end, jnp.where(after, before.y_new, y0), state, after | made_jump)
-
-            def look():
-                found, time, slope = self._first_end(begin, end, done.dense, args)
-                return jax.lax.cond(
-                    after,
-                    lambda: before._replace(second=done, usable=before.usable & ~found),
-                    lambda: before._replace(first=done, second=done, ended=found, next_cut=time, slope=slope),
-                )
-
-            def locate():
-                value = self.equations.margins(end, done.y, args)
-                falling = before.slope < 0
-                until = jnp.where(falling, jnp.abs(value) / jnp.where(falling, -before.slope, 1), jnp.inf)
-                nearest = jax.lax.stop_gradient(jnp.argmin(until))
-                better = end - value[nearest] / jnp.where(falling[nearest], before.slope[nearest], -jnp.inf)
-                usable = jnp.any(falling) & (end >= t0) & (end < t1)
-                located = before._replace(first=done, cut=end, next_cut=better, usable=usable)
-                return jax.lax.cond(
-                    count == LAST - 1, lambda: self._changed(located, jnp.arange(value.size) == nearest, args), lambda: located
-                )
-
-            return jax.lax.cond(looks, look, locate)
-
-        step = lambda before, count: (jax.lax.cond((count == 0) | before.ended, turn, lambda before, _: before, before, count), None)
-        made, _ = jax.lax.scan(step, start, np.arange(LAST + 1))
+        turn = functools.partial(self._turn, piece, given, args)
+        needed = lambda before, count: jax.lax.cond((count == 0) | before.ended, turn, lambda before, _: before, before, count)
+        made, _ = jax.lax.scan(lambda *turn: (needed(*turn), None), start, np.arange(LAST + 1))
         first, second, ended = made.first, made.second, made.ended
         cut = jnp.where(ended, made.cut, t1)
         error = jnp.where(ended, jnp.maximum(jnp.abs(first.error), jnp.abs(second.error)), first.error)
@@ -234,6 +207,35 @@ class StickSlipSolver(Kept):
         refused = dfx.RESULTS.where(self.equations.exhausted(second.y), dfx.RESULTS.max_steps_rejected, refused)
         result = dfx.RESULTS.where(first.result == dfx.RESULTS.successful, refused, first.result)
         return second.y, error, {"cut": cut, "first": first.dense, "second": second.dense}, second.state, result
+
+    def _turn(self, piece, given, args, before, count):
+        """One piece of the step: the whole at first; if a mode ends in it, what comes before that; and what comes after."""
+        t0, t1, y0, state, made_jump = given
+        looks, after = (count == 0) | (count == LAST), count == LAST
+        begin, end = jnp.where(after, before.cut, t0), jnp.where(looks, t1, before.next_cut)
+        state = jax.tree.map(lambda new, old: jnp.where(after, new, old), before.first.state, state)
+        done = piece(begin, end, jnp.where(after, before.y_new, y0), state, after | made_jump)
+
+        def look():
+            found, time, slope = self._first_end(begin, end, done.dense, args)
+            return jax.lax.cond(
+                after,
+                lambda: before._replace(second=done, usable=before.usable & ~found),
+                lambda: before._replace(first=done, second=done, ended=found, next_cut=time, slope=slope),
+            )
+
+        def locate():
+            value = self.equations.margins(end, done.y, args)
+            falling = before.slope < 0
+            until = jnp.where(falling, jnp.abs(value) / jnp.where(falling, -before.slope, 1), jnp.inf)
+            nearest = jax.lax.stop_gradient(jnp.argmin(until))
+            better = end - value[nearest] / jnp.where(falling[nearest], before.slope[nearest], -jnp.inf)
+            usable = jnp.any(falling) & (end >= t0) & (end < t1)
+            located = before._replace(first=done, cut=end, next_cut=better, usable=usable)
+            which = jnp.arange(value.size) == nearest
+            return jax.lax.cond(count == LAST - 1, lambda: self._changed(located, which, args), lambda: located)
+
+        return jax.lax.cond(looks, look, locate)
 
     def _changed(self, turn, which, args):
         """With the state in the mode that follows the end of those `which`."""

@@ -1,6 +1,8 @@
-"""Exact dry friction against its smooth form at the same error: a chain of 20 blocks that rub on the floor, run to rest.
+"""Exact dry friction: against its smooth form at the same error, and how long it takes to compile.
 
-The error is the largest difference of the final positions from a motion with exact friction at rtol 1e-11.
+A chain of 20 blocks that rub on the floor runs to rest; the error is the largest difference of the final positions from a motion with
+exact friction at rtol 1e-11. Then a pendulum with friction in its joint, by its angle and in Cartesian coordinates, where the friction
+is given or that of the rod's force: first call and each further one, of a motion and of its derivative in all coordinates of the start.
 Run: python tests/benchmarks/bench_friction.py
 """
 
@@ -21,6 +23,27 @@ def energy(q, qdot, c):
 
 chain = jl.System(energy, dissipation={"floor": lambda qdot, F: F * jnp.sum(jnp.abs(qdot))})
 START = np.zeros(20), np.r_[np.zeros(19), 3.0]
+
+
+def sweep(q, qdot):
+    return jnp.abs(q[0] * qdot[1] - q[1] * qdot[0])
+
+
+def on_a_rod(friction):
+    lagrangian = lambda q, qdot: 0.5 * qdot @ qdot - 9.81 * q[1]
+    return jl.System(lagrangian, holonomic={"rod": lambda q: q @ q - 1.0}, dissipation={"joint": friction})
+
+
+by_angle = jl.System(lambda q, qdot: 0.5 * qdot**2 + 9.81 * jnp.cos(q), dissipation={"joint": lambda qdot: 0.1 * jnp.abs(qdot)})
+START_ON_ROD = np.array([0.6, -0.8])
+PENDULA = {
+    "by its angle": (by_angle, np.array(1.0)),
+    "on a rod": (on_a_rod(lambda q, qdot: 0.1 * sweep(q, qdot)), START_ON_ROD),
+    "of the rod's force": (
+        on_a_rod(lambda q, qdot, multipliers: 0.1 * jnp.abs(multipliers["rod"]) * sweep(q, qdot)),
+        START_ON_ROD,
+    ),
+}
 
 
 def run(**how):
@@ -45,6 +68,13 @@ def main():
         motion, first, then = timed(**how)
         error = float(jnp.max(jnp.abs(motion.q[-1] - reference)))
         print(f"{name:<34}{error:10.1e}{int(motion.stats['num_steps']):9d}{first:9.2f}{1e3 * then:9.1f}")
+    print(f"\n{'pendulum':<34}{'motion: first s':>16}{'then ms':>9}{'derivative: first s':>21}{'then ms':>9}")
+    for name, (system, start) in PENDULA.items():
+        motion = jax.jit(lambda q, system=system: jl.simulate(system, q, 0 * q, np.linspace(0, 2, 101)).q)
+        derivative = jax.jit(lambda q, motion=motion: jax.jacfwd(motion)(q))
+        first, first_derivative = (once(lambda action=action: action(start)) for action in (motion, derivative))  # noqa: B023
+        then = medians({"motion": lambda: motion(start), "derivative": lambda: derivative(start)}, rounds=7)  # noqa: B023
+        print(f"{name:<34}{first:16.1f}{1e3 * then['motion']:9.1f}{first_derivative:21.1f}{1e3 * then['derivative']:9.1f}")
 
 
 if __name__ == "__main__":
