@@ -10,10 +10,10 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.extend.core import ClosedJaxpr, Literal, jaxpr_as_fun
+from jax.extend.core import ClosedJaxpr, Literal
 from jaxtyping import Array, Float
 
-from ._entries import evaluate
+from ._entries import evaluate, on_arrays
 from ._folding import Algebra
 from ._system import Flat, role
 
@@ -162,7 +162,7 @@ class _Term(NamedTuple):
                 inner = inner if hasattr(inner, "consts") else ClosedJaxpr(inner, ())
                 known = [node(c, False, None, ("const", id(c))) for c in inner.consts]
                 return run(inner.jaxpr, dict(zip((*inner.jaxpr.constvars, *inner.jaxpr.invars), (*known, *ins), strict=True)))
-            outs = _apply(self.closed.jaxpr, eqn, [n.value for n in ins])
+            outs = on_arrays(eqn)(*(n.value for n in ins))
             made_by, depends = (eqn.primitive.name, tuple(ins), eqn.params), any(n.depends for n in ins)
             key = (eqn.primitive.name, tuple(n.number for n in ins), str(eqn.params))
             return [node(out, depends, made_by, (*key, i)) for i, out in enumerate(outs)]
@@ -176,13 +176,6 @@ class _Term(NamedTuple):
 
 _INLINED = {"jit": "jaxpr", "pjit": "jaxpr", "closed_call": "call_jaxpr", "remat": "jaxpr", "checkpoint": "jaxpr"}
 _CARRIED = {"reshape", "convert_element_type", "copy", "squeeze", "broadcast_in_dim"}
-
-
-def _apply(whole, eqn, values):
-    """One equation of a jaxpr, applied to values: the whole is that equation alone."""
-    given = {var: value for var, value in zip(eqn.invars, values, strict=True) if not isinstance(var, Literal)}
-    alone = whole.replace(constvars=[], invars=list(given), outvars=eqn.outvars, eqns=[eqn], effects=eqn.effects)
-    return jaxpr_as_fun(ClosedJaxpr(alone, ()))(*given.values())
 
 
 def _drawn(rng, x):

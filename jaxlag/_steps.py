@@ -249,14 +249,15 @@ class StickSlipSolver(Kept):
         margins = lambda t: self.equations.margins(t, path.evaluate(t), args)
 
         def narrower(carry):
-            turn, low, width, _ = carry
+            section, low, width, ended = carry
             beyond = jnp.any(jax.vmap(margins)(low + width * np.arange(1, LOOKS + 1) / LOOKS) < 0, axis=1)
-            ended = jnp.any(beyond)
-            part = jnp.where(ended, jnp.argmax(beyond), LOOKS - 1)  # the end itself may be beyond by rounding alone
-            return turn + 1, low + part * width / LOOKS, width / LOOKS, carry[3] | ((turn == 0) & ended)
+            found = jnp.any(beyond)
+            part = jnp.where(found, jnp.argmax(beyond), LOOKS - 1)  # the end itself may be beyond by rounding alone
+            return section + 1, low + part * width / LOOKS, width / LOOKS, ended | ((section == 0) & found)
 
-        going_on = lambda carry: (carry[0] == 0) | (carry[3] & (carry[0] < SECTIONS))
-        _, low, width, ended = jax.lax.while_loop(going_on, narrower, (0, t0, t1 - t0, jnp.array(False)))
+        going_on = lambda section, _low, _width, ended: (section == 0) | (ended & (section < SECTIONS))
+        start = (0, t0, t1 - t0, jnp.array(False))
+        _, low, width, ended = jax.lax.while_loop(lambda carry: going_on(*carry), narrower, start)
         _, slope = jax.jvp(margins, (low + width,), (jnp.ones_like(low),))
         return ended, low + width, slope
 
