@@ -9,7 +9,8 @@ import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
 from jaxtyping import PyTree
 
-from ._checks import at_state, is_concrete
+from ._checks import at_state
+from ._compiled import is_concrete
 from ._friction import settled
 from ._mechanics import constraint_rows
 from ._multipliers import NO_INERTIA, constrained_acceleration, pseudo_inverse

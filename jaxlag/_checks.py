@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Array, PyTree
 
 from ._arguments import call, check_entries, missing
+from ._compiled import compiled, is_concrete
 from ._system import Flat, System, bind, role
 
 
@@ -85,11 +86,6 @@ def sample_times(ts: Any, dtype: Any) -> Array:
     return ts
 
 
-def is_concrete(*trees: PyTree) -> bool:
-    """Whether the numbers are at hand, so that Python may look at them; under `jit` and `vmap` they are not."""
-    return not any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(trees))
-
-
 def check(system: System, t: Array, q: PyTree[Array], qdot: PyTree[Array], params: PyTree) -> None:
     """Refuses functions that return the wrong kind of thing. Shapes only: runs while a program is traced, never with it."""
     for slot in ("lagrangian", "dissipation"):
@@ -122,7 +118,7 @@ def at_state(core: Callable[..., Any], system: System, q: Any, qdot: Any, params
     return _at_state(core, system, jnp.asarray(t, dtype), q, qdot, parameters(params, q))
 
 
-@eqx.filter_jit
+@compiled
 def _at_state(core, system, t, q, qdot, params):
     return core(*checked(system, t, q, qdot, params))
 

@@ -12,7 +12,8 @@ import numpy as np
 from jaxtyping import Array, Float, PyTree
 
 from ._arguments import check_entries
-from ._checks import is_concrete, is_vector, parameters, sample_times, state
+from ._checks import is_vector, parameters, sample_times, state
+from ._compiled import is_concrete
 from ._system import leaf_names
 
 

@@ -12,6 +12,7 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import PyTree
 
+from ._compiled import compiled
 from ._experiment import Experiment, entry_names, is_within
 from ._least_squares import levenberg_marquardt
 from ._problem import Problem, blank, failure_of, linearise
@@ -242,7 +243,7 @@ class Fit:
         return [f"  correlation  {'; '.join([*shown, *more])}"] if strong else []
 
 
-@eqx.filter_jit
+@compiled
 def _motion(model, params, e):
     return model.predicted(params, e, jnp.zeros(e.unknowns))[1]
 

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import PyTree
 
+from ._compiled import compiled
 from ._experiment import Experiment, measured
 from ._fit import Fit
 from ._free import Free
@@ -271,7 +272,7 @@ def _by_optax(problem, method, x, more):
     return Outcome(Iterate(best, rows.residuals, rows.jacobian, rows, lowest, none, none, np.asarray(ended)), len(costs), np.array(costs))
 
 
-@eqx.filter_jit
+@compiled
 def _optax_step(problem, method, x, state):
     import optax
 

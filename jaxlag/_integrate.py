@@ -10,6 +10,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, PyTree
 
 from ._checks import checked, parameters, sample_times, state
+from ._compiled import compiled
 from ._friction import Regularised, StickSlip
 from ._manifold import Baumgarte, NoStabilisation, Projection
 from ._motion import Equations
@@ -86,7 +87,7 @@ def simulate(
     return trajectory
 
 
-@eqx.filter_jit
+@compiled
 def _simulate(system, how, q0, qdot0, ts, params, tolerances):
     _, t0, q, v = checked(system, ts[0], q0, qdot0, params)
     equations = Equations.of(system, q0, how.stabilisation, how.friction, how.audit, t0, q, v, params)

@@ -14,8 +14,10 @@ from jaxtyping import Array, Bool, Float
 
 from ._entries import Reader, opened
 from ._folding import Algebra, Entry, TooLong, UnknownPrimitive
+from ._products import matrix
 
 FEW = 3  # columns; up to here a direction for each costs less than looking for zeros
+SCALARS = 5  # columns; up to here most programs are written out in scalars, and are shortest in a direction for each column
 LIMIT = 20_000  # scalar operations that are looked at, in a second or less
 
 
@@ -26,6 +28,8 @@ def jacobian(function: Callable, x: Float[Array, " n"]) -> tuple[Float[Array, " 
     if pattern.shape[0] == pattern.shape[1] > FEW and np.array_equal(pattern, np.eye(x.size)):
         return y, lx.DiagonalLinearOperator(push(jnp.ones_like(x)))
     color = _colors(pattern)
+    if x.size > SCALARS and max(color) + 1 == x.size and (columns := matrix(function, x)) is not None:
+        return y, lx.MatrixLinearOperator(columns)
     directions = jnp.asarray(color[:, None] == np.arange(max(color, default=-1) + 1), x.dtype)
     columns = jax.vmap(push, in_axes=1, out_axes=1)(directions)
     if directions.shape[1] < x.size:

@@ -48,11 +48,11 @@ def _rows(tree: Any) -> int:
 
 def _is_long(function: Callable, *given: Any) -> bool:
     arrays, static = eqx.partition(given, eqx.is_array)
-    return _length(jax.make_jaxpr(lambda arrays: function(*eqx.combine(arrays, static)))(arrays).jaxpr) >= LONG
+    return length(jax.make_jaxpr(lambda arrays: function(*eqx.combine(arrays, static)))(arrays).jaxpr) >= LONG
 
 
-def _length(jaxpr: Any) -> int:
+def length(jaxpr: Any) -> int:
     """Its operations, those of programs within it included."""
     is_program = lambda x: hasattr(x, "eqns") or hasattr(x, "jaxpr")
     parts = lambda equation: filter(is_program, jax.tree.leaves(list(equation.params.values()), is_leaf=is_program))
-    return sum(1 + sum(_length(getattr(part, "jaxpr", part)) for part in parts(equation)) for equation in jaxpr.eqns)
+    return sum(1 + sum(length(getattr(part, "jaxpr", part)) for part in parts(equation)) for equation in jaxpr.eqns)

@@ -3,12 +3,13 @@
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import lineax as lx
 import numpy as np
 import optimistix as optx
+
+from ._compiled import compiled
 
 RUNNING, CONVERGED, STALLED, MAX_STEPS, INTERRUPTED, FAILED = range(6)
 REASONS = (
@@ -128,5 +129,5 @@ def _advance(now, trial, predicted, seen, tolerance, freedom):
     return now, *_propose(now)
 
 
-ONE = tuple(eqx.filter_jit(f) for f in (_begin, _advance))
-MANY = tuple(eqx.filter_jit(jax.vmap(f)) for f in (_begin, _advance))
+ONE = tuple(compiled(f) for f in (_begin, _advance))
+MANY = tuple(compiled(jax.vmap(f)) for f in (_begin, _advance))

@@ -10,7 +10,8 @@ import lineax as lx
 import numpy as np
 from jaxtyping import Array, Bool, Float, PyTree
 
-from ._checks import at_state, coordinates, is_concrete
+from ._checks import at_state, coordinates
+from ._compiled import is_concrete
 from ._mechanics import constraint_rows, inertia, position_residual, velocity_residual
 from ._multipliers import NO_INERTIA, is_determined, saddle_point
 from ._system import Flat, System

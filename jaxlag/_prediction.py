@@ -13,7 +13,8 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from jaxtyping import PyTree
 
 from ._arguments import call
-from ._checks import at_state, is_concrete
+from ._checks import at_state
+from ._compiled import is_concrete
 from ._experiment import Experiment, is_within, start_entries
 from ._free import Free
 from ._integrate import simulate

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
+from ._compiled import compiled
 from ._experiment import Experiment
 from ._free import Free
 from ._many import of_each
@@ -125,12 +126,12 @@ def linearise(problem: Problem, x: Array) -> Rows:
     return rows if all(stack.mesh is None for stack in problem.stacks) else jax.tree.map(np.asarray, rows)
 
 
-@eqx.filter_jit
+@compiled
 def _linearise(problem, x):
     return problem.linearise(x)
 
 
-@eqx.filter_jit
+@compiled
 def look(problem: Problem, x: Array) -> Rows:
     """The residuals alone, where there are too many unknowns for a Jacobian."""
     y, zs = problem.split(x)
@@ -142,7 +143,7 @@ def look(problem: Problem, x: Array) -> Rows:
     return Rows(r, None, tuple(parts), jnp.zeros(0), jnp.zeros((0, problem.size)))
 
 
-@eqx.filter_jit
+@compiled
 def linearise_starts(problem: Problem, xs: Array) -> Rows:
     """One problem at many places."""
     return of_each(problem.linearise, xs)
@@ -154,7 +155,7 @@ def linearise_each(problem: Problem, xs: Array) -> Rows:
     return rows if problem.stacks[0].mesh is None else jax.tree.map(np.asarray, rows)
 
 
-@eqx.filter_jit
+@compiled
 def _linearise_each(problem, xs):
     (stack,) = problem.stacks
 

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import PyTree
 
+from ._compiled import compiled
 from ._experiment import Experiment, measured
 from ._fit import plus_minus
 from ._free import Free
@@ -168,7 +169,7 @@ class _Equations(eqx.Module):
         return (used / np.maximum(rms, 1e-9 * np.max(rms, initial=1e-300))).ravel()
 
 
-@eqx.filter_jit
+@compiled
 def _linearised(equations, free, y):
     def all_rows(y):
         params = free.insert(free.theta(y))

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
 
+from ._compiled import compiled
 from ._experiment import Experiment, is_within
 from ._fit import Fit
 from ._least_squares import CONVERGED, REASONS, Outcome
@@ -97,7 +98,7 @@ def report(problem: Problem, experiments: Sequence[Experiment], outcome: Outcome
     )
 
 
-@eqx.filter_jit
+@compiled
 def _theta_and_slope(free, y):
     return free.theta(y), free.slope(y)
 

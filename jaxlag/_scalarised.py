@@ -33,14 +33,14 @@ class _Jax(Algebra):
 JAX_ALGEBRA = _Jax()
 
 
-def scalarised(function: Callable, *, limit: int = 1500) -> Callable:
+def scalarised(function: Callable, *, limit: int = 700) -> Callable:
     """`function` of pytrees of arrays as scalar code: the same values and derivatives, to rounding, in less time where it is small.
 
     What is not taken apart (a decomposition, a loop of unknown length) works on arrays as before, and a function of more than
     `limit` scalar operations does so altogether. What an infinity or a NaN would have made of 0·x or x − x is not kept.
     """
-    # 1500: a chain of 8 links has 1257, and takes half the time of arrays and no longer to compile; one of 10 links has 1903,
-    # and takes 0.8 of the time and 6 times as long to compile (tests/benchmarks/bench_entries.py --limit 100000).
+    # 700: a chain of 5 links has 633, and takes half the time of arrays; one of 6 links has 838, and its first derivative would take
+    # four times as long to compile, a further one twice as long (tests/benchmarks/bench_entries.py --limit 100000).
     return jax.jit(functools.wraps(function)(_written_out(function, limit)))
 
 

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PyTree
 
-from ._checks import is_concrete
+from ._compiled import is_concrete
 
 KINDS = ("hold", "linear", "cubic")
 

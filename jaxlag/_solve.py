@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool
 
-from ._checks import is_concrete
+from ._compiled import is_concrete
 from ._kernel import in_one_kernel
 from ._manifold import nearest_state
 from ._motion import Equations, slack_of

@@ -10,7 +10,7 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float, PyTree
 
-from ._checks import is_concrete
+from ._compiled import compiled, is_concrete
 from ._friction import Regularised, StickSlip
 from ._kinks import kinks_of
 from ._power import energy_turnover
@@ -80,7 +80,7 @@ class Trajectory(eqx.Module):
 
     def energy(self) -> Float[Array, " T"]:
         """The energy h = q̇ · ∂L/∂q̇ − L at the samples; T + V where L = T − V with T quadratic in q̇."""
-        return self._energy_turnover()[0]
+        return _energy_turnover(self)[0]
 
     def work(self) -> dict[str, Float[Array, " T"]]:
         """Work since the start of each dissipation term, force and constraint by its name, of explicit time in L (`"time"`), and of the
@@ -94,7 +94,7 @@ class Trajectory(eqx.Module):
 
     def balance(self) -> Float[Array, " T"]:
         """Residual of the energy balance, ΔE − ΣW, as a fraction of the energy turned over: the largest q̇ · ∂L/∂q̇ and all works."""
-        energy, turned = self._energy_turnover()
+        energy, turned = _energy_turnover(self)
         works = jnp.stack(list(self.work().values()))
         scale = jnp.nanmax(jnp.abs(turned)) + jnp.nansum(jnp.nanmax(jnp.abs(works), axis=1))
         return (energy - energy[0] - jnp.sum(works, axis=0)) / jnp.where(scale > 0, scale, 1)
@@ -107,10 +107,6 @@ class Trajectory(eqx.Module):
             return {}
         slip = jax.vmap(kinks.slip)(self.ts, q, v)
         return {name: slip[:, rows].reshape(self.friction[name].force.shape) for name, rows in kinks.rows_of_term.items()}
-
-    @eqx.filter_jit
-    def _energy_turnover(self):
-        return jax.vmap(functools.partial(energy_turnover, self._flat()))(self.ts, *self._vectors())
 
     def _vectors(self):
         return [jax.vmap(lambda leaf: ravel_pytree(leaf)[0])(tree) for tree in (self.q, self.qdot)]
@@ -142,3 +138,8 @@ class Trajectory(eqx.Module):
         of = f"{' × '.join(map(str, batch))} motions of " if batch else ""
         head = f"Trajectory: {of}{self.ts.shape[-1]} samples, t = {np.min(self.ts):g} … {np.max(self.ts):g}"
         return "\n".join([head, *(f"  {name:<15}{value}" for name, value in rows)])
+
+
+@compiled
+def _energy_turnover(motion):
+    return jax.vmap(functools.partial(energy_turnover, motion._flat()))(motion.ts, *motion._vectors())

@@ -1,0 +1,51 @@
+"""Programs that Python calls, compiled in little more than half the time.
+
+On a CPU, XLA makes each of its kernels by a compiler of its own, which takes as long as all the rest; the emitters it had before make
+programs that take half as long to compile and run as fast, if not in batches (tests/benchmarks/bench_first_use.py --emitters).
+Within a user's own `jit` that is the user's choice: the environment variable XLA_FLAGS="--xla_cpu_use_fusion_emitters=false".
+"""
+
+import functools
+from collections.abc import Callable
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import PyTree
+
+QUICK = {"xla_cpu_use_fusion_emitters": False}
+
+
+def compiled(function: Callable) -> Callable:
+    """`equinox.filter_jit`, with choices of its own for the compiler where Python calls the program, not another program."""
+    within = eqx.filter_jit(function)
+
+    @functools.wraps(function)
+    def call(*given, **named):
+        return (_quick(function) if _by_python(given, named) else within)(*given, **named)
+
+    return call
+
+
+def _by_python(*given) -> bool:
+    return jax.default_backend() == "cpu" and is_concrete(given, jnp.zeros(()))  # under `jit` even a constant is traced
+
+
+@functools.cache
+def _quick(function):
+    return eqx.filter_jit(function, compiler_options=QUICK) if _are_known() else eqx.filter_jit(function)
+
+
+@functools.cache
+def _are_known() -> bool:
+    """Whether this version of XLA has the options; one that has not refuses them."""
+    try:
+        jax.jit(lambda: 0, compiler_options=QUICK)()
+    except jax.errors.JaxRuntimeError:
+        return False
+    return True
+
+
+def is_concrete(*trees: PyTree) -> bool:
+    """Whether the numbers are at hand, so that Python may look at them; under `jit` and `vmap` they are not."""
+    return not any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(trees))
