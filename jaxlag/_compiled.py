@@ -1,7 +1,7 @@
-"""Programs that Python calls, compiled in little more than half the time.
+"""Programs that Python calls, compiled in two thirds of the time.
 
-On a CPU, XLA makes each of its kernels by a compiler of its own, which takes as long as all the rest; the emitters it had before make
-programs that take half as long to compile and run as fast, if not in batches (tests/benchmarks/bench_first_use.py --emitters).
+On a CPU, XLA makes each of its kernels by a compiler of its own, which takes long; the emitters it had before make
+programs that take a third less to compile and run as fast, but for batches (tests/benchmarks/bench_emitters.py).
 Within a user's own `jit` that is the user's choice: the environment variable XLA_FLAGS="--xla_cpu_use_fusion_emitters=false".
 """
 
