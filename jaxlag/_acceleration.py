@@ -60,9 +60,12 @@ def acceleration(system: System, q: PyTree, qdot: PyTree, params: PyTree = None,
 
 def _acceleration(flat, t, q, v):
     mode = settled(flat, t, q, v)
-    qddot, multipliers, determined = scalarised(lambda t, q, v: constrained_acceleration(mode, t, q, v))(t, q, v)
-    multipliers = jnp.where(determined, multipliers, jnp.nan)
-    qddot = jnp.where(determined, qddot, jnp.nan)
+
+    def known(t, q, v):
+        qddot, multipliers, determined = constrained_acceleration(mode, t, q, v)
+        return jnp.where(determined, qddot, jnp.nan), jnp.where(determined, multipliers, jnp.nan), determined
+
+    qddot, multipliers, determined = scalarised(known)(t, q, v)
     return Acceleration(flat.unravel(qddot), flat.unravel_multipliers(multipliers)), determined
 
 
