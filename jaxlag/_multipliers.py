@@ -71,6 +71,7 @@ def _solver(M, G):
         W, by_inertia, determined = jnp.zeros_like(G[:, 0]), lambda B: B / M.diagonal[:, None], jnp.array(True)
     else:
         augmented, W = _augmented(M.as_matrix(), G)
+        augmented = jax.lax.optimization_barrier(augmented)  # its diagonal would be computed anew
         factor = jnp.linalg.cholesky(jax.lax.stop_gradient(augmented))
         by_inertia, determined = lambda B: _solve(augmented, factor, B), _is_positive(factor, augmented)
     mobility = by_inertia(G.T)

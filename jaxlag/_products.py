@@ -14,7 +14,7 @@ import numpy as np
 from jax.extend.core import Literal
 from jaxtyping import Array, Float
 
-from ._entries import Reader, on_arrays, settled
+from ._entries import Reader, is_extended, on_arrays, settled
 from ._folding import Algebra, UnknownPrimitive
 from ._kernel import length
 
@@ -72,6 +72,8 @@ def _step(equation, operands):
     """The outputs of one equation."""
     name, moving = equation.primitive.name, [isinstance(x, list) for x in operands]
     shapes = [atom.aval.shape for atom in equation.invars]
+    if any(map(is_extended, [*equation.invars, *equation.outvars])):
+        raise UnknownPrimitive(equation.primitive, [equation.source_info])
     if name in INLINED and (any(moving) or name != "custom_jvp_call"):
         return _run(_inner(equation).jaxpr, _inner(equation).consts, operands)
     if not any(moving):
@@ -113,7 +115,8 @@ def _scaled(term, factor):
     if _is_number(factor):
         return term._replace(K=rows[:, None] * term.K)
     if term.a is None and _is_selection(term.K):  # its rows are columns
-        columns = rows[np.argmax(term.K != 0, axis=0)]
+        of_column = np.argmax(term.K != 0, axis=0)
+        columns = rows if np.array_equal(of_column, np.arange(len(rows))) else rows[of_column]
         return term._replace(b=columns if term.b is None else term.b * columns)
     return term._replace(a=rows if term.a is None else term.a * rows)
 

@@ -33,6 +33,7 @@ UNREAD = {
     "a choice": lambda x: jax.lax.cond(x[0] > 0, jnp.sin, jnp.cos, x * C),
     "a choice for each entry": lambda x: jnp.where(x > 1, x**2, jnp.cumsum(x)),
     "a linear solve": lambda x: jnp.linalg.solve(jnp.eye(6) * 3 + jnp.outer(x, C), x),
+    "a draw": lambda x: x * jax.random.normal(jax.random.key(0), 6),
     "scalar code": lambda x: jnp.stack([sum(jnp.sin(x[i] * x[j]) for i in range(6)) for j in range(6)]),
 }
 

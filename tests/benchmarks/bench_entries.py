@@ -1,6 +1,6 @@
 """One acceleration as array code and entry by entry: run time and compile time of the n-link pendulum and of the vehicle.
 
-python tests/benchmarks/bench_entries.py [--limit 1500] [--loop 10000] [n ...]
+python tests/benchmarks/bench_entries.py [--limit 700] [--loop 10000] [n ...]
 
 Each time is that of one of many dependent evaluations inside one compiled loop (median of 7 runs), so that dispatch is out of it.
 On a CPU, XLA runs each fused operation of a loop as a kernel of its own, unless the loop is small: then the whole loop is one kernel,
