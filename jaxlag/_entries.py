@@ -137,7 +137,12 @@ def settled(array: np.ndarray, dtype: Any) -> np.ndarray:
 def on_arrays(equation: Any) -> Callable[..., list]:
     """The equation as a function of its operands."""
     places = {atom: i for i, atom in enumerate(equation.invars) if not isinstance(atom, core.Literal)}
-    empty: Any = jax.make_jaxpr(lambda: ())().jaxpr
-    jaxpr = empty.replace(invars=list(places), outvars=equation.outvars, eqns=[equation], effects=equation.effects)
+    jaxpr = _nothing().replace(invars=list(places), outvars=equation.outvars, eqns=[equation], effects=equation.effects)
     function = core.jaxpr_as_fun(core.ClosedJaxpr(jaxpr, ()))
     return lambda *operands: function(*(operands[i] for i in places.values()))
+
+
+@functools.cache
+def _nothing() -> Any:
+    """A program that does nothing."""
+    return jax.make_jaxpr(lambda: ())().jaxpr

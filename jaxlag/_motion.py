@@ -157,14 +157,7 @@ class Equations:
 
     def changed(self, t, y, args, ended):
         """y in the mode that follows where the modes of the elements `ended` have; whether there is one; whether slip has come to rest."""
-        params, slack = args
-        q, v, works, sigma, transitions, time_stuck = self.parts(y)
-        flat, _, kinks = self.mode(t, q, v, sigma, params)
-        stuck, slow = sticking(kinks, sigma), norms(kinks, kinks.slip(t, q, v)) <= slack
-        mode = settle(flat, kinks, t, q, v, sigma, stuck | ended | slow, ended & stuck)
-        changes = jnp.sum(norms(kinks, mode.sigma - sigma) > 0.5)
-        y = jnp.concatenate([q, v, works, mode.sigma, transitions + changes, time_stuck])
-        return self.kept(t, y, args), mode.consistent, jnp.all(~ended | stuck | slow)
+        return _changed(self, t, y, args, ended)
 
     def exhausted(self, y):
         """Whether there were more transitions than allowed."""
@@ -211,6 +204,19 @@ def _margins(equations: Equations, t, y, params):
     flat, _, kinks = equations.mode(t, q, v, sigma, params)
     assert kinks is not None  # asked of systems with dry friction alone
     return friction(flat, kinks, sigma, t, q, v).margin
+
+
+@eqx.filter_jit
+def _changed(equations: Equations, t, y, args, ended):
+    params, slack = args
+    q, v, works, sigma, transitions, time_stuck = equations.parts(y)
+    flat, _, kinks = equations.mode(t, q, v, sigma, params)
+    assert kinks is not None
+    stuck, slow = sticking(kinks, sigma), norms(kinks, kinks.slip(t, q, v)) <= slack
+    mode = settle(flat, kinks, t, q, v, sigma, stuck | ended | slow, ended & stuck)
+    changes = jnp.sum(norms(kinks, mode.sigma - sigma) > 0.5)
+    y = jnp.concatenate([q, v, works, mode.sigma, transitions + changes, time_stuck])
+    return equations.kept(t, y, args), mode.consistent, jnp.all(~ended | stuck | slow)
 
 
 @eqx.filter_jit

@@ -292,9 +292,9 @@ def _called(reader, equation, *operands):
 
 @_rule("custom_jvp_call", "custom_vjp_call", "custom_vjp_call_jaxpr")
 def _with_rule(reader, equation, *operands):
-    """Taken apart, unless the algebra differentiates: then it stays in one piece, with its rule."""
-    results = _called(reader, equation, *operands)
-    return results if reader.algebra.block(equation) is None else NotImplemented
+    """Taken apart, unless the algebra differentiates what is no number: then it stays in one piece, with its rule."""
+    results, known = _called(reader, equation, *operands), all(x.dtype != object for x in operands)
+    return results if known or reader.algebra.block(equation) is None else NotImplemented
 
 
 @_rule("platform_index")

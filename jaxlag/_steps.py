@@ -242,6 +242,7 @@ class StickSlipSolver(Kept):
         y, possible, ready = self.equations.changed(turn.cut, turn.first.y, args, which)
         return turn._replace(y_new=y, possible=possible, usable=turn.usable & ready)
 
+    @eqx.filter_jit
     def _first_end(self, t0, t1, dense, args):
         """Whether a mode ends within a step, when the first does on the dense output, and the slopes of the margins there."""
         t0, t1, dense, args = jax.lax.stop_gradient((t0, t1, dense, args))
