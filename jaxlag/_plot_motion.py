@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from ._canvas import GREY, Units, canvas, channels, chosen, colour, label, legend_above, legend_beside, one_motion, panels, zero_line
-from ._trajectory import Trajectory
+from ._trajectory import Trajectory, energies
 
 THIN = 1e-3  # of the largest area, below which none can be seen
 
@@ -224,7 +224,7 @@ def balance(trajectory: Trajectory, *, units: Units = None, ax: Any = None) -> A
     ```
     """
     one_motion(trajectory).work()  # which says what to do where there are none
-    h, turned = (np.asarray(x) for x in trajectory._energy_turnover())
+    h, turned = map(np.asarray, energies(trajectory))
     parts = {"change of energy": h - h[0]} | {name: -work for name, work in _shown_works(trajectory).items()}
     ax = canvas(ax, figsize=(6.4, 3.6))
     above = below = np.zeros_like(h)
@@ -323,7 +323,7 @@ def _sign_changes(ts, samples):
 def _shown_works(trajectory):
     """The works that can be seen beside the largest change of energy."""
     works = {name: np.asarray(work) for name, work in trajectory.work().items()}
-    h, turned = (np.asarray(x) for x in trajectory._energy_turnover())
+    h, turned = map(np.asarray, energies(trajectory))
     sizes = {name: np.nanmax(np.abs(work)) for name, work in works.items()}
     least = THIN * max(*sizes.values(), np.nanmax(np.abs(h - h[0])), THIN * np.nanmax(np.abs(turned)))
     return {name: works[name] for name, size in sizes.items() if size > least}

@@ -80,7 +80,7 @@ class Trajectory(eqx.Module):
 
     def energy(self) -> Float[Array, " T"]:
         """The energy h = q̇ · ∂L/∂q̇ − L at the samples; T + V where L = T − V with T quadratic in q̇."""
-        return _energy_turnover(self)[0]
+        return energies(self)[0]
 
     def work(self) -> dict[str, Float[Array, " T"]]:
         """Work since the start of each dissipation term, force and constraint by its name, of explicit time in L (`"time"`), and of the
@@ -94,7 +94,7 @@ class Trajectory(eqx.Module):
 
     def balance(self) -> Float[Array, " T"]:
         """Residual of the energy balance, ΔE − ΣW, as a fraction of the energy turned over: the largest q̇ · ∂L/∂q̇ and all works."""
-        energy, turned = _energy_turnover(self)
+        energy, turned = energies(self)
         works = jnp.stack(list(self.work().values()))
         scale = jnp.nanmax(jnp.abs(turned)) + jnp.nansum(jnp.nanmax(jnp.abs(works), axis=1))
         return (energy - energy[0] - jnp.sum(works, axis=0)) / jnp.where(scale > 0, scale, 1)
@@ -141,5 +141,6 @@ class Trajectory(eqx.Module):
 
 
 @compiled
-def _energy_turnover(motion):
+def energies(motion: Trajectory) -> tuple[Float[Array, " T"], Float[Array, " T"]]:
+    """The energy h and q̇ · ∂L/∂q̇ at the samples."""
     return jax.vmap(functools.partial(energy_turnover, motion._flat()))(motion.ts, *motion._vectors())

@@ -11,6 +11,7 @@ import pytest
 from jax import lax
 
 import jaxlag as jl
+from jaxlag import _entries
 from jaxlag._entries import evaluate
 from jaxlag._folding import Algebra, TooLong, UnknownPrimitive, filled, folded
 from jaxlag._multipliers import constrained_acceleration
@@ -366,6 +367,18 @@ def held_diagonal(a):
 def test_the_same_operation_is_made_once():
     names = operations(scalarised(lambda x: jnp.cos(x[0] - x[1]) * jnp.cos(x[1] - x[0]) + (jnp.sin(x[0] - x[1]) + jnp.sin(x[1] - x[0]))), v)
     assert {name: names.count(name) for name in ("sub", "cos", "sin")} == {"sub": 1, "cos": 1, "sin": 0}
+
+
+def test_numbers_are_computed_without_being_compiled(monkeypatch):
+    """Also those of a function with a derivative rule of its own, which numbers have no need of."""
+    cube = jax.custom_jvp(lambda x: x**3)
+    cube.defjvp(lambda primals, tangents: (cube(*primals), 3 * primals[0] ** 2 * tangents[0]))
+    scaled = lambda x: lax.optimization_barrier(x) * jnp.sqrt(cube(jnp.arange(1.0, 5.0)))
+    with monkeypatch.context() as patched:
+        patched.setattr(_entries, "on_arrays", None)
+        names = operations(scalarised(scaled), v)
+    assert {name: names.count(name) for name in ("mul", "sqrt", "integer_pow")} == {"mul": 3, "sqrt": 0, "integer_pow": 0}
+    close(scalarised(scaled)(v), scaled(v))
 
 
 @pytest.mark.parametrize("mechanics", ["vehicle", "polar pendulum", "Cartesian pendulum", "3 links"], indirect=True)

@@ -76,3 +76,11 @@ def test_a_chain_takes_no_sums_over_columns(n):
         np.testing.assert_allclose(M(q, {"l": l} | masses), expected, rtol=1e-13, atol=1e-14)
     text = jax.jit(lambda q: jl.mass_matrix(jl.System(lambda q, qdot: chain(q, qdot, l, m)), q, 0 * q)).lower(q).compile().as_text()
     assert f"f64[{n},{n}]" in text and "reduce-window" not in text and " dot(" not in text
+
+
+def test_single_precision_stays_single(single_precision):
+    q, m = np.linspace(-1, 1, 9, dtype=np.float32), np.ones(9, np.float32)
+    found = jl.mass_matrix(jl.System(lambda q, qdot, l: chain(q, qdot, l, m)), q, 0 * q, {"l": 0.5})
+    expected = 0.25 * np.cos(np.subtract.outer(q, q)) * (9 - np.maximum.outer(np.arange(9), np.arange(9)))
+    assert found.dtype == jnp.float32
+    np.testing.assert_allclose(found, expected, rtol=1e-5)
