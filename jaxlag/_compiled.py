@@ -28,22 +28,23 @@ def compiled(function: Callable) -> Callable:
 
 
 def _by_python(*given) -> bool:
-    return jax.default_backend() == "cpu" and is_concrete(given, jnp.zeros(()))  # under `jit` even a constant is traced
+    """Whether nothing that is being traced calls: under `jit` even what is computed of numbers is traced."""
+    return jax.default_backend() == "cpu" and is_concrete(given, jnp.zeros(()))
 
 
 @functools.cache
 def _quick(function):
-    return eqx.filter_jit(function, compiler_options=QUICK) if _are_known() else eqx.filter_jit(function)
+    return eqx.filter_jit(function, compiler_options=_options())
 
 
 @functools.cache
-def _are_known() -> bool:
-    """Whether this version of XLA has the options; one that has not refuses them."""
+def _options() -> dict[str, bool]:
+    """Those that this version of XLA knows; one that does not know an option refuses it."""
     try:
         jax.jit(lambda: 0, compiler_options=QUICK)()
     except jax.errors.JaxRuntimeError:
-        return False
-    return True
+        return {}
+    return QUICK
 
 
 def is_concrete(*trees: PyTree) -> bool:

@@ -15,6 +15,7 @@ from jaxtyping import Array, Float
 
 from ._entries import evaluate, on_arrays
 from ._folding import Algebra
+from ._primitives import CALLS, body
 from ._system import Flat, role
 
 
@@ -157,9 +158,8 @@ class _Term(NamedTuple):
                 value = replaced(number, _Group(value, is_norm, int(np.size(value))))
                 if value is not None:
                     return [_Node(value, True, None, number)]
-            inner = eqn.params.get(_INLINED.get(eqn.primitive.name))
-            if inner is not None:
-                inner = inner if hasattr(inner, "consts") else ClosedJaxpr(inner, ())
+            if eqn.primitive.name in CALLS:
+                inner = body(eqn)
                 known = [node(c, False, None, ("const", id(c))) for c in inner.consts]
                 return run(inner.jaxpr, dict(zip((*inner.jaxpr.constvars, *inner.jaxpr.invars), (*known, *ins), strict=True)))
             outs = on_arrays(eqn)(*(n.value for n in ins))
@@ -174,7 +174,6 @@ class _Term(NamedTuple):
         return run(self.closed.jaxpr, dict(zip(variables, (*known, *given), strict=True)))[0].value
 
 
-_INLINED = {"jit": "jaxpr", "pjit": "jaxpr", "closed_call": "call_jaxpr", "remat": "jaxpr", "checkpoint": "jaxpr"}
 _CARRIED = {"reshape", "convert_element_type", "copy", "squeeze", "broadcast_in_dim"}
 
 
@@ -208,10 +207,9 @@ def _is_norm(jaxpr) -> bool:
 
 
 def _primitives(eqn):
-    inner = eqn.params.get(_INLINED.get(eqn.primitive.name))
-    if inner is None:
+    if eqn.primitive.name not in CALLS:
         return [eqn.primitive.name]
-    return [name for part in getattr(inner, "jaxpr", inner).eqns for name in _primitives(part)]
+    return [name for part in body(eqn).jaxpr.eqns for name in _primitives(part)]
 
 
 def _squares(node: _Node) -> tuple[_Node, ...] | None:

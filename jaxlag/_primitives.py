@@ -281,13 +281,21 @@ def _linear_solve(reader, equation, *operands):
 # Calls and loops.
 
 
-@_rule("jit", "pjit", "closed_call", "core_call", "remat", "remat2", "checkpoint")
+CALLS = ("jit", "pjit", "closed_call", "core_call", "remat", "remat2", "checkpoint")  # equations that call a program and do nothing else
+
+
+def body(equation: Any) -> Any:
+    """The program that an equation calls, closed."""
+    program = next(equation.params[name] for name in ("jaxpr", "call_jaxpr", "fun_jaxpr") if name in equation.params)
+    return program if hasattr(program, "consts") else core.ClosedJaxpr(program, ())
+
+
+@_rule(*CALLS)
 def _called(reader, equation, *operands):
     shortcut = reader.algebra.shortcut(equation)
     if shortcut is not None and any(x.dtype == object for x in operands):
         return reader.block(shortcut, operands, equation.outvars)
-    body = next(equation.params[name] for name in ("jaxpr", "call_jaxpr", "fun_jaxpr") if name in equation.params)
-    return reader.inner(body, operands)
+    return reader.inner(body(equation), operands)
 
 
 @_rule("custom_jvp_call", "custom_vjp_call", "custom_vjp_call_jaxpr")

@@ -17,10 +17,10 @@ from jaxtyping import Array, Float
 from ._entries import Reader, is_extended, on_arrays, settled
 from ._folding import Algebra, UnknownPrimitive
 from ._kernel import length
+from ._primitives import CALLS, body
 
 SHORT = 200  # equations; what is longer is scalar code, whose entries cost less one by one
 FEW = 4  # terms of a value; more are one dense matrix
-INLINED = {"jit": "jaxpr", "pjit": "jaxpr", "closed_call": "call_jaxpr", "custom_jvp_call": "call_jaxpr"}
 LINEAR = {
     "reshape", "squeeze", "broadcast_in_dim", "transpose", "slice", "split", "pad", "concatenate", "gather", "rev", "copy", "neg",
     "convert_element_type", "cumsum", "reduce_sum", "select_n", "add", "add_any", "sub",
@@ -54,11 +54,6 @@ def matrix(function: Callable, x: Float[Array, " n"]) -> Float[Array, "m n"] | N
     return jnp.asarray(sum(term.dense() for term in terms))
 
 
-def _inner(equation):
-    """The program that an equation calls."""
-    return equation.params[INLINED[equation.primitive.name]]
-
-
 def _run(jaxpr, consts, inputs):
     """The outputs of a program whose values are arrays or, where they depend on x, lists of terms."""
     env = dict(zip([*jaxpr.constvars, *jaxpr.invars], [*consts, *inputs], strict=True))
@@ -74,8 +69,8 @@ def _step(equation, operands):
     shapes = [atom.aval.shape for atom in equation.invars]
     if any(map(is_extended, [*equation.invars, *equation.outvars])):
         raise UnknownPrimitive(equation.primitive, [equation.source_info])
-    if name in INLINED and (any(moving) or name != "custom_jvp_call"):
-        return _run(_inner(equation).jaxpr, _inner(equation).consts, operands)
+    if name in CALLS or (name == "custom_jvp_call" and any(moving)):
+        return _run(body(equation).jaxpr, body(equation).consts, operands)
     if not any(moving):
         return _known(equation, operands)
     if name in ("add", "add_any", "sub") and all(moving) and shapes[0] == shapes[1]:
@@ -105,6 +100,7 @@ def _known(equation, operands):
 
 
 def _in_numbers(equation, operands):
+    """The outputs of an equation of numbers, by NumPy."""
     outs = Reader(Algebra()).equation(equation, operands)
     return [settled(out, variable.aval.dtype) for out, variable in zip(outs, equation.outvars, strict=True)]
 

@@ -40,7 +40,7 @@ def test_it_may_be_called_from_anywhere(known, monkeypatch):
     """From Python, under transformations, within other programs; and where XLA does not know the options."""
     if not known:
         monkeypatch.setattr(_compiled, "QUICK", {"xla_cpu_no_such_option": False})
-    for cached in (_compiled._quick, _compiled._are_known):
+    for cached in (_compiled._quick, _compiled._options):
         cached.cache_clear()
     traced = []
 
@@ -58,5 +58,15 @@ def test_it_may_be_called_from_anywhere(known, monkeypatch):
     np.testing.assert_array_equal(jax.vmap(jax.grad(lambda x: program(x, "cube")))(x), 3 * x**2)
     assert jax.grad(lambda y: y * program(2.0, "cube"))(1.0) == 8.0
     assert jax.eval_shape(lambda: program(x, "square")).shape == (3,)
-    for cached in (_compiled._quick, _compiled._are_known):
+    for cached in (_compiled._quick, _compiled._options):
         cached.cache_clear()
+
+
+@pytest.mark.skipif(jax.default_backend() != "cpu", reason="the choice is one for CPUs")
+def test_the_choice_reaches_the_compiler_where_python_calls_alone(monkeypatch):
+    """An option that XLA does not know, left in, is refused."""
+    monkeypatch.setattr(_compiled, "_options", lambda: {"xla_cpu_no_such_option": False})
+    program = _compiled.compiled(lambda x: 2 * x)
+    with pytest.raises(jax.errors.JaxRuntimeError, match="xla_cpu_no_such_option"):
+        program(1.0)
+    assert jax.jit(program)(1.0) == 2.0

@@ -387,6 +387,17 @@ def test_the_acceleration_is_scalar_code_throughout(mechanics):
     assert on_scalars(function, *state)
 
 
+def test_a_batch_of_accelerations_is_one_kernel():
+    """Also what says that inertia is missing, which would otherwise split it and take twice the time."""
+    double = jl.System(
+        lambda q, qdot: 0.5 * jnp.sum(jnp.cumsum(jnp.cos(q) * qdot) ** 2 + jnp.cumsum(jnp.sin(q) * qdot) ** 2) + jnp.sum(jnp.cos(q))
+    )
+    batch = jnp.linspace(0.1, 1.0, 2 * 64).reshape(64, 2)
+    program = jax.jit(jax.vmap(lambda q, v: jl.acceleration(double, q, v).qddot)).lower(batch, batch).compile().as_text()
+    main = program[program.index("ENTRY") :]
+    assert main.count(" fusion(") == 1 and "custom-call" not in main
+
+
 def test_above_the_limit_the_function_stays_as_it_is():
     f = lambda x: jnp.sin(x) @ x.T
     assert "dot_general" in operations(scalarised(f, limit=20), x)

@@ -13,17 +13,21 @@ A, W = rng.normal(size=(5, 6)), rng.normal(size=(6, 6))
 X, C = jnp.asarray(rng.uniform(0.5, 1.5, 6)), jnp.asarray(rng.uniform(0.5, 1.5, 6))
 
 PROGRAMS = {
-    "elementwise": lambda x: jnp.sin(x) * x**2 / (1 + x),
-    "cumulative sums": lambda x: jnp.cumsum(jnp.cumsum(x * C)[::-1] * jnp.cos(C)),
-    "a known matrix": lambda x: (A @ (x * C)) * (A @ C),
-    "a matrix of numbers that vary": lambda x: jnp.outer(C, C) @ jnp.sin(x),
-    "parts put together": lambda x: jnp.concatenate([x[1:4] * C[:3], jnp.zeros(2), x[:2] - x[4:]]),
-    "sums of several": lambda x: jnp.cumsum(x) * C + jnp.cumsum(x * C) - 2 * x + jnp.sum(x),
-    "two axes": lambda x: jnp.ravel(jnp.cumsum(x.reshape(2, 3) * C.reshape(2, 3), axis=1).T),
-    "parts of two": lambda x: jnp.where(np.arange(6) > 2, x**2, jnp.cumsum(x)),
-    "a constant": lambda x: jnp.ones(3),
-    "a part of x": lambda x: x[2:3],
-    "a quotient by x": lambda x: C / x,
+    "elementwise": lambda x, c: jnp.sin(x) * x**2 / (1 + x),
+    "cumulative sums": lambda x, c: jnp.cumsum(jnp.cumsum(x * c)[::-1] * jnp.cos(c)),
+    "a known matrix": lambda x, c: (A @ (x * c)) * (A @ c),
+    "a matrix that varies": lambda x, c: jnp.outer(c, c) @ (jnp.sin(x) * c),
+    "a matrix from the right": lambda x, c: 0.5 * (x @ jnp.outer(c, jnp.cos(c))) + x,
+    "columns of a matrix that varies": lambda x, c: jnp.ravel(jnp.diag(c) @ x.reshape(6, 1)) * c,
+    "rows times a matrix that varies": lambda x, c: jnp.ravel(x.reshape(2, 3) @ jnp.diag(c[:3])),
+    "a call": lambda x, c: jax.checkpoint(lambda x: jnp.cumsum(c * x))(x),
+    "parts put together": lambda x, c: jnp.concatenate([x[1:4] * c[:3], jnp.zeros(2), x[:2] - x[4:]]),
+    "sums of several": lambda x, c: jnp.cumsum(x) * c + jnp.cumsum(x * c) - 2 * x + jnp.sum(x),
+    "two axes": lambda x, c: jnp.ravel(jnp.cumsum(x.reshape(2, 3) * c.reshape(2, 3), axis=1).T),
+    "parts of two": lambda x, c: jnp.where(np.arange(6) > 2, x**2, jnp.cumsum(x)),
+    "a constant": lambda x, c: jnp.ones(3),
+    "a part of x": lambda x, c: x[2:3],
+    "a quotient by x": lambda x, c: c / x,
 }
 
 
@@ -40,15 +44,15 @@ UNREAD = {
 
 @pytest.mark.parametrize("name", PROGRAMS)
 def test_the_matrix_is_jaxs(name):
+    """With c a vector of numbers, and one that varies."""
     function = PROGRAMS[name]
-    expected = jax.jacfwd(function)(X)
-    np.testing.assert_allclose(matrix(function, X), expected, rtol=1e-13, atol=1e-13)
-    np.testing.assert_allclose(jax.jit(lambda x: matrix(function, x))(X), expected, rtol=1e-13, atol=1e-13)
-    np.testing.assert_allclose(jax.vmap(lambda x: matrix(function, x))(X[None])[0], expected, rtol=1e-13, atol=1e-13)
-    both = [jax.jacfwd(of)(X) for of in (lambda x: matrix(function, x), jax.jacfwd(function))]
-    np.testing.assert_allclose(*both, rtol=1e-12, atol=1e-12)
-    both = [jax.jacrev(of)(X) for of in (lambda x: matrix(function, x), jax.jacfwd(function))]
-    np.testing.assert_allclose(*both, rtol=1e-12, atol=1e-12)
+    found, expected = lambda x, c: matrix(lambda x: function(x, c), x), jax.jacfwd(function)
+    np.testing.assert_allclose(found(X, C), expected(X, C), rtol=1e-13, atol=1e-13)
+    np.testing.assert_allclose(jax.jit(found)(X, C), expected(X, C), rtol=1e-13, atol=1e-13)
+    np.testing.assert_allclose(jax.vmap(found)(X[None], C[None])[0], expected(X, C), rtol=1e-13, atol=1e-13)
+    for derivative in (jax.jacfwd, jax.jacrev):
+        for a, b in zip(*(derivative(of, argnums=(0, 1))(X, C) for of in (found, expected)), strict=True):
+            np.testing.assert_allclose(a, b, rtol=1e-12, atol=1e-12)
 
 
 @pytest.mark.parametrize("name", UNREAD)

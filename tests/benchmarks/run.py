@@ -8,7 +8,7 @@ import subprocess
 import sys
 from pathlib import Path
 
-TOPICS = ("vehicle", "devices", "pendulum", "constraints", "first_use")
+TOPICS = ("vehicle", "devices", "pendulum", "constraints", "first_use", "emitters")
 
 
 def main():
