@@ -8,7 +8,7 @@ Source: Pfeiffer & Glocker, Multibody Dynamics with Unilateral Contacts, chapter
 """
 
 import dataclasses
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -61,7 +61,7 @@ def _extent(kinks, sigma, slip):
 
 class Friction(NamedTuple):
     """At one state in one mode: acceleration and multipliers; force and rate of the slip over the rows; bound, and how far from its end
-    the mode is, per element.
+    the mode is, per element, were each free to slip.
     """
 
     qddot: Float[Array, " n"]
@@ -87,65 +87,119 @@ def friction(flat: Flat, kinks: Kinks, sigma, t, q, v, feedback=None) -> Frictio
     return Friction(qddot, multipliers, force, slip_rate, bound, margin)
 
 
-class Settled(NamedTuple):
-    """A mode σ, whether the forces it brings about agree with it, and the bounds."""
+class Mode(NamedTuple):
+    """A mode σ; which elements stand still at their bound, because others hold them; whether the forces agree with it; the bounds."""
 
     sigma: Float[Array, " r"]
+    held: Bool[Array, " e"]
     consistent: Bool[Array, ""]
     bound: Float[Array, " e"]
 
 
-def settle(flat: Flat, kinks: Kinks, t, q, v, sigma, at_rest: Bool[Array, " e"], breaking: Bool[Array, " e"]) -> Settled:
-    """The mode that follows where the elements `at_rest` have no slip: all of them stick, but those `breaking` away at their bound;
-    and the one farthest beyond its bound breaks away against its force, one after the other, until none is beyond.
-    The others slip on along σ.
+class _Search(NamedTuple):
+    """How far the search for a mode has come; slip rates without friction, by which others are judged."""
+
+    stage: Any
+    mode: Mode
+    clearly: Bool[Array, " e"]  # broken away, and not by rounding
+    free_rate: Float[Array, " e"]
+
+
+LOOSE, FIRST, NEXT, HOLD, DONE = range(5)  # stages of the search
+
+
+def settle(flat: Flat, kinks: Kinks, t, q, v, sigma, at_rest: Bool[Array, " e"], breaking: Bool[Array, " e"]) -> Mode:
+    """The mode that follows where the elements `at_rest` have no slip; the others slip on along σ.
+
+    All at rest stick, but those `breaking` away at their bound. One after the other, the one farthest beyond its bound slips against its
+    force, and one that would set off backwards sticks again, until none is beyond and none goes backwards. Of dependent elements some
+    may be at their bound while others hold them: of the shares that are possible that is one, and the motion is the same for all.
     """
     of = kinks.element_of_row
     t, q, v = jax.lax.stop_gradient((t, q, v))
+    loose = jnp.finfo(v.dtype).tiny ** 0.25  # a σ of this length slips without a force
+    no = jnp.zeros(kinks.elements, bool)
 
-    def release(turn, carry):
-        sigma, clearly, *_ = carry
-        found = jax.lax.stop_gradient(friction(flat, kinks, sigma, t, q, v))
-        over = jnp.where(sticking(kinks, sigma), -found.margin, -jnp.inf)
-        worst = jnp.arange(over.size) == jnp.argmax(over)
-        beyond = jnp.where(turn == 0, breaking, worst & (over > 0)) & (turn <= kinks.elements)
-        clear = clearly | (beyond & (over > 1e-6 * jnp.abs(found.bound)))
-        size = norms(kinks, found.force)[of]
-        released = jnp.where(beyond[of], -found.force / jnp.where(size > 0, size, 1), sigma)
-        # What has clearly broken away has to set off the way it was let go: if not, no mode agrees with its forces (Painlevé).
-        backwards = clearly & (_per_element(kinks, found.slip_rate * sigma) < 0)
-        agrees = jnp.all(over <= 0) & ~jnp.any(backwards) & jnp.all(jnp.isfinite(found.force))
-        return released, clear, agrees, found.bound
+    def turn(search):
+        mode, stage = search.mode, search.stage
+        released = at_rest & ~sticking(kinks, mode.sigma)
+        freed = jnp.where(stage == LOOSE, at_rest, released & (stage == HOLD))
+        found = jax.lax.stop_gradient(friction(flat, kinks, jnp.where(freed[of], loose, mode.sigma), t, q, v))
+        rate = norms(kinks, found.slip_rate)
 
-    resting = jax.lax.stop_gradient(jnp.where(at_rest[of], 0, sigma))
+        over = jnp.where(sticking(kinks, mode.sigma), -found.margin, -jnp.inf)
+        beyond = _greatest(over, over > 0)
+        backwards = -_per_element(kinks, found.slip_rate * mode.sigma)
+        returning = _greatest(backwards, released & (backwards > jnp.where(search.clearly, 0, 1e-6 * search.free_rate)))
+        torn = _torn(kinks, t, q, v, found, over > -jnp.inf) & ~jnp.any(beyond)
+        leaving = jnp.where((stage == FIRST) & jnp.any(breaking), breaking, beyond | torn)
+        returning = returning & ~jnp.any(leaving)
+        way = jnp.where((beyond | breaking)[of], -found.force, found.slip_rate)
+        size = norms(kinks, way)[of]
+        sigma = jnp.where(leaving[of], way / jnp.where(size > 0, size, 1), jnp.where(returning[of], 0, mode.sigma))
+        clearly = (search.clearly | (leaving & (over > 1e-6 * jnp.abs(found.bound)))) & ~returning
+        settled = ~jnp.any(leaving | returning)
+        agrees = settled & jnp.all(jnp.isfinite(found.force))
+
+        within = (stage == FIRST) | (stage == NEXT)
+        return _Search(
+            jnp.where(within, jnp.where(settled, HOLD, NEXT), jnp.where(stage == LOOSE, FIRST, DONE)),
+            Mode(
+                jnp.where(within, sigma, mode.sigma),
+                jnp.where(stage == HOLD, released & (rate <= 1e-6 * search.free_rate), mode.held),
+                jnp.where(within, agrees, mode.consistent),
+                jnp.where(within, found.bound, mode.bound),
+            ),
+            jnp.where(within, clearly, search.clearly),
+            jnp.where(stage == LOOSE, rate, search.free_rate),
+        )
+
     nothing = jnp.zeros(kinks.elements, v.dtype)
-    start = (resting, nothing > 0, jnp.array(False), nothing)
-    sigma, _, consistent, bound = jax.lax.fori_loop(0, kinks.elements + 2, release, start)
-    return Settled(sigma, consistent, bound)
+    resting = jax.lax.stop_gradient(jnp.where(at_rest[of], 0, sigma))
+    start = _Search(jnp.array(LOOSE), Mode(resting, no, jnp.array(False), nothing), no, nothing)
+    needed = lambda _, search: jax.lax.cond(search.stage == DONE, lambda search: search, turn, search)
+    return jax.lax.fori_loop(0, 4 * kinks.elements + 6, needed, start).mode
 
 
-def first_mode(flat: Flat, kinks: Kinks, t, q, v) -> Settled:
+def _greatest(x, among):
+    """The one entry that is greatest among some, if there are any."""
+    return among & (jnp.arange(x.size) == jnp.argmax(jnp.where(among, x, -jnp.inf)))
+
+
+def _torn(kinks, t, q, v, found, stuck):
+    """Of elements that cannot stick together, as on belts that part, the one farthest from its rest."""
+    _, drift = jax.jvp(lambda t, q: kinks.slip(t, q, v), (t, q), (jnp.ones_like(t), v))
+    most, rate = jnp.max(norms(kinks, drift), initial=0.0), norms(kinks, found.slip_rate)
+    return _greatest(rate, stuck & (most > 0) & (rate > 1e-6 * most))
+
+
+def first_mode(flat: Flat, kinks: Kinks, t, q, v) -> Mode:
     """The mode at a start: what moves slips along its motion; what rests sticks, or breaks away."""
     slip = jax.lax.stop_gradient(kinks.slip(t, q, v))
     size = norms(kinks, slip)
-    at_rest = size <= 1e2 * jnp.finfo(v.dtype).eps * jnp.max(jnp.abs(v))
+    at_rest = size <= slip_of(kinks, t, q, v, 1e2 * jnp.finfo(v.dtype).eps * jnp.abs(v))
     sigma = slip / jnp.where(at_rest, 1, size)[kinks.element_of_row]
     return settle(flat, kinks, t, q, v, sigma, at_rest, jnp.zeros_like(at_rest))
 
 
-def redirected(kinks: Kinks, sigma, slip):
+def slip_of(kinks: Kinks, t, q, v, errors: Float[Array, " n"]) -> Float[Array, " e"]:
+    """How much slip errors of the velocities come to, per element: each in its own units."""
+    return norms(kinks, jnp.abs(jax.jacfwd(kinks.slip, argnums=2)(t, q, v)) @ errors)
+
+
+def redirected(kinks: Kinks, sigma, held, t, q, v):
     """σ of the slipping elements of several rows, turned along with their motion."""
-    of = kinks.element_of_row
-    several, size = (np.bincount(of) > 1)[of], norms(kinks, slip)[of]
-    turns = several & (size > jnp.finfo(slip.dtype).tiny ** 0.25) & ~sticking(kinks, sigma)[of]
-    return jnp.where(turns, slip / jnp.where(turns, size, 1), sigma)
+    of, slip = kinks.element_of_row, kinks.slip(t, q, v)
+    several, size = np.bincount(of) > 1, norms(kinks, slip)
+    turns = (several & (size > slip_of(kinks, t, q, v, jnp.finfo(v.dtype).eps * jnp.abs(v))) & ~sticking(kinks, sigma) & ~held)[of]
+    return jnp.where(turns, slip / jnp.where(turns, size[of], 1), sigma) if np.any(several) else sigma
 
 
-def friction_by_term(kinks: Kinks, sigma, t, q, v, found: Friction) -> dict[str, tuple[Array, Array]]:
+def friction_by_term(kinks: Kinks, sigma, held, t, q, v, found: Friction) -> dict[str, tuple[Array, Array]]:
     """Force on each slip velocity and whether it sticks, by dissipation term. Where several terms rub on one slip velocity, each has
     its share of the force by its bound.
     """
-    of, stuck = kinks.element_of_row, sticking(kinks, sigma)
+    of, stuck = kinks.element_of_row, sticking(kinks, sigma) | held
     extent, forces = _extent(kinks, sigma, kinks.slip(t, q, v)), {}
     for name, rows in kinks.rows_of_term.items():
         bound = jax.grad(lambda u, D=kinks.lifted[name]: D(t, q, v, found.multipliers, u))(extent)

@@ -13,7 +13,7 @@ from ._checks import checked, parameters, sample_times, state
 from ._compiled import compiled
 from ._friction import Regularised, StickSlip
 from ._manifold import Baumgarte, NoStabilisation, Projection
-from ._motion import Equations
+from ._motion import Equations, Scales
 from ._sensitivities import differentiable, pushed
 from ._signal import solved
 from ._solve import How, begun, can_be_varied, judged, raise_failure, states_at, states_varied, tolerances_of
@@ -114,8 +114,8 @@ def _motion(equations, how, adjoint, inputs, ts):
     """y at the samples; and, not differentiated, the reason it ended and the counts."""
     t0, q, v, params, tolerances = inputs
     params = solved(params)
-    start = begun(equations, t0, q, v, params, tolerances)
-    ys, result, stats = states_at(equations, how, adjoint, t0, start.y, ts, (params, start.slack), tolerances)
+    start, scales = begun(equations, t0, q, v, params), Scales.of(tolerances, ts, params)
+    ys, result, stats = states_at(equations, how, adjoint, t0, start.y, ts, (params, scales), tolerances)
     ys, result = judged(ys, result, start.obstacles, (inputs, ts))
     return ys, (result, stats | {"start_moved": start.moved})
 
@@ -127,8 +127,8 @@ def _varied_motion(equations, how, moving, still, directions, ts):
         return pushed(functools.partial(_motion, equations, how, dfx.ForwardMode()))(moving, still, directions, ts)
 
     def started(moving):
-        t0, q, v, params, tolerances = eqx.combine(moving, still)
-        start = begun(equations, t0, q, v, solved(params), tolerances)
+        t0, q, v, params, _ = eqx.combine(moving, still)
+        start = begun(equations, t0, q, v, solved(params))
         return start.y, start
 
     along_all = moving, directions, t0, directions[0], ts, (solved(params), directions[3])

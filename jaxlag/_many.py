@@ -209,13 +209,13 @@ def _varied_motions(equations, how, moving, still, directions, ts):
 
 def _started(equations, inputs, ts):
     """y0; and, not differentiated, how far starts were off and what is wrong with them."""
-    (t0, tolerances, shared), own = inputs
+    (t0, _, shared), own = inputs
     shared = shared | {"params": solved(shared["params"])}
 
     def start(own):
         member = eqx.combine(own, shared)
         q, v = (ravel_pytree(member[name])[0] for name in ("q0", "qdot0"))
-        found = begun(equations, t0, q, v, member["params"], tolerances)
+        found = begun(equations, t0, q, v, member["params"])
         return found.y, (found.moved, judged(found.y, RESULTS.successful, found.obstacles, (member, ts))[1])
 
     y0, start = jax.vmap(start, in_axes=-1, out_axes=(-1, 0))(own)
@@ -260,5 +260,5 @@ class Abreast:
         return self._each(self.equations.kept, t, y, args)
 
     def _each(self, function, t, y, args):
-        (shared, own), slack = args
-        return jax.vmap(lambda y, own: function(t, y, (eqx.combine(shared, own), slack)), in_axes=-1, out_axes=-1)(y, own)
+        (shared, own), scales = args
+        return jax.vmap(lambda y, own: function(t, y, (eqx.combine(shared, own), scales)), in_axes=-1, out_axes=-1)(y, own)

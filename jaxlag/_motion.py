@@ -1,8 +1,8 @@
 """The equations of motion as a first-order system, ready to be integrated.
 
-    y = (q, q̇, work of each term, σ of each slip, number of transitions, time stuck)
+    y = (q, q̇, work of each term, σ of each slip, which elements others hold at their bound, number of transitions, time stuck)
 
-Works are there where they were asked for, the last three where D has kinks.
+Works are there where they were asked for, the last four where D has kinks.
 """
 
 import dataclasses
@@ -15,6 +15,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, PyTree
 
 from ._friction import (
+    Mode,
     Regularised,
     StickSlip,
     first_mode,
@@ -24,6 +25,7 @@ from ._friction import (
     norms,
     redirected,
     settle,
+    slip_of,
     sticking,
 )
 from ._kinks import Kinks, kinks_of
@@ -31,6 +33,7 @@ from ._manifold import Baumgarte, NoStabilisation, Projection
 from ._multipliers import constrained_acceleration
 from ._power import energy_turnover, listed_powers
 from ._scalarised import scalarised
+from ._signal import least_spacing
 from ._system import Flat, System, bind
 
 PROJECTION = "projection"  # how the work that projection does is named
@@ -43,6 +46,7 @@ class Parts(NamedTuple):
     v: Float[Array, " n"]
     works: Float[Array, " w"]
     sigma: Float[Array, " r"]
+    held: Float[Array, " e"]  # 1 or 0
     transitions: Float[Array, " 0|1"]
     time_stuck: Float[Array, " e"]
 
@@ -69,7 +73,7 @@ class Sample(NamedTuple):
 
 @dataclasses.dataclass(frozen=True)
 class Equations:
-    """ẏ and what else the integration asks for; `args` are (params, slack), slack the slip velocity that counts as rest at an event."""
+    """ẏ and what else the integration asks for; `args` are (params, scales)."""
 
     system: System
     like: tuple  # structure, shapes and dtype of q
@@ -118,7 +122,7 @@ class Equations:
 
     def parts(self, y) -> Parts:
         """y, taken apart."""
-        sizes = [self.size, self.size, len(self.works), self.rows, min(self.elements, 1)]
+        sizes = [self.size, self.size, len(self.works), self.rows, self.elements, min(self.elements, 1)]
         return Parts(*jnp.split(y, np.cumsum(sizes)))
 
     @property
@@ -136,7 +140,7 @@ class Equations:
         if kinks is None:
             return Start(jnp.concatenate([q, v, works]), jnp.array(True), jnp.array(True))
         mode = first_mode(flat, kinks, t, q, v)
-        y = jnp.concatenate([q, v, works, mode.sigma, jnp.zeros(1 + self.elements, q.dtype)])
+        y = jnp.concatenate([q, v, works, mode.sigma, mode.held.astype(q.dtype), jnp.zeros(1 + self.elements, q.dtype)])
         return Start(self.kept(t, y, (params, None)), mode.consistent, ~jnp.any(mode.bound < 0))
 
     def rates(self, t, y, args):
@@ -152,7 +156,7 @@ class Equations:
         return root_mean_square(error)
 
     def margins(self, t, y, args):
-        """Per element of dry friction, how far its mode is from its end; negative beyond."""
+        """Per element of dry friction, how far its mode is from its end, negative beyond; and then its bound."""
         return _margins(self, t, y, args[0])
 
     def changed(self, t, y, args, ended):
@@ -165,7 +169,7 @@ class Equations:
 
     def sample(self, t, y, params) -> Sample:
         """One sample, from y on the constraints."""
-        q, v, works, sigma, transitions, time_stuck = self.parts(y)
+        q, v, works, sigma, held, transitions, time_stuck = self.parts(y)
         flat, _, kinks = self.mode(t, q, v, sigma, params)
         rubbing, counts = {}, {}
         if kinks is None:
@@ -173,7 +177,7 @@ class Equations:
         else:
             found = friction(flat, kinks, sigma, t, q, v, self.stabilisation.feedback())
             qddot, multipliers = found.qddot, found.multipliers
-            rubbing = friction_by_term(kinks, sigma, t, q, v, found)
+            rubbing = friction_by_term(kinks, sigma, held > 0, t, q, v, found)
             counts = {"transitions": transitions[0], "time_stuck": time_stuck}
         named = dict(zip(self.works, works, strict=True)) if self.audit else None
         unraveled = flat.unravel(q), flat.unravel(v), flat.unravel(qddot), flat.unravel_multipliers(multipliers)
@@ -190,38 +194,48 @@ def _accelerated(equations: Equations, t, y, params):
 
 @eqx.filter_jit
 def _rates(equations: Equations, t, y, params):
-    q, v, works, sigma, transitions, time_stuck = equations.parts(y)
+    q, v, works, sigma, held, transitions, time_stuck = equations.parts(y)
     _, mode, kinks = equations.mode(t, q, v, sigma, params)
     qddot = _accelerated(equations, t, y, params).x
     powers = listed_powers(mode, t, q, v) if equations.audit else works
-    stuck = time_stuck if kinks is None else sticking(kinks, sigma).astype(y.dtype)
-    return jnp.concatenate([v, qddot, powers, 0 * sigma, 0 * transitions, stuck])
+    stuck = time_stuck if kinks is None else jnp.maximum(sticking(kinks, sigma).astype(y.dtype), held)
+    return jnp.concatenate([v, qddot, powers, 0 * sigma, 0 * held, 0 * transitions, stuck])
 
 
 @eqx.filter_jit
 def _margins(equations: Equations, t, y, params):
-    q, v, _, sigma, *_ = equations.parts(y)
+    q, v, _, sigma, held, *_ = equations.parts(y)
     flat, _, kinks = equations.mode(t, q, v, sigma, params)
     assert kinks is not None  # asked of systems with dry friction alone
-    return friction(flat, kinks, sigma, t, q, v).margin
+    found = friction(flat, kinks, sigma, t, q, v)
+    return jnp.concatenate([jnp.where(held > 0, 1, found.margin), found.bound])
 
 
 @eqx.filter_jit
 def _changed(equations: Equations, t, y, args, ended):
-    params, slack = args
-    q, v, works, sigma, transitions, time_stuck = equations.parts(y)
+    params, scales = args
+    q, v, _, sigma, held, *_ = equations.parts(y)
     flat, _, kinks = equations.mode(t, q, v, sigma, params)
     assert kinks is not None
-    stuck, slow = sticking(kinks, sigma), norms(kinks, kinks.slip(t, q, v)) <= slack
+    stuck = sticking(kinks, sigma) | (held > 0)
+    slow = norms(kinks, kinks.slip(t, q, v)) <= slip_of(kinks, t, q, v, scales.error(v))
     mode = settle(flat, kinks, t, q, v, sigma, stuck | ended | slow, ended & stuck)
-    changes = jnp.sum(norms(kinks, mode.sigma - sigma) > 0.5)
-    y = jnp.concatenate([q, v, works, mode.sigma, transitions + changes, time_stuck])
+    y = in_other_mode(equations, kinks, y, mode)
     return equations.kept(t, y, args), mode.consistent, jnp.all(~ended | stuck | slow)
+
+
+def in_other_mode(equations: Equations, kinks: Kinks, y, mode: Mode):
+    """y with another mode, and its transitions counted: what begins or ceases to slip, or slips another way."""
+    q, v, works, sigma, held, transitions, time_stuck = equations.parts(y)
+    of = kinks.element_of_row
+    before, after = jnp.where((held > 0)[of], 0, sigma), jnp.where(mode.held[of], 0, mode.sigma)
+    changes = jnp.sum(norms(kinks, after - before) > 0.5)
+    return jnp.concatenate([q, v, works, mode.sigma, mode.held.astype(y.dtype), transitions + changes, time_stuck])
 
 
 @eqx.filter_jit
 def _kept(equations: Equations, t, y, params):
-    q, v, works, sigma, *counts = equations.parts(y)
+    q, v, works, sigma, held, *counts = equations.parts(y)
     _, mode, kinks = equations.mode(t, q, v, sigma, params)
     assert equations.projection is not None  # asked where there is something to keep
     projection = equations.projection
@@ -230,8 +244,8 @@ def _kept(equations: Equations, t, y, params):
         lift = energy_turnover(mode, t, on_q, on_v)[0] - energy_turnover(mode, t, q, v)[0]
         works = works.at[equations.works.index(PROJECTION)].add(lift)
     if kinks is not None:
-        sigma = jax.lax.stop_gradient(redirected(kinks, sigma, kinks.slip(t, on_q, on_v)))
-    return jnp.concatenate([on_q, on_v, works, sigma, *counts])
+        sigma = jax.lax.stop_gradient(redirected(kinks, sigma, held > 0, t, on_q, on_v))
+    return jnp.concatenate([on_q, on_v, works, sigma, held, *counts])
 
 
 def root_mean_square(x) -> Array:
@@ -239,7 +253,22 @@ def root_mean_square(x) -> Array:
     return jnp.sqrt(jnp.mean(jax.lax.stop_gradient(x) ** 2, axis=0))
 
 
-def slack_of(tolerances: tuple[Any, Any], v) -> Any:
-    """The slip velocity that counts as rest where another element changes its mode: ten times the tolerance of the integration."""
-    rtol, atol = tolerances
-    return 10 * (rtol * jnp.max(jnp.abs(v)) + atol)
+class Scales(NamedTuple):
+    """What counts as small in a motion: the tolerances, how long it is, how finely its inputs are given, the rounding of its times."""
+
+    rtol: Any
+    atol: Any
+    duration: Any
+    spacing: Any
+    rounding: Any
+
+    @classmethod
+    def of(cls, tolerances, ts, params) -> "Scales":
+        """Of a motion at the times `ts`."""
+        end = jnp.maximum(jnp.abs(ts[0]), jnp.abs(ts[-1]))
+        found = cls(*tolerances, ts[-1] - ts[0], least_spacing(params, ts.dtype), jnp.finfo(ts.dtype).eps * end)
+        return jax.lax.stop_gradient(found)
+
+    def error(self, v) -> Array:
+        """Of each velocity, what the integration may be off by: so little slip counts as rest where another element changes its mode."""
+        return 10 * (self.rtol * jnp.abs(v) + self.atol)

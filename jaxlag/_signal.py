@@ -114,6 +114,13 @@ def jump_times(params: PyTree, dtype: Any) -> Float[Array, " jumps"] | None:
     return jax.lax.stop_gradient(jnp.concatenate([signal.ts[1:] for signal in held]).astype(dtype)) if held else None
 
 
+def least_spacing(params: PyTree, dtype: Any) -> Float[Array, ""]:
+    """The shortest time between two samples of a signal in `params`; infinite without signals."""
+    signals = [leaf for leaf in jax.tree.leaves(params, is_leaf=is_signal) if is_signal(leaf)]
+    apart = jnp.concatenate([jnp.zeros(0, dtype), *(jnp.diff(signal.ts.astype(dtype)) for signal in signals)])
+    return jnp.min(jnp.where(apart > 0, apart, jnp.inf), initial=jnp.inf)
+
+
 def moves_smoothly(moving: PyTree, params: PyTree) -> bool:
     """Whether no signal in `params` is among what moves, and none jumps."""
     signals = [leaf for leaf in jax.tree.leaves(moving, is_leaf=is_signal) if is_signal(leaf)]

@@ -14,7 +14,7 @@ from jaxtyping import Array, Bool
 from ._compiled import is_concrete
 from ._kernel import in_one_kernel
 from ._manifold import nearest_state
-from ._motion import Equations, slack_of
+from ._motion import Equations
 from ._progress import Bar
 from ._results import OF_THE_INPUT, RESULTS, reason_of
 from ._runge_kutta import Dop853, is_explicit
@@ -60,15 +60,14 @@ def _warn_of_single_precision() -> None:
 
 
 class Begun(NamedTuple):
-    """y at the start, the velocities that count as rest, how far the start was off, and what may be wrong with it."""
+    """y at the start, how far the start was off, and what may be wrong with it."""
 
     y: Array
-    slack: Array
     moved: Array
     obstacles: tuple[tuple[Bool[Array, ""], Any], ...]
 
 
-def begun(equations: Equations, t0, q, v, params, tolerances) -> Begun:
+def begun(equations: Equations, t0, q, v, params) -> Begun:
     """The start, put on the constraints."""
     nearest = nearest_state(equations.flat(params), t0, q, v)
     start = equations.start(t0, nearest.q, nearest.v, params)
@@ -79,7 +78,7 @@ def begun(equations: Equations, t0, q, v, params, tolerances) -> Begun:
         (nearest.reached, RESULTS.impossible_start),
         (nearest.determined, RESULTS.no_inertia),
     )
-    return Begun(start.y, slack_of(tolerances, nearest.v), moved, obstacles)
+    return Begun(start.y, moved, obstacles)
 
 
 def judged(ys, result, obstacles, inputs) -> tuple[Array, RESULTS]:
@@ -127,7 +126,11 @@ def states_at(equations: Any, how: How, adjoint: dfx.AbstractAdjoint, t0, y0, ts
     ys = solution.ys if kept is None else jax.vmap(lambda t, y: kept(t, y, args))(ts, solution.ys)
     stats = {key: solution.stats[key] for key in ("num_steps", "num_accepted_steps", "num_rejected_steps")}
     result = RESULTS.promote(solution.result)
-    result = RESULTS.where(result == RESULTS.internal_error, RESULTS.no_friction, result)  # as StickSlipSolver says it
+    for said, reason in (
+        (RESULTS.internal_error, RESULTS.no_friction),
+        (RESULTS.stagnation, RESULTS.negative_bound),
+    ):  # as StickSlipSolver says it
+        result = RESULTS.where(result == said, reason, result)
     return ys, RESULTS.where(result == RESULTS.max_steps_rejected, RESULTS.chattering, result), stats
 
 

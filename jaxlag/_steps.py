@@ -12,16 +12,18 @@ import numpy as np
 from equinox.internal import prevbefore
 from jaxtyping import Array, Float
 
-from ._friction import norms, settle
-from ._motion import Equations
+from ._friction import norms, settle, slip_of
+from ._motion import Equations, in_other_mode
 from ._power import energy_turnover
 from ._signal import delayed
 from ._system import EXPLICIT_TIME
+from ._watch import Seen, first_end
 
-LOOKS = 4  # how often a step looks for an end of the mode, at its end the last time
-SECTIONS = 20  # of a step, each into as many parts: 4²⁰ = 10¹²
 NEWTON_STEPS = 3  # the first makes the time right and its derivative, the others its higher derivatives
 LAST = NEWTON_STEPS + 1  # pieces: the whole step, those up to the end of a mode, the rest
+TOGETHER = 1e3  # modes that end within so many roundings of time end together
+BARELY = 1e-6  # of the motion, the step that ends where a bound turns negative
+NEGATIVE = dfx.RESULTS.stagnation  # how a step says so
 
 
 class AtSamples(dfx.AbstractAdjoint):
@@ -114,8 +116,8 @@ class Kept(dfx.AbstractWrappedSolver, dfx.AbstractAdaptiveSolver):
             return terms, args
 
         def rates(t, y, given):
-            (params, slack), end = given
-            return terms.vf(t, y, (delayed(params, jnp.maximum(t - end, 0)), slack))
+            (params, scales), end = given
+            return terms.vf(t, y, (delayed(params, jnp.maximum(t - end, 0)), scales))
 
         return dfx.ODETerm(rates), (args, t1)
 
@@ -154,17 +156,16 @@ class Piece(NamedTuple):
 
 class Turn(NamedTuple):
     """What is known of a step that may have the end of a mode in it: the pieces before and after it; where the first of them ends, and
-    would better have ended; the slopes of the margins; y in the next mode; whether a mode ends, the next agrees with its forces,
-    and the pieces can be used.
+    would better have ended; what was seen along the step; y in the next mode; whether that agrees with its forces, and whether the
+    pieces can be used.
     """
 
     first: Piece
     second: Piece
     cut: Any
     next_cut: Any
-    slope: Any
+    seen: Seen
     y_new: Any
-    ended: Any
     possible: Any
     usable: Any
 
@@ -192,18 +193,21 @@ class StickSlipSolver(Kept):
         piece = lambda *given: Piece(*self._stepped(terms, *given[:3], args, *given[3:]))
         given = t0, t1, y0, solver_state, jnp.asarray(made_jump)
         nothing = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), jax.eval_shape(piece, *given))
-        no = jnp.array(False)
-        start = Turn(nothing, nothing, t1, t1, jnp.zeros(self.equations.elements, y0.dtype), y0, no, no, no)
+        no, zeros = jnp.array(False), jnp.zeros(self.equations.elements, y0.dtype)
+        start = Turn(nothing, nothing, t1, t1, Seen(no, no, no, jnp.asarray(t1, y0.dtype), zeros), y0, no, no)
 
         turn = functools.partial(self._turn, piece, given, args)
-        needed = lambda before, count: jax.lax.cond((count == 0) | before.ended, turn, lambda before, _: before, before, count)
+        needed = lambda before, count: jax.lax.cond((count == 0) | before.seen.ended, turn, lambda before, _: before, before, count)
         made, _ = jax.lax.scan(lambda *turn: (needed(*turn), None), start, np.arange(LAST + 1))
-        first, second, ended = made.first, made.second, made.ended
+        first, second, ended = made.first, made.second, made.seen.ended
         cut = jnp.where(ended, made.cut, t1)
         error = jnp.where(ended, jnp.maximum(jnp.abs(first.error), jnp.abs(second.error)), first.error)
-        error = jnp.where(~ended | made.usable, error, jnp.inf)
+        # Where a bound has turned negative, steps shrink until the motion has come as far as it goes.
+        shrinking = made.seen.negative & (t1 - t0 > BARELY * args[1].duration)
+        error = jnp.where((ended & ~made.usable) | made.seen.unsure | shrinking, jnp.inf, error)
         possible = ~ended | made.possible | ~made.usable
         refused = dfx.RESULTS.where(possible & begins, dfx.RESULTS.successful, dfx.RESULTS.internal_error)
+        refused = dfx.RESULTS.where(made.seen.negative & ~shrinking, NEGATIVE, refused)
         refused = dfx.RESULTS.where(self.equations.exhausted(second.y), dfx.RESULTS.max_steps_rejected, refused)
         result = dfx.RESULTS.where(first.result == dfx.RESULTS.successful, refused, first.result)
         return second.y, error, {"cut": cut, "first": first.dense, "second": second.dense}, second.state, result
@@ -217,22 +221,24 @@ class StickSlipSolver(Kept):
         done = piece(begin, end, jnp.where(after, before.y_new, y0), state, after | made_jump)
 
         def look():
-            found, time, slope = self._first_end(begin, end, done.dense, args)
+            seen = self._looked(begin, end, done.dense, args)
+            fine = ~(seen.ended | seen.unsure | seen.negative)
             return jax.lax.cond(
                 after,
-                lambda: before._replace(second=done, usable=before.usable & ~found),
-                lambda: before._replace(first=done, second=done, ended=found, next_cut=time, slope=slope),
+                lambda: before._replace(second=done, usable=before.usable & fine),
+                lambda: before._replace(first=done, second=done, seen=seen, next_cut=seen.time),
             )
 
         def locate():
-            value = self.equations.margins(end, done.y, args)
-            falling = before.slope < 0
-            until = jnp.where(falling, jnp.abs(value) / jnp.where(falling, -before.slope, 1), jnp.inf)
+            value, slope = self.equations.margins(end, done.y, args)[: self.equations.elements], before.seen.slope
+            falling = slope < 0
+            until = jnp.where(falling, jnp.abs(value) / jnp.where(falling, -slope, 1), jnp.inf)
             nearest = jax.lax.stop_gradient(jnp.argmin(until))
-            better = end - value[nearest] / jnp.where(falling[nearest], before.slope[nearest], -jnp.inf)
+            better = end - value[nearest] / jnp.where(falling[nearest], slope[nearest], -jnp.inf)
             usable = jnp.any(falling) & (end >= t0) & (end < t1)
             located = before._replace(first=done, cut=end, next_cut=better, usable=usable)
-            which = jnp.arange(value.size) == nearest
+            together = falling & (value <= -slope * TOGETHER * args[1].rounding)
+            which = (jnp.arange(value.size) == nearest) | together
             return jax.lax.cond(count == LAST - 1, lambda: self._changed(located, which, args), lambda: located)
 
         return jax.lax.cond(looks, look, locate)
@@ -243,24 +249,12 @@ class StickSlipSolver(Kept):
         return turn._replace(y_new=y, possible=possible, usable=turn.usable & ready)
 
     @eqx.filter_jit
-    def _first_end(self, t0, t1, dense, args):
-        """Whether a mode ends within a step, when the first does on the dense output, and the slopes of the margins there."""
+    def _looked(self, t0, t1, dense, args):
+        """What is seen of the margins along a step, on its dense output."""
         t0, t1, dense, args = jax.lax.stop_gradient((t0, t1, dense, args))
         path = self.solver.interpolation_cls(t0=t0, t1=t1, **dense)
-        margins = lambda t: self.equations.margins(t, path.evaluate(t), args)
-
-        def narrower(carry):
-            section, low, width, ended = carry
-            beyond = jnp.any(jax.vmap(margins)(low + width * np.arange(1, LOOKS + 1) / LOOKS) < 0, axis=1)
-            found = jnp.any(beyond)
-            part = jnp.where(found, jnp.argmax(beyond), LOOKS - 1)  # the end itself may be beyond by rounding alone
-            return section + 1, low + part * width / LOOKS, width / LOOKS, ended | ((section == 0) & found)
-
-        going_on = lambda section, _low, _width, ended: (section == 0) | (ended & (section < SECTIONS))
-        start = (0, t0, t1 - t0, jnp.array(False))
-        _, low, width, ended = jax.lax.while_loop(lambda carry: going_on(*carry), narrower, start)
-        _, slope = jax.jvp(margins, (low + width,), (jnp.ones_like(low),))
-        return ended, low + width, slope
+        margins = lambda t, y: self.equations.margins(t, y, args)
+        return first_end(margins, path.evaluate, t0, t1, self.equations.elements, args[1])
 
 
 @eqx.filter_jit
@@ -270,13 +264,13 @@ def behind_a_jump(equations: Equations, t, y, args):
     A velocity constraint that jumps takes q̇ along by an impulse, which is the projection in the metric of M. Friction is bounded and
     has no part in it: where there is slip then, it goes on as it is; where there is none, it sticks or breaks away.
     """
-    params, slack = args
-    q, v, works, sigma, transitions, time_stuck = equations.parts(y)
+    params, scales = args
+    q, v, works, sigma, *counts = equations.parts(y)
     flat, _, kinks = equations.mode(t, q, v, sigma, params)
     if equations.audit:
         lift = energy_turnover(flat, t, q, v)[0] - energy_turnover(flat, prevbefore(prevbefore(t)), q, v)[0]
         works = works.at[equations.works.index(EXPLICIT_TIME)].add(lift)
-    slipping = jnp.concatenate([q, v, works, jnp.ones_like(sigma), transitions, time_stuck])
+    slipping = jnp.concatenate([q, v, works, jnp.ones_like(sigma), *counts])
     y = slipping if equations.projection is None else equations.kept(t, slipping, args)
     if kinks is None:
         return y, jnp.array(True)
@@ -284,9 +278,9 @@ def behind_a_jump(equations: Equations, t, y, args):
     slip = kinks.slip(t, q, v)
     size = norms(kinks, slip)
     along = slip / jnp.where(size > 0, size, 1)[kinks.element_of_row]
-    mode = settle(flat, kinks, t, q, v, along, size <= slack, jnp.zeros_like(size, bool))
-    changes = jnp.sum(norms(kinks, mode.sigma - sigma) > 0.5)
-    y = jnp.concatenate([q, v, works, mode.sigma, transitions + changes, time_stuck])
+    at_rest = size <= slip_of(kinks, t, q, v, scales.error(v))
+    mode = settle(flat, kinks, t, q, v, along, at_rest, jnp.zeros_like(at_rest))
+    y = in_other_mode(equations, kinks, jnp.concatenate([q, v, works, sigma, *counts]), mode)
     return equations.kept(t, y, args), mode.consistent
 
 

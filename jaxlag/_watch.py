@@ -1,0 +1,143 @@
+"""Watching a step for the end of a mode, so that none is missed.
+
+A mode may end and begin again between two looks in two ways. What follows the state is smooth on a step, so a dip shows in the slopes at
+the looks on both sides of it. What follows the time alone, a load that comes as a pulse, need not show at all: bounds of it over the
+whole interval (`_enclosure`) say by how much it may have changed there. Wherever a margin may have been used up, looks are closer.
+"""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.flatten_util import ravel_pytree
+from jaxtyping import Array, Float
+
+from ._enclosure import OfTime, of_time
+
+LOOKS = 8  # parts of an interval, at whose ends it is looked at
+SECTIONS = 14  # of the one with the end in it, each into as many parts: 8¹⁴ = 4 · 10¹²
+ROUNDS = 256  # of looks, after which the step is too long to be watched
+BRIEF = 1e-7  # of the motion, how long anything lasts that is looked for,
+UNBOUNDED = 2e-4  # where part of the time dependence has no bounds
+NEAR = 64  # roundings of time, below which no dip is looked for
+
+
+class Seen(NamedTuple):
+    """Along a step: whether a mode ends, a bound turns negative before, or neither is sure; when; the slopes of the margins there."""
+
+    ended: Any
+    negative: Any
+    unsure: Any
+    time: Any
+    slope: Float[Array, " e"]  # −∞ where a margin jumps
+
+
+class Looks(NamedTuple):
+    """Margins and bounds at some times: values and slopes, and by how much the time alone may have changed them in between."""
+
+    value: Float[Array, "k 2e"]
+    slope: Float[Array, "k 2e"]
+    change: Float[Array, "k-1 2e"]
+
+
+class _Search(NamedTuple):
+    """The interval looked at; whether an end is in it; how often was looked, and how often since; what was seen at its ends."""
+
+    low: Any
+    high: Any
+    found: Any
+    rounds: Any
+    sections: Any
+    before: Float[Array, " 2e"]
+    behind: Float[Array, " 2e"]
+    slope: Float[Array, " 2e"]
+    largest: Float[Array, " 2e"]
+
+
+def first_end(margins: Callable, path: Callable, t0, t1, elements: int, scales: Any) -> Seen:
+    """When the first of `margins(t, y)` turns negative along a `path`; the elements' bounds come after their margins, and count as well."""
+    parted = of_time(margins, t0, path(t0))
+    look, near = _looking(margins, path, parted), NEAR * scales.rounding
+    brief = jnp.maximum(BRIEF * scales.duration, near)
+    if parted is not None and not parted.is_bounded:
+        brief = jnp.maximum(brief, jnp.minimum(UNBOUNDED * scales.duration, scales.spacing))
+
+    def closer(search):
+        low, high, found, rounds, sections, *_, largest = search
+        part = (high - low) / LOOKS
+        value, slope, change = look(low + part * np.arange(LOOKS + 1))
+        largest = jnp.maximum(largest, jnp.max(jnp.abs(value), axis=0))
+        value = value.at[:, elements:].add(1e-9 * largest[elements:])  # a bound of zero is none that is negative
+        beyond = jnp.any(value[1:] < 0, axis=1)
+        doubtful = jnp.any(_dips(value, slope, part) & (part > near) | (value[:-1] + value[1:] < change) & (part > brief), axis=1)
+        wanted = beyond | (doubtful & ~found)
+        i = jnp.where(jnp.any(wanted), jnp.argmax(wanted), LOOKS - 1)  # the end itself may be beyond by rounding alone
+        onward = ~found & ~jnp.any(wanted)
+        hit = ~onward & beyond[i]
+        new = lambda now, before: jnp.where(hit, now, before)
+        return _Search(
+            jnp.where(onward, high, low + i * part),
+            jnp.where(onward, t1, jnp.where(i == LOOKS - 1, high, low + (i + 1) * part)),
+            found | hit,
+            rounds + 1,
+            sections + (found | hit),
+            *(new(now, before) for now, before in zip((value[i], value[i + 1], slope[i + 1]), search[5:8], strict=True)),
+            largest,
+        )
+
+    going_on = lambda search: jnp.where(search.found, search.sections < SECTIONS, (search.low < t1) & (search.rounds < ROUNDS))
+    nothing, time = jnp.zeros(2 * elements, path(t0).dtype), jnp.asarray(t0, path(t0).dtype)
+    start = _Search(time, jnp.asarray(t1, time.dtype), jnp.array(False), 0, 0, *[nothing] * 4)
+    done = jax.lax.while_loop(going_on, closer, start)
+    steep = 10 * jnp.abs(done.slope) * (done.high - done.low) + 1e-9 * done.largest
+    slope = jnp.where((done.behind < 0) & (done.before - done.behind > steep), -jnp.inf, done.slope)
+    is_margin = jnp.any(done.behind[:elements] < 0)
+    return Seen(done.found & is_margin, done.found & ~is_margin, ~done.found & (done.low < t1), done.high, slope[:elements])
+
+
+def _dips(value, slope, part):
+    """Where the tangents at both ends of a part meet below zero."""
+    (left, right), (falls, rises) = (value[:-1], value[1:]), (slope[:-1], slope[1:])
+    turns = (falls < 0) & (rises > 0)
+    meeting = (right - left - rises * part) / jnp.where(turns, falls - rises, 1)
+    return turns & (left + falls * meeting < 0)
+
+
+def _looking(margins, path, parted: OfTime | None) -> Callable[..., Looks]:
+    """Looks at some times along a path."""
+
+    def alone(t):
+        y, dy = jax.jvp(path, (t,), (jnp.ones_like(t),))
+        return jax.jvp(lambda y: margins(t, y), (y,), (dy,))
+
+    if parted is None:
+        return lambda ts: Looks(*jax.vmap(alone)(ts), jnp.zeros(()))
+    floats = lambda phi: ravel_pytree(eqx.filter(phi, eqx.is_inexact_array))[0]
+
+    def along(t):
+        (y, phi), (dy, dphi) = jax.jvp(lambda t: (path(t), floats(parted.phi(t))), (t,), (jnp.ones_like(t),))
+        found = parted.phi(t)
+        unravel = ravel_pytree(eqx.filter(found, eqx.is_inexact_array))[1]
+        rest = lambda phi, y: parted.rest(eqx.combine(unravel(phi), found), y)
+        value, push = jax.linearize(rest, phi, y)
+        each = jax.vmap(push, in_axes=(0, None), out_axes=1)(jnp.eye(phi.size, dtype=phi.dtype), jnp.zeros_like(y))
+        return value, push(dphi, dy), jnp.abs(each)
+
+    def looks(ts):
+        value, slope, reach = jax.vmap(along)(ts)
+        return Looks(value, slope, jax.vmap(lambda *given: _change(parted, *given))(ts[:-1], ts[1:], jnp.maximum(reach[:-1], reach[1:])))
+
+    return looks
+
+
+def _change(parted: OfTime, start, end, reach):
+    """By how much φ may change f from one time to another, with the derivatives `reach` of f; choices may change it altogether."""
+    intervals = parted.bounds(start, end)
+    widths = [high - low for low, high in intervals if jnp.issubdtype(low.dtype, jnp.inexact)]
+    switches = [jnp.any(low != high) for low, high in intervals if not jnp.issubdtype(low.dtype, jnp.inexact)]
+    width = jnp.concatenate([jnp.ravel(width) for width in widths]) if widths else jnp.zeros(0, reach.dtype)
+    change = jnp.sum(jnp.where(reach == 0, 0, reach * width), axis=1)
+    return jnp.where(jnp.any(jnp.stack(switches)), jnp.inf, change) if switches else change
