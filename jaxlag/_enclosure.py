@@ -79,12 +79,26 @@ class _Step(NamedTuple):
 
 
 def _flattened(closed) -> tuple[list[_Step], dict[int, Any], list[int]]:
-    """The equations of a program with those of the programs it calls in their places, its constants, and the outputs."""
-    numbers, steps, constants = itertools.count(2), [], {}
+    """The equations of a program with those of the programs it calls in their places, each once; its constants, and the outputs."""
+    numbers, constants = itertools.count(2), {}
+    steps: list[_Step] = []
+    made: dict[Any, Any] = {}
+
+    def once(key, make):
+        try:
+            return made[key] if key in made else made.setdefault(key, make())
+        except TypeError:  # parameters that cannot be compared
+            return make()
 
     def constant(value):
-        constants[number := next(numbers)] = value
+        small = isinstance(value, np.ndarray) and value.size < 100
+        number = once((value.dtype, value.shape, value.tobytes()) if small else id(value), lambda: next(numbers))
+        constants[number] = value
         return number
+
+    def step(equation, operands):
+        steps.append(_Step(equation, operands, [next(numbers) for _ in equation.outvars]))
+        return steps[-1].results
 
     def read(jaxpr, places):
         place = lambda atom: constant(np.asarray(atom.val, atom.aval.dtype)) if isinstance(atom, Literal) else places[atom]
@@ -95,8 +109,8 @@ def _flattened(closed) -> tuple[list[_Step], dict[int, Any], list[int]]:
                 given = (*map(constant, inner.consts), *operands)
                 results = read(inner.jaxpr, dict(zip((*inner.jaxpr.constvars, *inner.jaxpr.invars), given, strict=True)))
             else:
-                results = [next(numbers) for _ in equation.outvars]
-                steps.append(_Step(equation, operands, results))
+                what = (equation.primitive, tuple(equation.params.items()), tuple(operands))
+                results = once(what, lambda equation=equation, operands=operands: step(equation, operands))
             places |= dict(zip(equation.outvars, results, strict=True))
         return [place(atom) for atom in jaxpr.outvars]
 

@@ -225,11 +225,11 @@ def _changed(equations: Equations, t, y, args, ended):
 
 
 def in_other_mode(equations: Equations, kinks: Kinks, y, mode: Mode):
-    """y with another mode, and its transitions counted: what begins or ceases to slip, or slips another way."""
+    """y with another mode, and its transitions counted: what begins or ceases to slip, or slips another way, where there is friction."""
     q, v, works, sigma, held, transitions, time_stuck = equations.parts(y)
     of = kinks.element_of_row
     before, after = jnp.where((held > 0)[of], 0, sigma), jnp.where(mode.held[of], 0, mode.sigma)
-    changes = jnp.sum(norms(kinks, after - before) > 0.5)
+    changes = jnp.sum((norms(kinks, after - before) > 0.5) & (mode.bound != 0))
     return jnp.concatenate([q, v, works, mode.sigma, mode.held.astype(y.dtype), transitions + changes, time_stuck])
 
 

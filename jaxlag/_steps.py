@@ -221,7 +221,7 @@ class StickSlipSolver(Kept):
         done = piece(begin, end, jnp.where(after, before.y_new, y0), state, after | made_jump)
 
         def look():
-            seen = self._looked(begin, end, done.dense, args)
+            seen = self._looked(begin, end, done.dense, args, ~after)
             fine = ~(seen.ended | seen.unsure | seen.negative)
             return jax.lax.cond(
                 after,
@@ -249,12 +249,12 @@ class StickSlipSolver(Kept):
         return turn._replace(y_new=y, possible=possible, usable=turn.usable & ready)
 
     @eqx.filter_jit
-    def _looked(self, t0, t1, dense, args):
+    def _looked(self, t0, t1, dense, args, exactly):
         """What is seen of the margins along a step, on its dense output."""
         t0, t1, dense, args = jax.lax.stop_gradient((t0, t1, dense, args))
         path = self.solver.interpolation_cls(t0=t0, t1=t1, **dense)
         margins = lambda t, y: self.equations.margins(t, y, args)
-        return first_end(margins, path.evaluate, t0, t1, self.equations.elements, args[1])
+        return first_end(margins, path.evaluate, t0, t1, self.equations.elements, args[1], exactly)
 
 
 @eqx.filter_jit

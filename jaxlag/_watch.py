@@ -57,10 +57,13 @@ class _Search(NamedTuple):
     largest: Float[Array, " 2e"]
 
 
-def first_end(margins: Callable, path: Callable, t0, t1, elements: int, scales: Any) -> Seen:
-    """When the first of `margins(t, y)` turns negative along a `path`; the elements' bounds come after their margins, and count as well."""
+def first_end(margins: Callable, path: Callable, t0, t1, elements: int, scales: Any, exactly: Any = True) -> Seen:
+    """When the first of `margins(t, y)` turns negative along a `path`; the elements' bounds come after their margins, and count as well.
+
+    Not `exactly`: only whether there is one.
+    """
     parted = of_time(margins, t0, path(t0))
-    look, near = _looking(margins, path, parted), NEAR * scales.rounding
+    look, near = _looking(margins, path, t0, t1, parted), NEAR * scales.rounding
     brief = jnp.maximum(BRIEF * scales.duration, near)
     if parted is not None and not parted.is_bounded:
         brief = jnp.maximum(brief, jnp.minimum(UNBOUNDED * scales.duration, scales.spacing))
@@ -88,7 +91,7 @@ def first_end(margins: Callable, path: Callable, t0, t1, elements: int, scales: 
             largest,
         )
 
-    going_on = lambda search: jnp.where(search.found, search.sections < SECTIONS, (search.low < t1) & (search.rounds < ROUNDS))
+    going_on = lambda search: jnp.where(search.found, exactly & (search.sections < SECTIONS), (search.low < t1) & (search.rounds < ROUNDS))
     nothing, time = jnp.zeros(2 * elements, path(t0).dtype), jnp.asarray(t0, path(t0).dtype)
     start = _Search(time, jnp.asarray(t1, time.dtype), jnp.array(False), 0, 0, *[nothing] * 4)
     done = jax.lax.while_loop(going_on, closer, start)
@@ -106,35 +109,28 @@ def _dips(value, slope, part):
     return turns & (left + falls * meeting < 0)
 
 
-def _looking(margins, path, parted: OfTime | None) -> Callable[..., Looks]:
+def _looking(margins, path, t0, t1, parted: OfTime | None) -> Callable[..., Looks]:
     """Looks at some times along a path."""
 
-    def alone(t):
+    def along(t):
         y, dy = jax.jvp(path, (t,), (jnp.ones_like(t),))
-        return jax.jvp(lambda y: margins(t, y), (y,), (dy,))
+        return jax.jvp(margins, (t, y), (jnp.ones_like(t), dy))
 
     if parted is None:
-        return lambda ts: Looks(*jax.vmap(alone)(ts), jnp.zeros(()))
-    floats = lambda phi: ravel_pytree(eqx.filter(phi, eqx.is_inexact_array))[0]
-
-    def along(t):
-        (y, phi), (dy, dphi) = jax.jvp(lambda t: (path(t), floats(parted.phi(t))), (t,), (jnp.ones_like(t),))
-        found = parted.phi(t)
-        unravel = ravel_pytree(eqx.filter(found, eqx.is_inexact_array))[1]
-        rest = lambda phi, y: parted.rest(eqx.combine(unravel(phi), found), y)
-        value, push = jax.linearize(rest, phi, y)
-        each = jax.vmap(push, in_axes=(0, None), out_axes=1)(jnp.eye(phi.size, dtype=phi.dtype), jnp.zeros_like(y))
-        return value, push(dphi, dy), jnp.abs(each)
-
-    def looks(ts):
-        value, slope, reach = jax.vmap(along)(ts)
-        return Looks(value, slope, jax.vmap(lambda *given: _change(parted, *given))(ts[:-1], ts[1:], jnp.maximum(reach[:-1], reach[1:])))
-
-    return looks
+        return lambda ts: Looks(*jax.vmap(along)(ts), jnp.zeros(()))
+    reach = jnp.max(jax.vmap(lambda t: _reach(parted, t, path(t)))(jnp.linspace(t0, t1, 3)), axis=0)
+    return lambda ts: Looks(*jax.vmap(along)(ts), jax.vmap(lambda start, end: _change(parted, reach, start, end))(ts[:-1], ts[1:]))
 
 
-def _change(parted: OfTime, start, end, reach):
-    """By how much φ may change f from one time to another, with the derivatives `reach` of f; choices may change it altogether."""
+def _reach(parted: OfTime, t, y) -> Float[Array, "2e p"]:
+    """|∂f/∂φ|."""
+    found = parted.phi(t)
+    phi, unravel = ravel_pytree(eqx.filter(found, eqx.is_inexact_array))
+    return jnp.abs(jax.jacfwd(lambda phi: parted.rest(eqx.combine(unravel(phi), found), y))(phi))
+
+
+def _change(parted: OfTime, reach, start, end):
+    """By how much φ may change f from one time to another, with |∂f/∂φ|; choices may change it altogether."""
     intervals = parted.bounds(start, end)
     widths = [high - low for low, high in intervals if jnp.issubdtype(low.dtype, jnp.inexact)]
     switches = [jnp.any(low != high) for low, high in intervals if not jnp.issubdtype(low.dtype, jnp.inexact)]
