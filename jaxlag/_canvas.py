@@ -36,8 +36,7 @@ def one_motion(trajectory: Trajectory) -> Trajectory:
     """The trajectory, which a batch is refused as."""
     if trajectory.ts.ndim != 1:
         raise ValueError(
-            f"`trajectory` must be one motion, but is a batch of shape {trajectory.ts.shape[:-1]}. "
-            "Take one of it, e.g. `jax.tree.map(lambda x: x[0], trajectory)`."
+            f"`trajectory` must be one motion, but is a batch of shape {trajectory.ts.shape[:-1]}. Take one of it, e.g. `trajectory[0]`."
         )
     return trajectory
 

@@ -1,0 +1,88 @@
+"""Motions and fits from files."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from ._friction import Regularised, StickSlip
+from ._plain import FORMAT, filled_outline
+from ._results import result_of
+from ._stated import Recorded
+from ._trajectory import Rubbing, Trajectory
+
+
+def load(file: str | Path) -> Any:
+    """A motion or a fit from a file that `Trajectory.save` or `Fit.save` has written. None of the user's functions are needed.
+
+    **Arguments:** `file`: the path, as it was given to `save`.
+
+    **Returns:** of a motion a `Trajectory` with all its samples, its result, stats, energies and slip velocities, and the numbers of its
+    params; what needs the system itself, as forces on points in `animate`, it refuses in a sentence. Mappings and sequences are dicts and
+    lists, of a NamedTuple or another object there is the dict of its fields. Of a fit the dict that `Fit.to_dict` made, and its card under
+    `"card"`.
+
+    **Raises:** `ValueError` where the file is none of these; what `open` raises.
+
+    **Source:** NumPy's format NPY 1.0 (NEP 1) in a ZIP archive, without pickled objects; JSON, RFC 8259.
+
+    ```python
+    import pathlib, tempfile
+    import jax.numpy as jnp
+    import jaxlag as jl
+    oscillator = jl.System(lambda q, qdot, c: 0.5 * qdot**2 - 0.5 * c * q**2)
+    motion = jl.simulate(oscillator, 1.0, 0.0, jnp.linspace(0, 10, 11), {"c": 4.0})
+    file = pathlib.Path(tempfile.mkdtemp()) / "motion.npz"
+    motion.save(file)
+    jl.load(file).q[-1]  # cos(2 · 10) = 0.408
+    ```
+    """
+    with open(file, "rb") as stream:
+        is_archive = stream.read(2) == b"PK"
+    try:
+        if is_archive:
+            with np.load(file, allow_pickle=False) as archive:
+                arrays = dict(archive)
+            return _motion(_of_kind(json.loads(str(arrays["about"])), "Trajectory"), arrays)
+        return _of_kind(json.loads(Path(file).read_text(encoding="utf-8")), "Fit")
+    except (KeyError, TypeError, UnicodeDecodeError, json.JSONDecodeError) as error:
+        raise ValueError(f"`file` must be written by `save` of a motion or a fit, but {str(file)!r} is not. Look at its name.") from error
+
+
+def _of_kind(content, kind):
+    """What was saved, without the marks of the file; KeyError or TypeError where there are none."""
+    made_by, version = content.pop("jaxlag"), content.pop("format")
+    if made_by != kind:
+        raise KeyError(made_by)
+    if version > FORMAT:
+        raise ValueError(f"`file` must be of format {FORMAT} or before, but is of format {version}. Load it with a newer jaxlag.")
+    return content
+
+
+def _motion(about, arrays):
+    def part(prefix):
+        """The arrays of one kind, by their names within it."""
+        return {name.removeprefix(f"{prefix}."): jnp.asarray(x) for name, x in arrays.items() if name.startswith(f"{prefix}.")}
+
+    tree = lambda name: jax.tree.map(jnp.asarray, filled_outline(about["outlines"][name], arrays))
+    like = about["outlines"]["q"]
+    rate = lambda name: jax.tree.map(lambda leaf: jnp.asarray(arrays[name + leaf.removeprefix("q")]), like)
+    kinds = {kind.__name__: kind for kind in (StickSlip, Regularised)}
+    (friction,) = (kinds[name](**fields) for name, fields in about["friction"].items())
+    energy, rubbing = part("energy"), part("friction")
+    terms = list(dict.fromkeys(name.rpartition(".")[0] for name in rubbing))
+    return Trajectory(
+        ts=jnp.asarray(arrays["t"]),
+        q=tree("q"),
+        qdot=rate("qdot"),
+        qddot=rate("qddot"),
+        multipliers=tree("multipliers"),
+        result=result_of(arrays["result"]),
+        stats=part("stats"),
+        works=part("works") if about["audit"] else None,
+        friction={term: Rubbing(rubbing[f"{term}.force"], rubbing[f"{term}.sticking"]) for term in terms},
+        stated=Recorded((energy["h"], energy["turned"]), part("slip"), tree("params"), tuple(about["one_sided"]), friction),
+    )
