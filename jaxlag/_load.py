@@ -1,6 +1,7 @@
 """Motions and fits from files."""
 
 import json
+import zipfile
 from pathlib import Path
 from typing import Any
 
@@ -40,26 +41,27 @@ def load(file: str | Path) -> Any:
     jl.load(file).q[-1]  # cos(2 · 10) = 0.408
     ```
     """
-    with open(file, "rb") as stream:
-        is_archive = stream.read(2) == b"PK"
     try:
-        if is_archive:
-            with np.load(file, allow_pickle=False) as archive:
-                arrays = dict(archive)
-            return _motion(_of_kind(json.loads(str(arrays["about"])), "Trajectory"), arrays)
-        return _of_kind(json.loads(Path(file).read_text(encoding="utf-8")), "Fit")
-    except (KeyError, TypeError, UnicodeDecodeError, json.JSONDecodeError) as error:
+        about, arrays = _read(Path(file))
+        version = about.pop("format")
+        if about.pop("jaxlag") != ("Trajectory" if arrays else "Fit"):
+            raise KeyError
+    except (KeyError, TypeError, ValueError, zipfile.BadZipFile) as error:
         raise ValueError(f"`file` must be written by `save` of a motion or a fit, but {str(file)!r} is not. Look at its name.") from error
-
-
-def _of_kind(content, kind):
-    """What was saved, without the marks of the file; KeyError or TypeError where there are none."""
-    made_by, version = content.pop("jaxlag"), content.pop("format")
-    if made_by != kind:
-        raise KeyError(made_by)
     if version > FORMAT:
         raise ValueError(f"`file` must be of format {FORMAT} or before, but is of format {version}. Load it with a newer jaxlag.")
-    return content
+    return _motion(about, arrays) if arrays else about
+
+
+def _read(file):
+    """What is said in a file, and its arrays."""
+    with open(file, "rb") as stream:
+        is_archive = stream.read(2) == b"PK"
+    if not is_archive:
+        return json.loads(file.read_text(encoding="utf-8")), {}
+    with np.load(file, allow_pickle=False) as archive:
+        arrays = dict(archive)
+    return json.loads(str(arrays.pop("about"))), arrays
 
 
 def _motion(about, arrays):

@@ -46,7 +46,7 @@ class Interpolated(eqx.Module):
 
     - `q`, `qdot`, `qddot`: structured like q0, with the axes of `ts` first. NaN outside the motion.
     - `q_error`, `qdot_error`: how far they may be off, by what interpolation misses samples by that are left out: where the motion is
-      smooth, some 64 and 16 times too much.
+      smooth, some 64 and 18 times too much.
     """
 
     ts: Float[Array, "..."]
@@ -76,14 +76,14 @@ class Trajectory(eqx.Module):
       reversed; `time_stuck`, for how long each of them has stuck.
     """
 
-    ts: Float[Array, " T"]
+    ts: Float[Array, "*members T"]
     q: PyTree
     qdot: PyTree
     qddot: PyTree
     multipliers: dict[str, PyTree]
     result: RESULTS
     stats: dict[str, Any]
-    works: dict[str, Float[Array, " T"]] | None
+    works: dict[str, Float[Array, "*members T"]] | None
     friction: dict[str, Rubbing]
     stated: Stated | Recorded
 
@@ -125,8 +125,8 @@ class Trajectory(eqx.Module):
         return {name: slip[:, rows].reshape(self.friction[name].force.shape) for name, rows in kinks.rows_of_term.items()}
 
     def pulling(self) -> dict[str, PyTree]:
-        """By the name of each constraint that is `one_sided`, at which samples λ < 0: there it would have to pull, and the contact would have
-        opened. What is below the rounding of the largest |λ| is zero. Where redundant rows share a load, λ is that of least norm.
+        """By the name of each constraint that is `one_sided`, at which samples λ < 0: there it would have to pull, and the contact would
+        have opened. What is below the rounding of the largest |λ| is zero. Where redundant rows share a load, λ is that of least norm.
         """
         axis = self.ts.ndim - 1
 
@@ -140,7 +140,8 @@ class Trajectory(eqx.Module):
 
     def __getitem__(self, which: Any) -> Any:
         kind = None if isinstance(which, slice) else getattr(which, "dtype", np.asarray(which).dtype)
-        is_one = kind is not None and np.ndim(which) == 0 and jnp.issubdtype(kind, jnp.integer)
+        holds = lambda kinds: kind is not None and jnp.issubdtype(kind, kinds)
+        is_one = holds(jnp.integer) and np.ndim(which) == 0
         if is_one and is_concrete(which) and not -len(self) <= which < len(self):
             raise IndexError(f"`motion[{which}]` must be there, but there are {len(self)} {'members' if self.ts.ndim > 1 else 'samples'}.")
         chosen = functools.partial(jax.tree.map, lambda x: x[which])
@@ -149,14 +150,14 @@ class Trajectory(eqx.Module):
         if is_one:
             return Instant(*chosen((self.ts, self.q, self.qdot, self.qddot, self.multipliers)))
         is_forward = isinstance(which, slice) and (which.step is None or which.step > 0)
-        if not (is_forward or (jnp.issubdtype(kind, jnp.bool_) and np.shape(which) == self.ts.shape)):
+        if not (is_forward or (holds(jnp.bool_) and np.shape(which) == self.ts.shape)):
             raise TypeError(
                 f"`motion[...]` must be asked for a sample, a slice forward in time or a mask of the samples, but is for {which!r}. "
                 "Write e.g. `motion[-1]`, `motion[100:200]`, `motion[motion.ts > 1]`."
             )
         if not self.ts[which].size:
             raise ValueError(f"`motion[...]` must keep at least one sample, but keeps none of the {len(self)}.")
-        since = lambda count: chosen(count) - chosen(count)[0]
+        since = lambda count: chosen(count) - chosen(count)[:1]
         counts = {name: since(count) if name in COUNTED else count for name, count in self.stats.items()}
         works = None if self.works is None else jax.tree.map(since, self.works)
         stated = self.stated
