@@ -139,7 +139,7 @@ class Trajectory(eqx.Module):
         return self.ts.shape[0]
 
     def __getitem__(self, which: Any) -> Any:
-        kind = None if isinstance(which, slice) else getattr(which, "dtype", np.asarray(which).dtype)
+        kind = None if isinstance(which, slice) else which.dtype if hasattr(which, "dtype") else np.asarray(which).dtype
         holds = lambda kinds: kind is not None and jnp.issubdtype(kind, kinds)
         is_one = holds(jnp.integer) and np.ndim(which) == 0
         if is_one and is_concrete(which) and not -len(self) <= which < len(self):

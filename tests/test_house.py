@@ -44,6 +44,7 @@ ORDER = [
     "_load",
     "_canvas",
     "_plot_motion",
+    "_plot_forces",
     "_variations",
     "_sensitivities",
     "_tableaux",
