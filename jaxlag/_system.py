@@ -11,6 +11,7 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, PyTree
 
 from ._arguments import call, names
+from ._pickling import portable, restored
 
 Terms = tuple[tuple[str, Callable], ...]
 Slot = Any  # a function, a mapping from names to functions, or None: `_terms` checks it, with a sentence
@@ -93,6 +94,16 @@ class System:
                 raise ValueError(f"`one_sided` must name holonomic constraints, but holds {name!r}. There are {there}.")
         object.__setattr__(self, "one_sided", tuple(name for name in known if name in given))
 
+    def __copy__(self) -> "System":
+        return self
+
+    def __deepcopy__(self, memo: Any) -> "System":
+        return self
+
+    def __reduce__(self) -> Any:
+        stands = {slot: {name: portable(f, role(slot, name)) for name, f in getattr(self, slot)} for slot in SLOTS}
+        return _unpickled, (stands, self.one_sided)
+
     def __repr__(self) -> str:
         def listed(slot: str, terms: Terms) -> str:
             return slot if [name for name, _ in terms] == [slot] else f"{slot}: {', '.join(name for name, _ in terms)}"
@@ -110,6 +121,11 @@ class System:
     def terms(self) -> tuple[str, ...]:
         """Names of all that does work: dissipation, forces, constraints, and explicit time in L."""
         return (*(name for name, _ in (*self.dissipation, *self.force)), *self.constraints, EXPLICIT_TIME)
+
+
+def _unpickled(stands: dict[str, dict[str, Any]], one_sided: tuple[str, ...]) -> System:
+    slots = {slot: {name: restored(f) for name, f in terms.items()} for slot, terms in stands.items()}
+    return System(**slots, one_sided=one_sided)
 
 
 def _terms(slot: str, given: Any) -> Terms:

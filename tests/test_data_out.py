@@ -1,7 +1,10 @@
 """What comes out of a motion and of a fit: samples, times between them, dicts, tables, files; and where a one-sided constraint pulls."""
 
+import copy
 import dataclasses
+import functools
 import json
+import pickle
 import re
 import subprocess
 import sys
@@ -378,6 +381,63 @@ def test_files_of_a_newer_format_are_refused(tmp_path):
     (tmp_path / "fit.json").write_text('{"jaxlag": "Fit", "format": 2}')
     with pytest.raises(ValueError, match="`file` must be of format 1 or before, but is of format 2. Load it with a newer jaxlag."):
         jl.load(tmp_path / "fit.json")
+
+
+# Pickles.
+
+
+def free(q, qdot):
+    return 0.5 * qdot**2
+
+
+class Spring:
+    def __init__(self, c):
+        self.c = c
+
+    def __call__(self, q, qdot):
+        return -0.5 * self.c * q**2
+
+    def __eq__(self, other):
+        return self.c == other.c
+
+    def __hash__(self):
+        return hash(self.c)
+
+
+def test_a_system_of_named_functions_is_pickled():
+    system = jl.System({"T": free, "V": Spring(4.0)}, holonomic={"table": jnp.sin}, one_sided="table")
+    assert pickle.loads(pickle.dumps(system)) == system
+    motion = given(TS, TS, TS, TS)
+    motion = dataclasses.replace(motion, stated=Stated.of(system, {"c": jnp.ones(())}))
+    back = pickle.loads(pickle.dumps(motion))
+    jax.tree.map(np.testing.assert_array_equal, motion, back)
+    assert back.stated.system == system and jax.tree.structure(back) == jax.tree.structure(motion)
+
+
+@pytest.mark.parametrize("function, called", [(lambda q, qdot: qdot**2, "<lambda>"), (functools.partial(lambda a, q: q, 1), "partial")])
+def test_a_pickle_without_a_name_says_how_results_are_saved(function, called):
+    system = jl.System({"T": free, "V": function})
+    motion = dataclasses.replace(waves(TS), stated=Stated.of(system, None))
+    sentence = (
+        f"`lagrangian` 'V' must be a function of a module for a pickle, but '.*{called}' is not to be found by its name. Define .*jl.load"
+    )
+    for what in (system, motion):
+        with pytest.raises(pickle.PicklingError, match=sentence):
+            pickle.dumps(what)
+    assert copy.deepcopy(system) is system and copy.copy(system) is system and copy.deepcopy(motion).stated.system is system
+
+
+def test_a_pickler_that_takes_functions_along_is_let(monkeypatch):
+    function = lambda q, qdot: qdot**2
+    monkeypatch.setitem(sys.modules, "somebody.cloudpickle", SimpleNamespace())
+    assert jl.System(function).__reduce__()[1][0]["lagrangian"]["lagrangian"] is function
+
+
+def test_a_pickle_whose_functions_are_gone_says_so(monkeypatch):
+    dumped = pickle.dumps(jl.System(free))
+    monkeypatch.delattr(sys.modules[__name__], "free")
+    with pytest.raises(pickle.UnpicklingError, match="must be where they were when it was pickled, but there is no 'free' in module"):
+        pickle.loads(dumped)
 
 
 # Fits.

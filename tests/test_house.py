@@ -20,6 +20,7 @@ ORDER = [
     "_kernel",
     "_products",
     "_arguments",
+    "_pickling",
     "_system",
     "_compiled",
     "_checks",
