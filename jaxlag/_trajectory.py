@@ -258,7 +258,7 @@ class Trajectory(eqx.Module):
         if self.multipliers:
             rows.append(("start moved by", f"{np.max(self.stats['start_moved']):.2g}"))
         if self.friction:
-            transitions, stuck = np.asarray(self.stats["transitions"])[..., -1], np.asarray(self.stats["time_stuck"])[..., -1, :]
+            transitions, stuck = (np.nan_to_num(self.stats[name]) for name in COUNTED)  # NaN where the motion has not come to
             most = " (the most in the batch)" if batch else ""
             rows.append(("friction", f"{int(transitions.max())} transitions, stuck for {stuck.max():.4g}{most}"))
         if isinstance(self.stated.friction, Regularised):

@@ -181,6 +181,12 @@ def test_a_slice_is_a_motion_that_starts_later(rubbed):
     assert "41 samples, t = 10 … 14" in str(late) and "'table' never pulls" in str(late)
 
 
+def test_the_card_of_a_motion_that_failed_counts_what_was_reached(rubbed):
+    unreached = lambda x: x.at[100:].set(jnp.nan) if x.shape[:1] == (141,) and x.dtype == float else x
+    failed = dataclasses.replace(jax.tree.map(unreached, rubbed), ts=rubbed.ts, result=jl.RESULTS.max_steps_reached)
+    assert "6 transitions, stuck for 0" in str(failed) and "maximum number of solver steps" in str(failed)
+
+
 def test_a_mask_and_every_second_sample(rubbed):
     np.testing.assert_array_equal(rubbed[rubbed.ts > 3].ts, rubbed.ts[31:])
     np.testing.assert_array_equal(rubbed[np.asarray(rubbed.ts) > 3].q["x"], rubbed.q["x"][31:])
