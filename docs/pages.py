@@ -10,7 +10,8 @@ REFERENCE = {
     "dissipation.stribeck dissipation.speed",
     "At one state": "acceleration Acceleration mass_matrix momentum energy constraint_jacobian constraint_residual constraint_force powers "
     "consistent_state examine",
-    "Motions": "simulate simulate_many Trajectory Dop853 Dopri5 Projection Baumgarte NoStabilisation StickSlip Regularised",
+    "Motions": "simulate simulate_many Trajectory Instant Interpolated load Dop853 Dopri5 Projection Baumgarte NoStabilisation "
+    "StickSlip Regularised",
     "Identification": "Experiment fit fit_each Fit Interval Prediction regress Regression validate Validation compare Comparison "
     "information Information Huber learnt.ConvexDissipation learnt.PassiveDissipation learnt.Potential learnt.ConvexPotential",
     "On paper": "equations Equations to_sympy",

@@ -21,6 +21,7 @@ from ._prediction import Huber as Huber
 from ._quality import Channel as Channel
 from ._regress import Regression as Regression, regress as regress
 from ._integrate import simulate as simulate
+from ._load import load as load
 from ._many import simulate_many as simulate_many
 from ._kinematics import rate as rate, substitute as substitute, virtual_work as virtual_work
 from ._manifold import (
@@ -42,4 +43,9 @@ from ._runge_kutta import Dop853 as Dop853, Dopri5 as Dopri5
 from ._results import RESULTS as RESULTS
 from ._signal import Signal as Signal
 from ._system import System as System
-from ._trajectory import Rubbing as Rubbing, Trajectory as Trajectory
+from ._trajectory import (
+    Instant as Instant,
+    Interpolated as Interpolated,
+    Rubbing as Rubbing,
+    Trajectory as Trajectory,
+)

@@ -42,8 +42,8 @@ def animate(
 
     $$ x_p(t) = x_p(t, q(t)), \qquad F_c \cdot \delta x_p = Q_c \cdot \delta q $$
 
-    Between the samples q is interpolated by the cubics that have the right positions and velocities at both ends. The limits are fixed,
-    from the whole motion; a machine that travels far is looked at in a frame of its own, by points that leave its travel out.
+    Between the samples q is interpolated, as by `Trajectory.at`. The limits are fixed, from the whole motion; a machine that
+    travels far is looked at in a frame of its own, by points that leave its travel out.
 
     **Arguments:**
 
@@ -253,8 +253,7 @@ def _reached(motion):
     count = int(np.sum(np.isfinite(first)))
     if count < 2:
         raise ValueError(f"`trajectory` must have at least two samples, but only {count} were computed. Look at `trajectory.result`.")
-    parts = {name: jax.tree.map(lambda x: x[:count], getattr(motion, name)) for name in ("ts", "q", "qdot", "qddot")}
-    return dataclasses.replace(motion, **parts)
+    return motion[:count]
 
 
 def _frame_times(ts, fps, speed):
@@ -270,10 +269,10 @@ def _frame_times(ts, fps, speed):
 
 def _track(motion, at, name, point):
     """Where a point is in each frame, and at times between two of them."""
-    ts, fine = np.asarray(motion.ts), np.linspace(at[0], at[-1], BETWEEN * (at.size - 1) + 1)
-    along = lambda x, v: jax.tree.map(lambda x, v: between(ts, np.asarray(x), np.asarray(v), fine), x, v)
+    fine = np.minimum(np.linspace(at[0], at[-1], BETWEEN * (at.size - 1) + 1), motion.ts[-1])
+    state = motion.at(fine)
     place = lambda t, q, qdot: ravel_pytree(call(point, f"`points` {name!r}", motion.stated.params, t=t, q=q, qdot=qdot))[0]
-    x = np.asarray(jax.jit(jax.vmap(place))(fine, along(motion.q, motion.qdot), along(motion.qdot, motion.qddot)))
+    x = np.asarray(jax.jit(jax.vmap(place))(state.ts, state.q, state.qdot))
     if x.shape[1] != 2:
         raise ValueError(f"`points` {name!r} must return a position (x, y), but returned {x.shape[1]} numbers. Return the two to be seen.")
     return x
@@ -292,13 +291,3 @@ def _forces(motion, at, name, on):
             "Name the points at both of its ends."
         )
     return {point: np.stack([np.interp(at, ts[known], component) for component in F[known, k].T], axis=1) for k, point in enumerate(on)}
-
-
-def between(ts: np.ndarray, x: np.ndarray, v: np.ndarray, at: np.ndarray) -> np.ndarray:
-    """x at times between the samples: the cubics of Hermite, with the right values and rates at both ends."""
-    i = np.clip(np.searchsorted(ts, at, side="right") - 1, 0, ts.size - 2)
-    column = lambda s: s.reshape(-1, *(1,) * (x.ndim - 1))
-    h = column(ts[i + 1] - ts[i])
-    s = column(at - ts[i]) / h
-    values = (1 + 2 * s) * (1 - s) ** 2 * x[i] + s**2 * (3 - 2 * s) * x[i + 1]
-    return values + h * s * (1 - s) * ((1 - s) * v[i] - s * v[i + 1])

@@ -36,8 +36,7 @@ def one_motion(trajectory: Trajectory) -> Trajectory:
     """The trajectory, which a batch is refused as."""
     if trajectory.ts.ndim != 1:
         raise ValueError(
-            f"`trajectory` must be one motion, but is a batch of shape {trajectory.ts.shape[:-1]}. "
-            "Take one of it, e.g. `jax.tree.map(lambda x: x[0], trajectory)`."
+            f"`trajectory` must be one motion, but is a batch of shape {trajectory.ts.shape[:-1]}. Take one of it, e.g. `trajectory[0]`."
         )
     return trajectory
 
@@ -76,6 +75,18 @@ def pyplot() -> Any:
     return plt
 
 
+def curve(ax: Any, x: Any, y: Any, **style: Any) -> None:
+    """A line; where it lies on lines drawn before it is dashed, so that these are seen between the dashes."""
+    x, y = np.asarray(x), np.asarray(y)
+    before = [np.asarray(line.get_ydata()) for line in ax.lines if np.array_equal(line.get_xdata(), x)]
+    height = max((float(np.ptp(z[np.isfinite(z)])) for z in (y, *before) if np.isfinite(z).any()), default=0.0)
+    below = sum(np.mean(np.abs(y - z) <= SEEN * height) > 0.5 for z in before)
+    ax.plot(x, y, **({"linestyle": (6 * (below - 1), (6, 6 * below))} if below else {}) | style)
+
+
+SEEN = 0.01  # of the height of what is drawn: lines that are nearer to each other over half of their length lie on each other
+
+
 def legend_beside(ax: Any) -> None:
     """A legend to the right of the panel, where it hides nothing."""
     ax.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), fontsize="small")
@@ -95,3 +106,16 @@ def label(name: str, units: Units, of: str | None = None) -> str:
     """A name with the unit of it, or of another quantity."""
     unit = (units or {}).get(of or name)
     return f"{name} ({unit})" if unit else name
+
+
+def over_time(ts: Any, quantities: Mapping[str, dict], titles: Sequence[str], which: str, units: Units, axes: Any) -> Any:
+    """A panel for each quantity, over a common time axis."""
+    drawn = panels(axes, (len(quantities), 1), which, figsize=(6.4, 1.0 + 1.7 * len(quantities)))[:, 0]
+    for ax, (name, entries), title in zip(drawn, quantities.items(), titles, strict=True):
+        for i, (entry, samples) in enumerate(entries.items()):
+            curve(ax, ts, samples, color=colour(i), label=entry)
+        ax.set_ylabel(label(title, units, name))
+        if len(entries) > 1:
+            legend_beside(ax)
+    drawn[-1].set_xlabel(label("t", units))
+    return drawn

@@ -94,7 +94,19 @@ def examine(system: System, q: PyTree, qdot: PyTree, params: PyTree = None, *, t
         "time_constants": constants,
     }
     no_inertia = inertia_on_N.size > 0 and smallest <= 100 * M.shape[0] * eps * np.max(np.abs(M), initial=0.0)
-    return Examination(**numbers, findings=tuple(_findings(numbers, no_inertia, found["M"].dtype)))
+    pulling = _pulling(system, found["multipliers"])
+    return Examination(**numbers, findings=(*_findings(numbers, no_inertia, found["M"].dtype), *pulling))
+
+
+def _pulling(system, multipliers):
+    """One-sided constraints that would have to pull."""
+    for name in system.one_sided:
+        least, size = np.min(multipliers[name], initial=0.0), np.max(np.abs(multipliers[name]), initial=0.0)
+        if least < -np.sqrt(np.finfo(multipliers[name].dtype).eps) * size:
+            yield (
+                f"the one-sided constraint {name!r} would have to pull here (λ = {least:.3g}), so its contact would open: "
+                "the motion keeps it all the same, until the contact is stated as one"
+            )
 
 
 def _findings(numbers, no_inertia, dtype):
@@ -145,6 +157,7 @@ def _measure(flat: Flat, t, q, v):
         "position": {name: g[split[name]] for name in flat.holonomic_names},
         "velocity": {name: psi[rows] for name, rows in split.items()},
         "dissipated": fed,
+        "multipliers": {name: multipliers[rows] for name, rows in split.items()},
     }
 
 

@@ -2,8 +2,9 @@
 
 import dataclasses
 import itertools
-from collections.abc import Sequence
-from typing import NamedTuple
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -15,6 +16,7 @@ from jaxtyping import PyTree
 from ._compiled import compiled
 from ._experiment import Experiment, entry_names, is_within
 from ._least_squares import levenberg_marquardt
+from ._plain import frame_of, jsonable, write_json
 from ._problem import Problem, blank, failure_of, linearise
 from ._quality import Channel
 from ._trajectory import Trajectory
@@ -166,6 +168,33 @@ class Fit:
         motion = _motion(aside.model, free.insert(free.theta(y)), one)
         return Prediction(values, errors, lower, upper, motion)
 
+    def to_dict(self, *, level: float = 0.95) -> dict[str, Any]:
+        """What the fit says, ready for `json.dumps`: `"parameters"`, a row for each with its name, value, standard error and the ends of
+        its confidence interval, those that experiments have of their own behind them; `"params"` as nested dicts; correlation, remarks,
+        channels and how it converged. None is a number that there is not: the error of what is not determined, an end without limit.
+        """
+        said = ("names", "correlation", "covariance", "remarks", "sigma", "absolute", "cost", "costs", "aic", "bic", "measurements")
+        parts = {name: getattr(self, name) for name in (*said, "freedom", "converged", "reason", "steps", "params")}
+        rows, channels = list(self._rows(level)), [channel._asdict() for channel in self.channels]
+        return jsonable({"parameters": rows, "level": level} | parts | {"channels": channels})
+
+    def to_dataframe(self, frame: Callable | None = None, *, level: float = 0.95) -> Any:
+        """A table with a row for each parameter: name, value, standard_error, lower, upper. `frame` as for `Trajectory.to_dataframe`."""
+        rows = list(self._rows(level))
+        return frame_of({column: [row[column] for row in rows] for column in rows[0]}, frame)
+
+    def save(self, file: str | Path, *, level: float = 0.95) -> None:
+        """Writes `to_dict` and the card as JSON. `jl.load` reads it, as any other program does; no function of the system is needed."""
+        write_json(file, "Fit", {"card": str(self)} | self.to_dict(level=level))
+
+    def _rows(self, level):
+        t = self._quantile(level)
+        for _, group in self._groups():
+            for name, value, error in group:
+                ends = self.interval(name, level) if name in self.names else (value - t * error, value + t * error)
+                row = (name, value, error, *ends)
+                yield dict(zip(("name", "value", "standard_error", "lower", "upper"), (name, *map(float, row[1:])), strict=True))
+
     @property
     def sigma_scale(self) -> float:
         """What standard errors are multiplied with: σ̂, or 1 where sigma was given."""
@@ -212,17 +241,21 @@ class Fit:
         rows += channel_rows(self.channels)
         return "\n".join([*rows, f"  residual sigma  {self.sigma:.4g}{'  (1 where the noise is as said)' if self.absolute else ''}"])
 
-    def _parameter_rows(self):
-        """Estimates, errors and intervals; many numbers of one name in one row."""
+    def _groups(self) -> Iterator[tuple[str, list[tuple[str, float, float]]]]:
+        """Estimates and their errors, by the name they belong to: of the parameters, then of each experiment."""
         theta = np.asarray(self.problem.free.theta(jnp.asarray(self.x[: len(self.names)])))
         triples = list(zip(self.names, theta, np.sqrt(np.diag(self.covariance)), strict=True))
-        groups = [(name, [triple for triple in triples if is_within(triple[0], name)]) for name in self.estimates]
+        yield from ((name, [triple for triple in triples if is_within(triple[0], name)]) for name in self.estimates)
         for k, unknowns in enumerate(self.unknowns):
             for which, tree in unknowns.items():
                 label = f"experiment {k}: {which}"
                 entries = [f"{label}{'.' if name[:1].isalpha() else ''}{name}" for name in entry_names(tree)]
                 values, errors = (np.asarray(ravel_pytree(x)[0]) for x in (tree, self.unknown_errors[k][which]))
-                groups.append((label, list(zip(entries, values, errors, strict=True))))
+                yield label, list(zip(entries, values, errors, strict=True))
+
+    def _parameter_rows(self):
+        """Estimates, errors and intervals; many numbers of one name in one row."""
+        groups = list(self._groups())
         named = [(name, self._spoken(v, e)) for _, group in groups if len(group) <= MANY for name, v, e in group]
         named += [(name, _counted(group)) for name, group in groups if len(group) > MANY]
         width = max((len(name) for name, _ in named[:SHOWN]), default=0)

@@ -99,6 +99,7 @@ def substitute(system: System, coordinates: Callable) -> System:
         force=pulled("force", _PulledForce),
         holonomic=pulled("holonomic", _PulledPosition),
         nonholonomic=pulled("nonholonomic", _PulledBack),
+        one_sided=system.one_sided,
     )
 
 

@@ -166,9 +166,17 @@ class _Fractions:
         meaning = [atom ** self.roots[atom] for atom in self.generators] or [sympy.Integer(1)]
         number, factors = fraction.denom.factor_list()
         above, below = fraction.numer.as_expr(*meaning) / sympy.Rational(number.numerator, number.denominator), sympy.Integer(1)
-        for base, power in ((self.tidy(polynomial.as_expr(*meaning)), power) for polynomial, power in factors):
+        for base, power in self._joined([(self.tidy(polynomial.as_expr(*meaning)), power) for polynomial, power in factors]):
             turn = -1 if base.is_Add and base.could_extract_minus_sign() else 1
             above, below = above * turn**power, below * (turn * base) ** power
         if any(factor.as_base_exp()[0].is_Add for factor in sympy.Mul.make_args(below)):
             return self.tidy.factored(above) / below
         return self.tidy(above / below)
+
+    def _joined(self, factors: list[tuple[Expr, int]]) -> list[tuple[Expr, int]]:
+        """With −sin² in place of (cos − 1) (cos + 1)."""
+        for (left, power), (right, other) in itertools.combinations(factors, 2):
+            product = self.tidy(left * right)
+            if left.is_Add and right.is_Add and power == other and not product.is_Add:
+                return self._joined([(product, power), *(factor for factor in factors if factor[0] not in (left, right))])
+        return factors

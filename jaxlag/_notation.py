@@ -102,7 +102,7 @@ class Textbook(Printer):
         raise NotImplementedError
 
     def letter(self, name: str, dots: int) -> str:
-        """A symbol with dots on its first letter, and what follows it below."""
+        """A symbol with its dots, and what follows it below."""
         raise NotImplementedError
 
     def _print_Symbol(self, symbol: Symbol, style: Any = None) -> str:
@@ -173,6 +173,11 @@ def _sizes_joined(factors: Sequence[Expr]) -> list[Expr]:
     return out
 
 
+def _is_bare(formula: Expr) -> bool:
+    """Whether it is a function that is written without brackets: sin φ."""
+    return isinstance(formula, TrigonometricFunction) and formula.args[0].is_Symbol
+
+
 def _parts(name: str) -> tuple[str, list[str]]:
     """The letter of a name, and what stands below it."""
     letter, above, below = split_super_sub(name)
@@ -182,7 +187,7 @@ def _parts(name: str) -> tuple[str, list[str]]:
 class Unicode(Textbook, StrPrinter):
     """One line of text."""
 
-    minus, is_bare = "−", True
+    minus = "−"
     FRACTIONS: ClassVar = {
         Rational(*pair): sign for *pair, sign in ((1, 2, "½"), (1, 3, "⅓"), (2, 3, "⅔"), (1, 4, "¼"), (3, 4, "¾"), (1, 8, "⅛"))
     }
@@ -194,9 +199,9 @@ class Unicode(Textbook, StrPrinter):
         whole = Mul(*above, *(1 / factor for factor in below)) if all(x.is_Rational for x in (*above, *below)) else None
         if whole in self.FRACTIONS:
             return self.FRACTIONS[whole]
-        outside, self.is_bare = self.is_bare, False  # sin φ/r were the sine of φ/r
         up, down = (" ".join(map(self.factor, factors)) for factors in (above, below))
-        self.is_bare = outside
+        if _is_bare(above[-1].as_base_exp()[0]):
+            up = self.bracketed(up)  # sin φ/r were the sine of φ/r
         text = f"{up}/{self.bracketed(down) if len(below) > 1 else down}"
         return self.bracketed(text) if is_followed else text
 
@@ -211,12 +216,16 @@ class Unicode(Textbook, StrPrinter):
         return f"{base}^{self._print(exponent) if exponent.is_Symbol else self.bracketed(self._print(exponent))}"
 
     def letter(self, name, dots):
-        """ẍ₂, Θₛ."""
+        """ẍ₂, Θₛ; a word has its dots behind it: wheel˙."""
         letter, below = _parts(name)
         letter = greek_unicode.get(letter, letter)
-        letter = unicodedata.normalize("NFC", letter[:1] + ["", "\u0307", "\u0308"][dots]) + letter[1:]
+        if len(letter) > 1:
+            return self.letter(name, 0) + ["", "˙", "¨"][dots] if dots else letter + self._lowered(below)
+        return unicodedata.normalize("NFC", letter + ["", "\u0307", "\u0308"][dots]) + self._lowered(below)
+
+    def _lowered(self, below):
         has_small = all(character in sub for part in below for character in part) and all(len(p) == 1 or p.isdigit() for p in below)
-        return letter + ("".join(sub[character] for part in below for character in part) if has_small else f"_{','.join(below)}")
+        return "".join(sub[character] for part in below for character in part) if has_small else f"_{','.join(below)}"
 
     def _print_root(self, base):
         return f"√{self._print(base) if base.is_Symbol or base.is_Integer else self.bracketed(self._print(base))}"
@@ -227,8 +236,7 @@ class Unicode(Textbook, StrPrinter):
     def _print_Function(self, formula, raised=""):
         name = self.NAMES.get(formula.func.__name__, formula.func.__name__)
         arguments = ", ".join(map(self._print, formula.args))
-        is_bare = self.is_bare and isinstance(formula, TrigonometricFunction) and formula.args[0].is_Symbol
-        return f"{name}{raised} {arguments}" if is_bare else f"{name}{raised}({arguments})"
+        return f"{name}{raised} {arguments}" if _is_bare(formula) else f"{name}{raised}({arguments})"
 
     _print_LatticeOp = _print_Function
 

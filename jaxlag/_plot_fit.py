@@ -90,7 +90,7 @@ def parameters(fit: Fit, names: Sequence[str] | None = None, *, axes: Any = None
        \rho_{ij} = \frac{\mathrm{cov}_{ij}}{\sqrt{\mathrm{cov}_{ii}\,\mathrm{cov}_{jj}}} $$
 
     The thick bar is one standard error to either side, the thin one the 95 % interval. Two parameters of correlation near ±1 are
-    told apart by these measurements only badly.
+    told apart by these measurements only badly: blue is +1, red is −1; of many parameters, those of more than ½ have a sign.
 
     **Arguments:**
 
@@ -134,15 +134,15 @@ def parameters(fit: Fit, names: Sequence[str] | None = None, *, axes: Any = None
     bars.set_xlabel("standard error and 95 % interval (% of the value)")
     bars.grid(axis="x", alpha=0.4)
 
-    image = matrix.imshow(np.where(np.isfinite(correlation), correlation, 0), cmap="PuOr", vmin=-1, vmax=1)
+    image = matrix.imshow(np.where(np.isfinite(correlation), correlation, 0), cmap="coolwarm_r", vmin=-1, vmax=1)
     matrix.set_xticks(rows, names, rotation=90 if max(map(len, names)) > 4 else 0)
     matrix.set_yticks(rows, names)
     matrix.set_title("correlation", fontsize="medium")
-    if len(names) <= WRITTEN:
-        for (i, j), rho in np.ndenumerate(correlation):
-            said = f"{rho:+.2f}" if np.isfinite(rho) else "–"
-            matrix.text(j, i, said, ha="center", va="center", fontsize="small", color="white" if abs(rho) > 0.7 else "black")
-    else:
+    for (i, j), rho in np.ndenumerate(correlation):
+        sign = "+−"[int(rho < 0)] if abs(rho) > 0.5 else ""
+        said = sign if len(names) > WRITTEN else f"{rho:+.2f}" if np.isfinite(rho) else "–"
+        matrix.text(j, i, said, ha="center", va="center", fontsize="small", color="white" if abs(rho) > 0.7 else "black")
+    if len(names) > WRITTEN:
         matrix.figure.colorbar(image, ax=matrix)
     return np.array([bars, matrix])
 

@@ -1,11 +1,26 @@
-"""Pictures of one motion: coordinates, phase portrait, constraint forces, energy, friction."""
+"""Pictures of one motion: coordinates, phase portrait, energy and where it goes."""
 
 from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
-from ._canvas import GREY, Units, canvas, channels, chosen, colour, label, legend_above, legend_beside, one_motion, panels, zero_line
+from ._canvas import (
+    GREY,
+    Units,
+    canvas,
+    channels,
+    chosen,
+    colour,
+    curve,
+    label,
+    legend_above,
+    legend_beside,
+    one_motion,
+    over_time,
+    panels,
+    zero_line,
+)
 from ._trajectory import Trajectory, energies
 
 THIN = 1e-3  # of the largest area, below which none can be seen
@@ -45,26 +60,27 @@ def motion(trajectory: Trajectory, names: Sequence[str] | None = None, *, units:
     """
     coordinates = channels(one_motion(trajectory).q, "q")
     names = chosen(names, tuple(coordinates), "coordinates")
-    return _over_time(trajectory.ts, {name: coordinates[name] for name in names}, names, "one for each coordinate", units, axes)
+    return over_time(trajectory.ts, {name: coordinates[name] for name in names}, names, "one for each coordinate", units, axes)
 
 
 def phase(trajectory: Trajectory, names: Sequence[str] | None = None, *, units: Units = None, ax: Any = None) -> Any:
-    r"""The phase portrait of a motion: velocity over position, with a dot at the start.
+    r"""The phase portrait of a motion: velocity over position, with a dot at the start, one panel for each number.
 
     $$ (q_i(t), \dot q_i(t)) $$
 
-    Drawn again on the same axes, another motion has the next colour: so a phase portrait is made of many.
+    Drawn again on the same axes, another motion has the next colour: so a phase portrait is made of many. A coordinate that is an array
+    has one panel for each entry.
 
     **Arguments:**
 
     - `trajectory`: one motion, as `simulate` returns it.
-    - `names`: the coordinates to be drawn, by their path in q. Default: all; they share the axes, so choose those of one unit.
+    - `names`: the coordinates to be drawn, by their path in q. Default: all.
     - `units`: units by name of coordinate, and of `"t"`; the velocity has the one divided by the other.
-    - `ax`: matplotlib axes to draw in. Default: a new figure.
+    - `ax`: matplotlib axes to draw in: one for each panel, or one that all share. Default: a new figure.
 
-    **Returns:** the axes.
+    **Returns:** the axes, where there are several panels an array of them.
 
-    **Raises:** `ValueError` where `names` do not fit the motion, `ImportError` without matplotlib.
+    **Raises:** `ValueError` where `names` or `ax` do not fit the motion, `ImportError` without matplotlib.
 
     **Source:** Arnold, Mathematical Methods of Classical Mechanics, 2nd ed., section 4.
 
@@ -81,72 +97,25 @@ def phase(trajectory: Trajectory, names: Sequence[str] | None = None, *, units: 
     """
     positions, velocities = (channels(tree, "q") for tree in (one_motion(trajectory).q, trajectory.qdot))
     names = chosen(names, tuple(positions), "coordinates")
-    ax = canvas(ax, figsize=(5.4, 4.2))
-    entries = [(entry, x, velocities[name][entry]) for name in names for entry, x in positions[name].items()]
-    for entry, x, v in entries:
-        ax.plot(x, v, color=colour(len(ax.lines)), marker="o", markevery=[0], label=entry)
-    whose = names[0] if len(names) == 1 else "q"
+    entries = [(name, entry, x, velocities[name][entry]) for name in names for entry, x in positions[name].items()]
+    if np.size(ax) == 1 and ax is not None:
+        ax, own = np.ravel(ax)[0], False
+    elif len(entries) == 1:
+        ax, own = canvas(None, figsize=(5.4, 4.2)), True
+    else:
+        shape = 1, len(entries)
+        ax, own = panels(ax, shape, "one for each number, or one for all", sharex=False, figsize=(1.0 + 3.4 * len(entries), 3.6))[0], True
+    for one, (_, entry, x, v) in zip(np.broadcast_to(ax, len(entries)), entries, strict=True):
+        one.plot(x, v, color=colour(len(one.lines)), marker="o", markevery=[0], label=entry)
     alike = {(units or {}).get(name) for name in names}
-    unit, time = alike.pop() if len(alike) == 1 else None, (units or {}).get("t")
-    ax.set_xlabel(label(whose, {whose: unit} if unit else None))
-    ax.set_ylabel(label(f"d{whose}/dt", {f"d{whose}/dt": f"{unit}/{time}"} if unit and time else None))
-    if len(entries) > 1:
+    named = [(name, entry) for name, entry, *_ in entries] if own else [(names[0], names[0] if len(names) == 1 else "q")]
+    for one, (name, whose) in zip(np.ravel(ax), named, strict=True):
+        unit, time = (units or {}).get(name) if own or len(alike) == 1 else None, (units or {}).get("t")
+        one.set_xlabel(label(whose, {whose: unit} if unit else None))
+        one.set_ylabel(label(f"d{whose}/dt", {f"d{whose}/dt": f"{unit}/{time}"} if unit and time else None))
+    if len(entries) > 1 and not own:
         legend_beside(ax)
     return ax
-
-
-def forces(trajectory: Trajectory, names: Sequence[str] | None = None, *, units: Units = None, axes: Any = None) -> Any:
-    r"""The multipliers λ over time, one panel for each constraint, with a ring wherever one changes its sign.
-
-    $$ M\ddot q = f + G^T\lambda $$
-
-    λ > 0 pushes along +∇g: the tension of a rod or a string with g = r − l is −λ, so it goes slack where λ becomes positive. A multiplier
-    is a force where g is a length, and a moment where g is an angle.
-
-    **Arguments:**
-
-    - `trajectory`: one motion, as `simulate` returns it.
-    - `names`: the constraints to be drawn, in this order. Default: all.
-    - `units`: units by name of constraint, and of `"t"`, to be written on the axes, e.g. `{"t": "s", "rod": "N"}`.
-    - `axes`: matplotlib axes to draw in, as many as there are constraints. Default: a new figure with a common time axis.
-
-    **Returns:** the axes, an array, one for each constraint.
-
-    **Raises:** `ValueError` where there are no constraints, or `names` or `axes` do not fit them; `ImportError` without matplotlib.
-
-    **Source:** Goldstein, Classical Mechanics, 3rd ed., section 2.4.
-
-    ```python
-    import jax.numpy as jnp
-    import jaxlag as jl
-    from jaxlag import plot
-    from jaxlag.examples import pendulum
-    start = pendulum.cartesian_state(2.0, 0.0, 1.0)
-    trajectory = jl.simulate(pendulum.cartesian, *start, jnp.linspace(0.0, 2.0, 101), pendulum.params)
-    (ax,) = plot.forces(trajectory, units={"t": "s", "rod": "N"})
-    ax.get_ylabel()  # λ rod (N)
-    ```
-    """
-    multipliers = channels(one_motion(trajectory).multipliers, "λ")
-    if not multipliers:
-        raise ValueError(
-            "`trajectory` must be of a system with constraints, but it has none. State them by `System(..., holonomic=...)`, "
-            "or draw its coordinates by `plot.motion`."
-        )
-    names = chosen(names, tuple(multipliers), "constraints")
-    shown = {name: multipliers[name] for name in names}
-    drawn = _over_time(trajectory.ts, shown, [f"λ {name}" for name in names], "one for each constraint", units, axes)
-    for ax, entries in zip(drawn, shown.values(), strict=True):
-        zero_line(ax)
-        crossings = np.concatenate([_sign_changes(np.asarray(trajectory.ts), samples) for samples in entries.values()])
-        if crossings.size:
-            ax.plot(crossings, 0 * crossings, "o", markerfacecolor="white", markeredgecolor="black", label="λ changes its sign")
-            if len(entries) == 1:
-                ax.lines[0].set_label(None)
-                legend_above(ax)
-            else:
-                legend_beside(ax)
-    return drawn
 
 
 def energy(trajectory: Trajectory, *, units: Units = None, ax: Any = None) -> Any:
@@ -155,7 +124,8 @@ def energy(trajectory: Trajectory, *, units: Units = None, ax: Any = None) -> An
     $$ h(t) = \dot q\cdot\frac{\partial L}{\partial\dot q} - L, \qquad h(t) = h(0) + \sum_i W_i(t) $$
 
     The dashed line is the right side of that balance: it lies on the energy where the integration is good. Works need
-    `simulate(..., audit=True)`; without, the energy is drawn alone. Terms that do no work to be seen, as constraints at rest, are left out.
+    `simulate(..., audit=True)`; without, the energy is drawn alone. Terms that do no work to be seen, as constraints at rest, are left out;
+    a curve that lies on another is dashed, so that both are seen.
 
     **Arguments:**
 
@@ -184,7 +154,7 @@ def energy(trajectory: Trajectory, *, units: Units = None, ax: Any = None) -> An
     ax.plot(ts, h, color=colour(0), linewidth=2.5, label="energy")
     if trajectory.works is not None:
         for name, work in _shown_works(trajectory).items():
-            ax.plot(ts, work, color=colour(len(ax.lines)), label=f"work of {name}")
+            curve(ax, ts, work, color=colour(len(ax.lines)), label=f"work of {name}")
         ax.plot(ts, h[0] + sum(np.asarray(work) for work in trajectory.works.values()), "k--", label="energy at the start + works")
         zero_line(ax)
     ax.set_xlabel(label("t", units))
@@ -244,82 +214,6 @@ def balance(trajectory: Trajectory, *, units: Units = None, ax: Any = None) -> A
     return ax
 
 
-def friction(trajectory: Trajectory, names: Sequence[str] | None = None, *, units: Units = None, axes: Any = None) -> Any:
-    r"""Dry friction over time: the slip velocity and below it the force, one column for each term; where it sticks is shaded.
-
-    $$ F = -\mu N\,\frac{s}{|s|} \ (s \neq 0), \qquad |F| \le \mu N \ (s = 0) $$
-
-    **Arguments:**
-
-    - `trajectory`: one motion with dry friction, as `simulate` returns it.
-    - `names`: the dissipation terms to be drawn. Default: all that have a kink.
-    - `units`: units of `"t"`, of `"slip"`, and of the force by the name of the term, e.g. `{"t": "s", "slip": "m/s", "brake": "N"}`.
-    - `axes`: matplotlib axes to draw in, 2 × number of terms. Default: a new figure with a common time axis.
-
-    **Returns:** the axes, an array of shape (2, terms).
-
-    **Raises:** `ValueError` where there is no dry friction, or `names` or `axes` do not fit it; `ImportError` without matplotlib.
-
-    **Source:** Pfeiffer & Glocker, Multibody Dynamics with Unilateral Contacts, chapter 5.
-
-    ```python
-    import jax.numpy as jnp
-    import jaxlag as jl
-    from jaxlag import plot
-    block = jl.System(lambda q, qdot: 0.5 * qdot**2 - 2.0 * q**2, dissipation={"dry": lambda qdot: 0.3 * jnp.abs(qdot)})
-    trajectory = jl.simulate(block, 1.0, 0.0, jnp.linspace(0.0, 14.0, 201))
-    plot.friction(trajectory, units={"t": "s", "slip": "m/s", "dry": "N"})
-    ```
-    """
-    if not one_motion(trajectory).friction:
-        raise ValueError(
-            "`trajectory` must have dry friction that sticks and slips, but has none. Write it with a kink, e.g. `F * jnp.abs(qdot)`, "
-            "and simulate with `friction=StickSlip()`, which is the default."
-        )
-    names = chosen(names, tuple(trajectory.friction), "dissipation terms with dry friction")
-    slip = channels(trajectory.slip(), "")
-    force = channels({name: rubbing.force for name, rubbing in trajectory.friction.items()}, "")
-    drawn = panels(axes, (2, len(names)), "two for each term", figsize=(max(6.4, 4.2 * len(names)), 4.6))
-    for (upper, lower), name in zip(drawn.T, names, strict=True):
-        for ax, entries in ((upper, slip[name]), (lower, force[name])):
-            zero_line(ax)
-            for i, (entry, samples) in enumerate(entries.items()):
-                ax.plot(trajectory.ts, samples, color=colour(i), label=entry)
-            stuck = np.reshape(trajectory.friction[name].sticking, (trajectory.ts.size, -1)).T
-            intervals = [interval for row in stuck for interval in _intervals(np.asarray(trajectory.ts), row)]
-            for i, (start, end) in enumerate(intervals):
-                ax.axvspan(start, end, color=GREY, alpha=0.35 / len(stuck), linewidth=0, label=None if i else "sticks")
-        upper.set_ylabel(label(f"slip {name}", units, "slip"))
-        lower.set_ylabel(label(f"force {name}", units, name))
-        lower.set_xlabel(label("t", units))
-        several = len(slip[name]) > 1
-        if not several:
-            upper.lines[-1].set_label(None)
-        if several or intervals:
-            legend_above(upper)
-    return drawn
-
-
-def _over_time(ts, quantities, titles, which, units, axes):
-    """A panel for each quantity, over a common time axis."""
-    drawn = panels(axes, (len(quantities), 1), which, figsize=(6.4, 1.0 + 1.7 * len(quantities)))[:, 0]
-    for ax, (name, entries), title in zip(drawn, quantities.items(), titles, strict=True):
-        for i, (entry, samples) in enumerate(entries.items()):
-            ax.plot(ts, samples, color=colour(i), label=entry)
-        ax.set_ylabel(label(title, units, name))
-        if len(entries) > 1:
-            legend_beside(ax)
-    drawn[-1].set_xlabel(label("t", units))
-    return drawn
-
-
-def _sign_changes(ts, samples):
-    """The times at which the straight lines between samples cross zero."""
-    before, after = samples[:-1], samples[1:]
-    at = np.flatnonzero(before * after < 0)
-    return ts[at] + (ts[at + 1] - ts[at]) * before[at] / (before[at] - after[at])
-
-
 def _shown_works(trajectory):
     """The works that can be seen beside the largest change of energy."""
     works = {name: np.asarray(work) for name, work in trajectory.work().items()}
@@ -327,10 +221,3 @@ def _shown_works(trajectory):
     sizes = {name: np.nanmax(np.abs(work)) for name, work in works.items()}
     least = THIN * max(*sizes.values(), np.nanmax(np.abs(h - h[0])), THIN * np.nanmax(np.abs(turned)))
     return {name: works[name] for name, size in sizes.items() if size > least}
-
-
-def _intervals(ts, sticking):
-    """Begin and end of each run of samples that stick, half a sample wider on either side."""
-    edges = np.concatenate([ts[:1], (ts[1:] + ts[:-1]) / 2, ts[-1:]])
-    steps = np.diff(np.concatenate([[0], np.asarray(sticking, int), [0]]))
-    return list(zip(edges[np.flatnonzero(steps == 1)], edges[np.flatnonzero(steps == -1)], strict=True))

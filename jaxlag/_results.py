@@ -38,3 +38,16 @@ def reason_of(result: Any) -> str:
     reasons = [named(value) for value in dict.fromkeys(np.ravel(result._value)[np.ravel(result != successful)].tolist())]
     of_input = [reason for reason in reasons if reason in [RESULTS[given] for given in OF_THE_INPUT]]  # type: ignore[misc]
     return [*of_input, *reasons, RESULTS[successful]][0]  # type: ignore[misc]
+
+
+def names_of(result: Any) -> np.ndarray:
+    """The names of results, which outlast the numbers that stand for them."""
+    named = {int(item._value): name for name, item in RESULTS._name_to_item.items()}  # type: ignore[attr-defined]
+    return np.reshape([named[value] for value in np.ravel(result._value).tolist()], np.shape(result._value))
+
+
+def result_of(names: np.ndarray) -> RESULTS:
+    """The results of these names."""
+    successful: Any = RESULTS.successful
+    values = [RESULTS._name_to_item[name]._value for name in np.ravel(names).tolist()]  # type: ignore[attr-defined]
+    return eqx.tree_at(lambda r: r._value, successful, jnp.reshape(jnp.asarray(values), np.shape(names)))

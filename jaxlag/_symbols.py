@@ -4,6 +4,7 @@ Imported where a formula is asked for, and nowhere else: SymPy is an extra.
 """
 
 import functools
+import itertools
 import math
 import operator
 from collections.abc import Callable
@@ -80,7 +81,8 @@ class Formulas(Algebra):
         if name not in SHORTCUTS:
             return None
         function, formula = SHORTCUTS[name]
-        shapes = [jax.ShapeDtypeStruct(atom.aval.shape, atom.aval.dtype) for atom in equation.invars]
+        avals = [atom.aval for atom in equation.invars]
+        shapes = [jax.ShapeDtypeStruct(aval.shape, aval.dtype, weak_type=aval.weak_type) for aval in avals]
         (call,) = jax.make_jaxpr(function)(*shapes).eqns
         return formula if str(call.params["jaxpr"]) == str(equation.params["jaxpr"]) else None
 
@@ -134,7 +136,21 @@ def _determinant(A: np.ndarray) -> list[np.ndarray]:
     return [filled(batch, [sympy.Matrix(A[at]).det(method="berkowitz") for at in np.ndindex(batch)])]
 
 
+def _interpolated(x: np.ndarray, xp: np.ndarray, fp: np.ndarray, left: Any = None, right: Any = None) -> list[np.ndarray]:
+    """Straight lines from point to point of a table, level beyond its ends."""
+    points = list(zip(xp, fp, strict=True))
+    line = lambda x, a, b: a[1] + (b[1] - a[1]) / (b[0] - a[0]) * (x - a[0])
+
+    def at(x):
+        inside = [(line(x, a, b), x < b[0]) for a, b in itertools.pairwise(points) if a[0] != b[0]]  # where points are equal it jumps
+        before, beyond = (end[()] if end is not None else f for end, f in ((left, fp[0]), (right, fp[-1])))
+        return sympy.Piecewise((before, x < xp[0]), *inside, (fp[-1], sympy.Eq(x, xp[-1])), (beyond, True))
+
+    return [filled(x.shape, map(at, x.flat))]
+
+
 SHORTCUTS: dict[str, tuple[Callable, Callable]] = {
     "hypot": (jnp.hypot, lambda x, y: [filled(x.shape, (sympy.sqrt(a**2 + b**2) for a, b in zip(x.flat, y.flat, strict=True)))]),
     "det": (jnp.linalg.det, _determinant),
+    "_interp": (jnp.interp, _interpolated),
 }

@@ -1,7 +1,7 @@
 """The mechanical system as its user states it, and the same system over flat vectors."""
 
 import dataclasses
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from typing import Any, NamedTuple
 
 import jax
@@ -11,6 +11,7 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, PyTree
 
 from ._arguments import call, names
+from ._pickling import portable, restored
 
 Terms = tuple[tuple[str, Callable], ...]
 Slot = Any  # a function, a mapping from names to functions, or None: `_terms` checks it, with a sentence
@@ -37,10 +38,14 @@ class System:
     - `force`: Q(t, q, q̇), shaped like q; where q is a mapping, coordinates may be left out.
     - `holonomic`: g(t, q), any array or pytree of arrays, kept at zero.
     - `nonholonomic`: a(t, q, q̇), affine in q̇, kept at zero.
+    - `one_sided`: names of holonomic constraints that push and never pull, as a table does: g ≥ 0 and λ ≥ 0, for λ > 0 pushes along +∇g.
+      The motion is computed with g = 0 kept all the same; but where λ < 0 the contact would have opened, and `Trajectory.pulling()`,
+      its card, `examine` and `plot.forces` say so.
 
     Any consistent set of units. A system is immutable, hashable and compared by its functions.
 
-    **Raises:** `TypeError` where a slot holds no function; `ValueError` where two terms share a name.
+    **Raises:** `TypeError` where a slot holds no function; `ValueError` where two terms share a name, or `one_sided` names no holonomic
+    constraint.
 
     **Source:** Goldstein, Classical Mechanics, 3rd ed., sections 1.5 and 2.4; sign of λ: M q̈ = f + Gᵀλ.
 
@@ -60,6 +65,7 @@ class System:
     force: Terms
     holonomic: Terms
     nonholonomic: Terms
+    one_sided: tuple[str, ...]
 
     def __init__(
         self,
@@ -69,6 +75,7 @@ class System:
         force: Slot = None,
         holonomic: Slot = None,
         nonholonomic: Slot = None,
+        one_sided: Any = (),  # a name, or a collection of names
     ):
         for slot, given in zip(SLOTS, (lagrangian, dissipation, force, holonomic, nonholonomic), strict=True):
             object.__setattr__(self, slot, _terms(slot, given))
@@ -79,12 +86,31 @@ class System:
                 raise ValueError(
                     f"terms must be named differently, but two are called {name!r}. Rename one, for powers and multipliers go by names."
                 )
+        given = one_sided if isinstance(one_sided, Collection) and not isinstance(one_sided, str) else (one_sided,)
+        known = [name for name, _ in self.holonomic]
+        for name in given:
+            if name not in known:
+                there = ", ".join(known) or "none"
+                raise ValueError(f"`one_sided` must name holonomic constraints, but holds {name!r}. There are {there}.")
+        object.__setattr__(self, "one_sided", tuple(name for name in known if name in given))
+
+    def __copy__(self) -> "System":
+        return self
+
+    def __deepcopy__(self, memo: Any) -> "System":
+        return self
+
+    def __reduce__(self) -> Any:
+        stands = {slot: {name: portable(f, role(slot, name)) for name, f in getattr(self, slot)} for slot in SLOTS}
+        return _unpickled, (stands, self.one_sided)
 
     def __repr__(self) -> str:
         def listed(slot: str, terms: Terms) -> str:
             return slot if [name for name, _ in terms] == [slot] else f"{slot}: {', '.join(name for name, _ in terms)}"
 
-        return f"System({'; '.join(listed(slot, getattr(self, slot)) for slot in SLOTS if getattr(self, slot))})"
+        parts = [listed(slot, getattr(self, slot)) for slot in SLOTS if getattr(self, slot)]
+        parts += [f"one-sided: {', '.join(self.one_sided)}"] * bool(self.one_sided)
+        return f"System({'; '.join(parts)})"
 
     @property
     def constraints(self) -> tuple[str, ...]:
@@ -95,6 +121,11 @@ class System:
     def terms(self) -> tuple[str, ...]:
         """Names of all that does work: dissipation, forces, constraints, and explicit time in L."""
         return (*(name for name, _ in (*self.dissipation, *self.force)), *self.constraints, EXPLICIT_TIME)
+
+
+def _unpickled(stands: dict[str, dict[str, Any]], one_sided: tuple[str, ...]) -> System:
+    slots = {slot: {name: restored(f) for name, f in terms.items()} for slot, terms in stands.items()}
+    return System(**slots, one_sided=one_sided)
 
 
 def _terms(slot: str, given: Any) -> Terms:

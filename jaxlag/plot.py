@@ -8,7 +8,8 @@ from ._canvas import COLOURS as COLOURS
 from ._canvas import pyplot
 from ._equations import Equations
 from ._plot_fit import convergence, fit, parameters
-from ._plot_motion import balance, energy, forces, friction, motion, phase
+from ._plot_forces import forces, friction
+from ._plot_motion import balance, energy, motion, phase
 
 __all__ = ["balance", "convergence", "energy", "equations", "fit", "forces", "friction", "motion", "parameters", "phase"]
 

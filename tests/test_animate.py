@@ -12,10 +12,8 @@ import matplotlib
 import numpy as np
 import pytest
 from PIL import Image
-from scipy.interpolate import CubicHermiteSpline
 
 import jaxlag as jl
-from jaxlag._animate import between
 from jaxlag._trajectory import Stated
 from jaxlag.examples import pendulum
 
@@ -55,12 +53,6 @@ def whirling(**options):
     return jl.animate(
         whirl(), {"bob": bob, "half": half}, [((0.0, 0.0), "half"), ("half", "bob")], **({"units": UNITS, "fps": 10} | options)
     )
-
-
-def test_positions_between_samples_are_hermites():
-    ts, at = np.array([0.0, 1.0, 1.5, 4.0]), np.linspace(0.0, 4.0, 29)
-    x, v = np.sin(np.outer(ts, [1.0, 2.0])), np.cos(np.outer(ts, [1.0, 3.0]))
-    np.testing.assert_allclose(between(ts, x, v, at), CubicHermiteSpline(ts, x, v)(at), atol=1e-14)
 
 
 def test_frames_are_where_the_motion_is():

@@ -114,6 +114,11 @@ FUNCTIONS = (
         lambda v: jnp.sum(jnp.eye(2) * v[None]) * jnp.array([True, False]),
         lambda v: v.astype(jnp.float32),
     ),
+    *(
+        lambda v: jnp.interp(v, jnp.array([0.0, 0.5, 0.7]), jnp.array([1.0, 3.0, 2.0])),
+        lambda v: jnp.interp(v[0], 0.5 * jnp.arange(3.0), v[1] * jnp.arange(3.0) ** 2, left=1, right=7.0),
+        lambda v: jnp.interp(5 * v - 2, jnp.array([0.0, 1.0, 1.0, 2.0]), jnp.array([1.0, 3.0, 5.0, 4.0])),
+    ),
 )
 
 
@@ -619,6 +624,13 @@ NOTATION = [
     ("x", "F_max", lambda q, p: p * jnp.where(q > 0, q, 0), "F_max (x if x > 0; 0 otherwise)", r"F_{\mathrm{max}} \left(\begin{cases}"),
     ("x", "p", lambda q, p: p * jnp.abs(q) ** 3 + jnp.arctan(q), "arctan(x) + p |x|³", r"\arctan {x} + p \left|{x}\right|^{3}"),
     ("x", "n", lambda q, p: jnp.abs(q) ** p / p, "|x|^n/n", r"\frac{\left|{x}\right|^{n}}{n}"),
+    (
+        "phi",
+        "k",
+        lambda q, p: jnp.cos(q) * p / (q - 1) + jnp.sin(q),
+        "sin φ + (k cos φ)/(φ − 1)",
+        r"\sin {\varphi} + \frac{k \cos {\varphi}}{\varphi - 1}",
+    ),
 ]
 k_ = c_ = lambda p: p
 
@@ -629,6 +641,41 @@ def test_notation(q, p, potential, text, tex):
     derivation = jl.equations(system, q, {"p": p}).derivation()
     assert text in str(derivation).splitlines()[0], str(derivation).splitlines()[0]
     assert tex in derivation.latex().splitlines()[1], derivation.latex().splitlines()[1]
+
+
+def test_the_dots_of_a_word_are_not_those_of_a_letter():
+    """In Unicode behind the word, in LaTeX above all of it."""
+    system = jl.System(lambda qdot: 0.5 * (qdot["wheel"] ** 2 + qdot["wheel_speed"] ** 2 + qdot["theta_rod"] ** 2 + qdot["x1"] ** 2))
+    e = jl.equations(system, {"wheel", "wheel_speed", "theta_rod", "x1"})
+    assert str(e).splitlines() == ["θ̈_rod = 0", "wheel¨ = 0", "wheel_speed¨ = 0", "ẍ₁ = 0"]
+    assert "∂L/∂wheel_speed˙ = wheel_speed˙" in str(e.derivation()).splitlines()
+    assert r"\ddot{\mathrm{wheel}}_{\mathrm{speed}} &= 0" in e.latex() and r"\ddot{\theta}_{\mathrm{rod}}" in e.latex()
+
+
+def test_what_is_solved_for_has_a_sine_where_a_person_writes_one():
+    """The symmetric top, whose precession is A φ̈ sin²θ = …: once it was (cos θ − 1) (cos θ + 1)."""
+
+    def top(q, qdot, A, C, m, g, l):
+        spin = qdot["psi"] + qdot["phi"] * jnp.cos(q["theta"])
+        tilt = qdot["theta"] ** 2 + (qdot["phi"] * jnp.sin(q["theta"])) ** 2
+        return 0.5 * A * tilt + 0.5 * C * spin**2 - m * g * l * jnp.cos(q["theta"])
+
+    e = jl.equations(jl.System(top), {"theta", "phi", "psi"}, {"A", "C", "m", "g", "l"})
+    A, C, theta, phidot, psidot, thetadot = (sympy.Symbol(n, real=True) for n in ("A", "C", "theta", "phidot", "psidot", "thetadot"))
+    by_hand = thetadot * (C * psidot - (2 * A - C) * phidot * cos(theta)) / (A * sin(theta))
+    assert is_zero(e.accelerations["phi"] - by_hand) and not e.accelerations["phi"].has(cos(theta) - 1, cos(theta) + 1)
+
+
+def test_a_table_is_differentiated_and_programmed(tmp_path):
+    """A spring of characteristic F(x) by `jnp.interp`, in the force and in a potential whose slope it is."""
+    xs, energies = jnp.array([-1.0, 0.0, 2.0]), jnp.array([3.0, 0.0, 1.0])
+    e = jl.equations(jl.System(lambda q, qdot, m: 0.5 * m * qdot**2 - jnp.interp(q, xs, energies)), "x", {"m"})
+    assert str(e) == "m ẍ + (0 if x < −1; −3 if x < 0; ½ if x < 2; 0 otherwise) = 0"
+    program: dict = {}
+    exec(e.to_python(), program)
+    in_c = compiled(e.to_c(), tmp_path)
+    for x, slope in ((-2.0, 0.0), (-0.5, -3.0), (1.0, 0.5), (3.0, 0.0)):
+        assert program["acceleration"](0.0, [x], [0.0], {"m": 2.0})[0][0] == in_c(0.0, [x], [0.0], [2.0], 1, 0)[0][0] == -slope / 2
 
 
 def test_equations_can_be_drawn(car):

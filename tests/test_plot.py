@@ -5,6 +5,7 @@ import functools
 import inspect
 import re
 import sys
+from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
@@ -212,9 +213,22 @@ def test_a_phase_portrait_is_velocity_over_position():
     np.testing.assert_array_equal(ax.lines[0].get_xydata(), np.stack([trajectory.q["x"], trajectory.qdot["x"]], axis=1))
     assert plot.phase(trajectory, ("y",), ax=ax) is ax
     assert ax.lines[0].get_color() != ax.lines[1].get_color()
-    both = plot.phase(trajectory, units={"x": "m", "y": "m"})
+    both = plot.phase(trajectory, units={"x": "m", "y": "m"}, ax=plt.figure().subplots())
     assert (both.get_xlabel(), both.get_ylabel()) == ("q (m)", "dq/dt")
     assert [text.get_text() for text in both.get_legend().get_texts()] == ["x", "y"]
+
+
+def test_a_phase_portrait_has_a_panel_for_each_number():
+    axes = plot.phase(motion({"r": np.array([1.0, 5.0]), "z": 9.0}), units={"t": "s", "r": "m"})
+    assert [ax.get_xlabel() for ax in axes] == ["r[0] (m)", "r[1] (m)", "z"]
+    assert [ax.get_ylabel() for ax in axes] == ["dr[0]/dt (m/s)", "dr[1]/dt (m/s)", "dz/dt"]
+    for ax, start in zip(axes, (1.0, 5.0, 9.0), strict=True):
+        np.testing.assert_allclose(ax.lines[0].get_xdata(), start + TIMES, rtol=1e-6)
+        assert len(ax.lines) == 1 and ax.get_legend() is None
+    again = plot.phase(motion({"r": np.array([1.0, 5.0]), "z": 9.0}), ax=axes)
+    assert list(again) == list(axes) and [len(ax.lines) for ax in axes] == [2, 2, 2]
+    with pytest.raises(ValueError, match="`axes` must be 3, one for each number, or one for all, but 2 were given."):
+        plot.phase(motion({"r": np.array([1.0, 5.0]), "z": 9.0}), ax=axes[:2])
 
 
 def test_forces_have_a_ring_where_the_rod_begins_to_push():
@@ -240,6 +254,45 @@ def test_energy_stands_beside_the_works():
     np.testing.assert_allclose(lines["energy at the start + works"], lines["energy"], rtol=1e-6)
     plain = example("motion")["trajectory"]
     assert [line.get_label() for line in plot.energy(plain).lines] == ["energy"]
+
+
+def test_curves_that_lie_on_each_other_are_both_seen():
+    """The second of two equal ones covers half of the first; the third leaves gaps that show both."""
+    (ax,) = plot.motion(motion({"r": np.array([1.0, 1.0, 2.0, 1.0005, 2.0])}))
+    width = lambda line: line.get_linewidth()
+    assert [line._unscaled_dash_pattern[1] for line in ax.lines] == [None, (6, 6), None, (6, 12), (6, 6)]
+    assert [line._unscaled_dash_pattern[0] for line in ax.lines] == [0, 0, 0, 6, 0] and width(ax.lines[0]) == width(ax.lines[1])
+    half = np.where(TIMES < 0.45, 1.0, 2.0)
+    crossing = dataclasses.replace(motion({"r": np.zeros(2)}), q={"r": jnp.stack([jnp.ones(11), jnp.asarray(half)], axis=1)})
+    assert [line.get_linestyle() for line in plot.motion(crossing)[0].lines] == ["-", "-"]
+
+
+@pytest.mark.parametrize("size", [2, 10])
+def test_correlations_of_either_sign_look_different(size):
+    """In colour by far, and where there is no place for numbers, by their signs."""
+    rho = np.tile([[1.0, -1.0], [-1.0, 1.0]], (size // 2, size // 2))
+    fit, free = object.__new__(jl.Fit), SimpleNamespace(theta=lambda y: y)
+    filled = {"names": tuple(f"p{i}" for i in range(size)), "x": np.ones(size), "covariance": np.eye(size), "correlation": rho}
+    for name, value in (filled | {"absolute": True, "problem": SimpleNamespace(free=free)}).items():
+        object.__setattr__(fit, name, value)
+    matrix = plot.parameters(fit)[1]
+    plus, minus = matrix.images[0].cmap([1.0, 0.0])
+    assert plus[2] - plus[0] > 0.4 and minus[0] - minus[2] > 0.4  # blue, red
+    said = [text.get_text() for text in matrix.texts]
+    assert said == (["+1.00", "-1.00", "-1.00", "+1.00"] if size == 2 else ["+" if r > 0 else "−" for r in rho.flat])
+
+
+def test_forces_are_shaded_where_a_constraint_would_have_to_pull():
+    lagrangian = lambda q, qdot: 0.5 * qdot @ qdot - q[1]
+    system = jl.System(lagrangian, holonomic={"table": lambda q: q[1], "wall": lambda q: q[0]}, one_sided="table")
+    wave = jnp.cos(2 * jnp.pi * jnp.asarray(TIMES))  # negative at 0.3 … 0.7
+    trajectory = dataclasses.replace(motion(np.zeros(2)), multipliers={"table": wave, "wall": wave}, stated=Stated.of(system, None))
+    table, wall = plot.forces(trajectory)
+    (shade,) = table.patches
+    box = shade.get_extents().transformed(table.transData.inverted())
+    np.testing.assert_allclose((box.x0, box.x1), (0.25, 0.75))
+    assert [text.get_text() for text in table.get_legend().get_texts()] == ["would have to pull", "λ changes its sign"]
+    assert not wall.patches
 
 
 def heights(area, ts):
