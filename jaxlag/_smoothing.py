@@ -9,7 +9,7 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 
 from ._arguments import call
-from ._experiment import Experiment, is_within, start_entries
+from ._experiment import Experiment, is_within, start_entries, with_own
 
 DEGREE = 5  # accelerations are twice differentiable
 GROWTH = 1.4  # from one number of pieces to the next that is tried
@@ -39,7 +39,7 @@ def smooth(experiment: Experiment, params: Any, *, between: bool = False) -> Smo
         raise ValueError("`delay` must be none where the motion is read off the measurements, but there is one. Shift `ts` by it.")
     ts = np.asarray(e.ts)
     at = (ts[1:] + ts[:-1]) / 2 if between else ts
-    seen = _Sensors(e, {**params, **e.params})
+    seen = _Sensors(e, with_own(params, e.params))
     measured = int(np.sum(np.isfinite(seen.measured)))
     best, most = None, max(4, min(len(ts) // 2, measured // (2 * seen.n), 600))
     pieces = 4.0
