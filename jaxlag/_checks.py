@@ -166,8 +166,9 @@ def _multipliers(system, t, q, qdot, params):
 
 
 def _shape_of(function, spoken, params, then=lambda out: out, /, **state):
+    numbers, rest = eqx.partition(params, eqx.is_array)
     try:
-        return eqx.filter_eval_shape(lambda params, state: then(call(function, spoken, params, **state)), params, state)
+        return jax.eval_shape(lambda numbers, state: then(call(function, spoken, eqx.combine(numbers, rest), **state)), numbers, state)
     except KeyError as error:
         if not (isinstance(state["q"], Mapping) or isinstance(params, Mapping)):
             raise

@@ -8,12 +8,12 @@ Works are there where they were asked for, the last three where D has kinks.
 import dataclasses
 from typing import Any, NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, PyTree
 
+from ._compiled import jitted
 from ._friction import (
     Regularised,
     StickSlip,
@@ -180,7 +180,7 @@ class Equations:
         return Sample(*unraveled, named, rubbing, counts)
 
 
-@eqx.filter_jit  # so that diffrax's many calls trace it once
+@jitted  # so that diffrax's many calls trace it once
 def _accelerated(equations: Equations, t, y, params):
     q, v, _, sigma, *_ = equations.parts(y)
     _, mode, _ = equations.mode(t, q, v, sigma, params)
@@ -188,7 +188,7 @@ def _accelerated(equations: Equations, t, y, params):
     return scalarised(lambda t, q, v: constrained_acceleration(mode, t, q, v, feedback))(t, q, v)
 
 
-@eqx.filter_jit
+@jitted
 def _rates(equations: Equations, t, y, params):
     q, v, works, sigma, transitions, time_stuck = equations.parts(y)
     _, mode, kinks = equations.mode(t, q, v, sigma, params)
@@ -198,7 +198,7 @@ def _rates(equations: Equations, t, y, params):
     return jnp.concatenate([v, qddot, powers, 0 * sigma, 0 * transitions, stuck])
 
 
-@eqx.filter_jit
+@jitted
 def _margins(equations: Equations, t, y, params):
     q, v, _, sigma, *_ = equations.parts(y)
     flat, _, kinks = equations.mode(t, q, v, sigma, params)
@@ -206,7 +206,7 @@ def _margins(equations: Equations, t, y, params):
     return friction(flat, kinks, sigma, t, q, v).margin
 
 
-@eqx.filter_jit
+@jitted
 def _changed(equations: Equations, t, y, args, ended):
     params, slack = args
     q, v, works, sigma, transitions, time_stuck = equations.parts(y)
@@ -219,7 +219,7 @@ def _changed(equations: Equations, t, y, args, ended):
     return equations.kept(t, y, args), mode.consistent, jnp.all(~ended | stuck | slow)
 
 
-@eqx.filter_jit
+@jitted
 def _kept(equations: Equations, t, y, params):
     q, v, works, sigma, *counts = equations.parts(y)
     _, mode, kinks = equations.mode(t, q, v, sigma, params)

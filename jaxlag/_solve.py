@@ -127,7 +127,7 @@ def states_at(equations: Any, how: How, adjoint: dfx.AbstractAdjoint, t0, y0, ts
         solver = StickSlipSolver(how.solver, kept, 2 * equations.size, behind, equations)
     elif kept is not None or behind is not None or how.audit:
         solver = Kept(how.solver, kept, 2 * equations.size, behind)
-    solution = dfx.diffeqsolve(
+    solution = dfx.diffeqsolve.__wrapped__(  # all is within a program already, and `equinox.filter_jit` would keep what it is given
         dfx.ODETerm(alone(equations.rates)),
         solver,
         t0,

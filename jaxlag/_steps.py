@@ -12,6 +12,7 @@ import numpy as np
 from equinox.internal import prevbefore
 from jaxtyping import Array, Float
 
+from ._compiled import jitted
 from ._friction import norms, settle
 from ._motion import Equations
 from ._power import energy_turnover
@@ -242,7 +243,7 @@ class StickSlipSolver(Kept):
         y, possible, ready = self.equations.changed(turn.cut, turn.first.y, args, which)
         return turn._replace(y_new=y, possible=possible, usable=turn.usable & ready)
 
-    @eqx.filter_jit
+    @jitted
     def _first_end(self, t0, t1, dense, args):
         """Whether a mode ends within a step, when the first does on the dense output, and the slopes of the margins there."""
         t0, t1, dense, args = jax.lax.stop_gradient((t0, t1, dense, args))
@@ -263,7 +264,7 @@ class StickSlipSolver(Kept):
         return ended, low + width, slope
 
 
-@eqx.filter_jit
+@jitted
 def behind_a_jump(equations: Equations, t, y, args):
     """y behind a jump of an input at t, and whether a mode of friction agrees with its forces.
 
