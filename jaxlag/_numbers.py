@@ -55,11 +55,15 @@ def _array(given: Any, spoken: str) -> np.ndarray | Array:
             array = jnp.asarray(given) if any(isinstance(x, jax.Array) for x in jax.tree.leaves(given)) else np.asarray(given)
     except (TypeError, ValueError):
         pass
-    if array is None or not (jnp.issubdtype(array.dtype, jnp.number) or array.dtype == bool):
+    kind = "O" if array is None else array.dtype.kind
+    is_number = (
+        array is not None and (jnp.issubdtype(array.dtype, jnp.number) or kind == "b") and kind != "m"
+    )  # NumPy's durations are integers
+    if array is None or not is_number:
         what, cure = "none", "Hand over rows of equal length."
-        if array is not None and array.dtype.kind in "SU":
+        if kind in "SU":
             what, cure = "text", "Read the numbers out of it first, by `float`."
-        if array is not None and (array.dtype.kind in "mM" or isinstance(next(iter(np.ravel(array)), None), TIMES)):
+        if kind in "mM" or (array is not None and isinstance(next(iter(np.ravel(array)), None), TIMES)):
             what, cure = "a date", DATES
         raise TypeError(f"{spoken} must be an array of real numbers, but is a {type(given).__name__} that is {what}. {cure}")
     return array
