@@ -89,13 +89,14 @@ def warn_of_functions_made_anew(functions: list[tuple[str, Callable]], shapes: A
     for role, function in functions:
         for part in _parts(function):
             by_code.setdefault(part.__code__, []).append((role, part))
+    kind = str(([role for role, _ in functions], shapes))
     for code, made in by_code.items():
         anew = not any(function in _met for _, function in made)
         for _, function in made:
             _met.add(function)
         counts = _times_made.setdefault(code, {})
-        counts[str(shapes)] = counts.get(str(shapes), 0) + anew
-        if anew and counts[str(shapes)] == REPEATS:
+        counts[kind] = counts.get(kind, 0) + anew
+        if anew and counts[kind] == REPEATS:
             warnings.warn(
                 f"{made[0][0]} must be made once to be compiled once, but `{code.co_name}`, line {code.co_firstlineno} of "
                 f"{code.co_filename}, was made anew {REPEATS} times, and each time all is compiled again. Define it and the system "
