@@ -38,7 +38,9 @@ class System:
     - `holonomic`: g(t, q), any array or pytree of arrays, kept at zero.
     - `nonholonomic`: a(t, q, q̇), affine in q̇, kept at zero.
 
-    Any consistent set of units. A system is immutable, hashable and compared by its functions.
+    Any consistent set of units. What a function returns may be plain numbers, integers or lists: it becomes floating arrays. A system
+    is immutable, hashable and compared by its functions: state it once, for one made anew from new functions is compiled anew. What
+    was compiled for it, and what its functions hold, stays until `jax.clear_caches()`.
 
     **Raises:** `TypeError` where a slot holds no function; `ValueError` where two terms share a name.
 

@@ -226,6 +226,8 @@ def test_any_mapping_is_params(params):
     assert sprung(params) == -8.0
     assert sprung({"c": 4.0, "more": {"deeper": params}}, dissipation=lambda more: 0.0 * more["deeper"]["c"]) == -8.0
     assert jax.grad(lambda c: sprung(types.MappingProxyType({"c": c})))(4.0) == -2.0
+    named = type(params)({"c": "stiffness"})
+    assert "stiffness q" in str(jl.equations(jl.System(energy), "q", named))
 
 
 def test_dataclasses_as_params_and_in_a_system():
