@@ -2,13 +2,13 @@
 
 from typing import Any, NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
 
 from ._arguments import call
+from ._compiled import jitted
 from ._experiment import Experiment, is_within, start_entries, with_own
 
 DEGREE = 5  # accelerations are twice differentiable
@@ -76,7 +76,7 @@ class _Sensors:
             return ravel_pytree(call(e.observe, "`observe`", params, t=t, q=q, qdot=v, qddot=a, multipliers=nothing))[0]
 
         both = lambda t, x: (channels(t, x), jax.jacfwd(channels, argnums=1)(t, x))
-        self.of_motion = eqx.filter_jit(jax.vmap(both))
+        self.of_motion = jitted(jax.vmap(both))
 
 
 class _Unseen(dict):
