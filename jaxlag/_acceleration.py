@@ -9,6 +9,7 @@ import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
 from jaxtyping import PyTree
 
+from ._arguments import check_function
 from ._checks import at_state
 from ._compiled import is_concrete
 from ._friction import settled
@@ -95,6 +96,8 @@ def constraint_force(
     jl.constraint_force(block, jnp.zeros(2), jnp.zeros(2), {"m": 2.0, "g": 9.81})["floor"]  # [0, 19.62]
     ```
     """
+    if at is not None:
+        check_function(at, "`at`")
     force, determined = at_state(_ConstraintForce(at), system, q, qdot, params, t)
     if is_concrete(determined) and not determined:
         raise ValueError(NO_INERTIA)

@@ -7,6 +7,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import PyTree
 
 from ._experiment import Experiment, measured
 from ._fit import Fit, Prediction, channel_rows
@@ -46,7 +47,7 @@ class Information:
 
 
 def information(
-    system: System, experiments: Experiment | Sequence[Experiment], params: Mapping[str, Any], free: Sequence[str], **numerics: Any
+    system: System, experiments: Experiment | Sequence[Experiment], params: PyTree, free: Sequence[str], **numerics: Any
 ) -> Information:
     r"""Fisher's information of planned experiments, and the standard errors a fit will have, before anybody measures.
 

@@ -1,5 +1,6 @@
 """The border: what a user hands over becomes arrays once, and is checked once, free of run time."""
 
+import functools
 from collections.abc import Callable, Mapping
 from typing import Any
 
@@ -9,9 +10,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, PyTree
 
-from ._arguments import call, check_entries, missing
+from ._arguments import call, check_entries, missing, told
 from ._compiled import compiled, is_concrete
-from ._system import Flat, System, bind, role
+from ._diagnosis import warn_of_functions_made_anew
+from ._numbers import number, numbers
+from ._system import SLOTS, Flat, System, bind, flat_like, role
 
 
 def is_vector(node: Any) -> bool:
@@ -20,17 +23,14 @@ def is_vector(node: Any) -> bool:
 
 
 def coordinates(q: Any, name: str) -> PyTree[Array]:
-    """`q` as a pytree of floating arrays; integers are taken as floats, and a list of numbers as a vector."""
+    """`q` as a pytree of floating arrays; integers and half precision become floats as Python's are, and a list of numbers a vector."""
 
     def floating(path, leaf):
         where = f"`{name}{jax.tree_util.keystr(path)}`"
-        leaf = np.asarray(leaf) if is_vector(leaf) else leaf
-        if not isinstance(leaf, (float, int, complex, np.generic, np.ndarray, jax.Array)):
+        if not isinstance(leaf, (float, int, complex, np.generic, np.ndarray, jax.Array, list)):
             raise TypeError(f"{where} must be a real number or array, but is a {type(leaf).__name__}. Hand over numbers only.")
-        dtype = np.asarray(leaf).dtype if not isinstance(leaf, jax.Array) else leaf.dtype
-        if jnp.issubdtype(dtype, jnp.bool_) or not jnp.issubdtype(dtype, jnp.number) or jnp.issubdtype(dtype, jnp.complexfloating):
-            raise TypeError(f"{where} must be real, but has dtype {dtype}. Hand over floating-point numbers.")
-        return jnp.asarray(leaf, None if jnp.issubdtype(dtype, jnp.floating) and not isinstance(leaf, float) else float)
+        array = numbers(leaf, where)
+        return array if array.dtype.itemsize >= 4 else array.astype(float)
 
     q = jax.tree_util.tree_map_with_path(floating, q, is_leaf=lambda node: node is None or is_vector(node))
     if not jax.tree.leaves(q):
@@ -55,22 +55,49 @@ def state(q: Any, qdot: Any, names: tuple[str, str] = ("q", "qdot")) -> tuple[Py
     return jax.tree.map(lambda x: x.astype(dtype), (q, qdot))
 
 
-def parameters(params: PyTree, like: PyTree[Array]) -> PyTree:
-    """`params` with Python numbers and NumPy arrays as JAX arrays, in the precision of the coordinates; the rest as it is."""
+def parameters(params: PyTree, like: PyTree[Array], name: str = "params") -> PyTree:
+    """`params` with numbers and arrays as JAX arrays, Python's in the precision of the coordinates, and every mapping a dict."""
     check_entries(params)
     dtype = jax.tree.leaves(like)[0].dtype
 
-    def array(leaf):
+    def array(path, leaf):
+        spoken = f"`{name}{jax.tree_util.keystr(path)}`"
+        if isinstance(leaf, Mapping):  # one that JAX takes for a leaf
+            return jax.tree_util.tree_map_with_path(lambda rest, leaf: array((*path, *rest), leaf), dict(leaf))
         if isinstance(leaf, (int, float)) and not isinstance(leaf, bool):
             return jnp.asarray(leaf, dtype)
-        return jnp.asarray(leaf) if isinstance(leaf, (np.ndarray, np.generic)) else leaf
+        if isinstance(leaf, np.ma.MaskedArray) or (isinstance(leaf, (np.ndarray, np.generic)) and leaf.dtype.kind not in "biucfV"):
+            return str(leaf) if isinstance(leaf, np.str_) else numbers(leaf, spoken)
+        if isinstance(leaf, (np.ndarray, np.generic)):
+            return jnp.asarray(leaf if leaf.dtype.itemsize <= 8 or leaf.dtype.kind == "c" else leaf.astype(float))
+        _check_seen(leaf, spoken)
+        return leaf
 
-    return jax.tree.map(array, params)
+    return jax.tree_util.tree_map_with_path(array, params)
+
+
+def _check_seen(leaf: Any, spoken: str) -> None:
+    """Refuses what JAX sees no numbers in, though it may hold some: a compiled program would keep those that it was first given."""
+    kind = type(leaf).__name__
+    if isinstance(leaf, (set, frozenset)):
+        raise TypeError(f"{spoken} must be numbers in some order, but is a {kind}, which has none. Write a list or a tuple.")
+    by_identity = type(leaf).__hash__ is object.__hash__ and not callable(leaf) and not isinstance(leaf, jax.Array)
+    try:
+        hash(None if isinstance(leaf, jax.Array) else leaf)
+    except TypeError:
+        by_identity = True
+    if by_identity:
+        raise TypeError(
+            f"{spoken} must be numbers, arrays, or a pytree of them, but is a {kind}, in which JAX sees none. "
+            f"Register its class, `jax.tree_util.register_dataclass({kind})`, make it an `equinox.Module`, or write a dict."
+        )
 
 
 def sample_times(ts: Any, dtype: Any) -> Array:
     """The sample times as a vector, at least two and increasing."""
-    ts = jnp.asarray(ts, dtype)
+    if isinstance(ts, Mapping):
+        raise TypeError(f"`ts` must be a list of times, but is a {type(ts).__name__}. Hand over `ts` before `params`.")
+    ts = numbers(ts, "`ts`", dtype)
     if ts.ndim != 1 or ts.size < 2:
         raise ValueError(f"`ts` must be a list of at least two times, but has shape {ts.shape}. Start it with the time of q0.")
     if is_concrete(ts):
@@ -92,30 +119,30 @@ def check(system: System, t: Array, q: PyTree[Array], qdot: PyTree[Array], param
         for name, function in getattr(system, slot):
             more = {} if slot == "lagrangian" else {"multipliers": _multipliers(system, t, q, qdot, params)}
             out = _shape_of(function, role(slot, name), params, t=t, q=q, qdot=qdot, **more)
-            if not (_is_real(out) and out.shape == ()):
+            if not (isinstance(out, jax.ShapeDtypeStruct) and out.shape == ()):
                 raise ValueError(
-                    f"{role(slot, name)} must return a real scalar, but returned {_spoken(out)}. Did you forget to sum, e.g. `qdot @ qdot`?"
+                    f"{role(slot, name)} must return a real scalar, but returned {told(out)}. Did you forget to sum, e.g. `qdot @ qdot`?"
                 )
     for slot in ("holonomic", "nonholonomic"):
         for name, function in getattr(system, slot):
             velocity = {} if slot == "holonomic" else {"qdot": qdot}
             out = _shape_of(function, role(slot, name), params, t=t, q=q, **velocity)
-            if not (jax.tree.leaves(out) and all(map(_is_real, jax.tree.leaves(out)))):
+            if not jax.tree.leaves(out):
                 raise ValueError(
-                    f"{role(slot, name)} must return real floating-point residuals, but returned {_spoken(out)}. "
-                    "Return what has to be zero, e.g. `q @ q - l**2`."
+                    f"{role(slot, name)} must return residuals, but returned {told(out)}. Return what has to be zero, e.g. `q @ q - l**2`."
                 )
     for name, function in system.force:
-        multipliers = _multipliers(system, t, q, qdot, params)
-        out = _shape_of(function, role("force", name), params, t=t, q=q, qdot=qdot, multipliers=multipliers)
-        _check_force(role("force", name), out, q)
+        spoken, state = role("force", name), {"t": t, "q": q, "qdot": qdot, "multipliers": _multipliers(system, t, q, qdot, params)}
+        _shape_of(function, spoken, params, functools.partial(flat_like, q, spoken), **state)
+    shapes = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype), (q, eqx.filter(params, eqx.is_array)))
+    warn_of_functions_made_anew([(role(s, n), f) for s in SLOTS for n, f in getattr(system, s)], shapes)
 
 
 def at_state(core: Callable[..., Any], system: System, q: Any, qdot: Any, params: Any, t: Any) -> Any:
     """`core(flat, t, q, v)` of the checked system at one state given by a user; compiled once for each `core` and `system`."""
     q, qdot = state(q, qdot)
-    dtype = jax.tree.leaves(q)[0].dtype
-    return _at_state(core, system, jnp.asarray(t, dtype), q, qdot, parameters(params, q))
+    t = number(t, "`t`", jax.tree.leaves(q)[0].dtype, cure="Take one time, and `jax.vmap` for several.")
+    return _at_state(core, system, t, q, qdot, parameters(params, q))
 
 
 @compiled
@@ -138,35 +165,11 @@ def _multipliers(system, t, q, qdot, params):
     return dict(zip(system.constraints, jax.tree.map(lambda s: jnp.zeros(s.shape, s.dtype), shapes), strict=True))
 
 
-def _shape_of(function, spoken, params, **state):
+def _shape_of(function, spoken, params, then=lambda out: out, /, **state):
+    numbers, rest = eqx.partition(params, eqx.is_array)
     try:
-        return eqx.filter_eval_shape(lambda params, state: call(function, spoken, params, **state), params, state)
+        return jax.eval_shape(lambda numbers, state: then(call(function, spoken, eqx.combine(numbers, rest), **state)), numbers, state)
     except KeyError as error:
         if not (isinstance(state["q"], Mapping) or isinstance(params, Mapping)):
             raise
         raise ValueError(missing(spoken, error.args[0] if error.args else "", state["q"], params)) from error
-
-
-def _is_real(leaf: Any) -> bool:
-    return hasattr(leaf, "dtype") and jnp.issubdtype(leaf.dtype, jnp.floating)
-
-
-def _spoken(out: Any) -> str:
-    if hasattr(out, "shape"):
-        return f"an array of shape {out.shape} and dtype {out.dtype}"
-    return "nothing" if out is None else f"a {type(out).__name__}: {out}"
-
-
-def _check_force(spoken: str, out: Any, q: PyTree) -> None:
-    cure = "Return one entry for each coordinate; where q is a mapping, coordinates without a force may be left out."
-    if not jax.tree.leaves(out) and out != {}:
-        raise ValueError(f"{spoken} must be shaped like q, but returned nothing. {cure}")
-    shapes = dict(jax.tree_util.tree_flatten_with_path(q)[0])
-    for path, leaf in jax.tree_util.tree_flatten_with_path(out)[0]:
-        at = jax.tree_util.keystr(path)
-        if path not in shapes:
-            raise ValueError(f"{spoken} must be shaped like q, but returned an entry {at or 'without a name'} that q has not. {cure}")
-        if not _is_real(leaf) or leaf.shape != shapes[path].shape:
-            raise ValueError(f"{spoken}{at} must be real and of shape {shapes[path].shape}, but is {_spoken(leaf)}. {cure}")
-    if not isinstance(q, dict) and len(jax.tree.leaves(out)) != len(shapes):
-        raise ValueError(f"{spoken} must be shaped like q, but returned {len(jax.tree.leaves(out))} of {len(shapes)} entries. {cure}")

@@ -7,18 +7,45 @@ Within a user's own `jit` that is the user's choice: the environment variable XL
 
 import functools
 from collections.abc import Callable
+from typing import Any
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import PyTree
 
 QUICK = {"xla_cpu_use_fusion_emitters": False}
 
 
+def jitted(function: Callable, **options: Any) -> Callable:
+    """`jax.jit`, with arrays as what is traced and all else as what the program is made for.
+
+    `equinox.filter_jit` does that too, but what it was called with stays alive in a cache of JAX that `jax.clear_caches` does not know.
+    """
+
+    def on_leaves(arrays, still):
+        leaves, structure = still
+        whole = [array if leaf is None else leaf for array, leaf in zip(arrays, leaves, strict=True)]
+        given, named = jax.tree.unflatten(structure, whole)
+        return function(*given, **named)
+
+    on_leaves.__name__ = getattr(function, "__name__", "on_leaves")  # which is that of the program
+    program = jax.jit(on_leaves, static_argnums=1, **options)
+
+    @functools.wraps(function)
+    def call(*given, **named):
+        leaves, structure = jax.tree.flatten((given, named))
+        is_array = [isinstance(leaf, (jax.Array, np.ndarray)) for leaf in leaves]
+        arrays = [leaf if traced else None for leaf, traced in zip(leaves, is_array, strict=True)]
+        still = tuple(None if traced else leaf for leaf, traced in zip(leaves, is_array, strict=True))
+        return program(arrays, (still, structure))
+
+    return call
+
+
 def compiled(function: Callable) -> Callable:
-    """`equinox.filter_jit`, with choices of its own for the compiler where Python calls the program, not another program."""
-    within = eqx.filter_jit(function)
+    """`jitted`, with choices of its own for the compiler where Python calls the program, not another program."""
+    within = jitted(function)
 
     @functools.wraps(function)
     def call(*given, **named):
@@ -34,7 +61,7 @@ def _by_python(*given) -> bool:
 
 @functools.cache
 def _quick(function):
-    return eqx.filter_jit(function, compiler_options=_options())
+    return jitted(function, compiler_options=_options())
 
 
 @functools.cache

@@ -11,9 +11,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PyTree
 
-from ._arguments import check_entries
+from ._arguments import check_function
 from ._checks import is_vector, parameters, sample_times, state
 from ._compiled import is_concrete
+from ._numbers import number, numbers
 from ._system import leaf_names
 
 
@@ -83,10 +84,16 @@ class Experiment(eqx.Module):
         self.ts = sample_times(ts, dtype)
         self.values = _measured(values, self.ts, dtype)
         self.sigma = None if sigma is None else _deviations(sigma, self.values)
-        check_entries(params)
-        self.params = dict(parameters(dict(params or {}), self.q0))
+        if params is not None and not isinstance(params, Mapping):
+            raise TypeError(f"`params` of an experiment must be a mapping, but is a {type(params).__name__}. Name its entries in a dict.")
+        self.params = dict(parameters(params or {}, self.q0))
         self.observe = _Coordinates.named_by(self.values, self.q0) if observe is None else observe
+        check_function(self.observe, "`observe`")
         self.unknown = (unknown,) if isinstance(unknown, str) else tuple(unknown)
+        if callable(delay):
+            check_function(delay, "`delay`")
+        elif delay is not None and is_concrete(delay):
+            delay = float(number(delay, "`delay`", cure="Give the time by which the sensors are late."))
         self.delay = delay
         for name in self.unknown:
             self._check_unknown(name)
@@ -123,7 +130,7 @@ class Experiment(eqx.Module):
 
         **Arguments, raises:** as `from_csv`.
         """
-        ts, values = _from_columns(list(frame.columns), lambda name: np.asarray(frame[name].to_numpy(), float), time, channels)
+        ts, values = _from_columns(list(frame.columns), lambda name: np.asarray(frame[name].to_numpy()), time, channels)
         return cls(ts, values, q0, qdot0, **more)
 
 
@@ -135,17 +142,32 @@ def measured(experiments: Any, params: PyTree, *, planned: bool = False) -> tupl
     for i, e in enumerate(experiments):
         if e.values is None and not planned:
             raise ValueError(f"`experiments` must have been measured, but number {i} has no values. Use `information` to plan one.")
+    if params is None or (jax.tree_util.all_leaves([params]) and not isinstance(params, Mapping)):
+        raise ValueError(f"`params` must have entries that `free` can name, but is a {type(params).__name__}. Use a dict.")
+    params = parameters(params, experiments[0].q0)
+    for e in experiments:
+        with_own(params, e.params)
+    return experiments, params
+
+
+def with_own(params: PyTree, own: Mapping[str, Any]) -> PyTree:
+    """The parameters of the fit with those of an experiment's own over them."""
+    if not own:
+        return params
     if not isinstance(params, Mapping):
-        raise ValueError(f"`params` must be a mapping, so that `free` can name its entries, but is a {type(params).__name__}. Use a dict.")
-    return experiments, parameters(params, experiments[0].q0)
+        raise ValueError(
+            f"`params` must be a mapping where an experiment has params of its own to be put over them, but is a {type(params).__name__}. "
+            "Use a dict, which may hold it as an entry."
+        )
+    return {**params, **own}
 
 
 def _measured(values, ts, dtype):
     def channel(path, value):
         at = f"`values{jax.tree_util.keystr(path)}`"
-        if not (hasattr(value, "shape") or is_vector(value)) or jnp.iscomplexobj(value):
+        if not (hasattr(value, "shape") or is_vector(value)):
             raise TypeError(f"{at} must be an array of real numbers, but is a {type(value).__name__}. Give one number for each time.")
-        value = jnp.asarray(value, dtype)
+        value = numbers(value, at, dtype)
         if value.shape[:1] != ts.shape:
             raise ValueError(f"{at} must have one row for each of the {ts.size} times, but has shape {value.shape}. Put the samples first.")
         if is_concrete(value):
@@ -159,7 +181,8 @@ def _measured(values, ts, dtype):
 
 
 def _deviations(sigma, values):
-    sigma = jax.tree.map(jnp.asarray, sigma, is_leaf=is_vector)
+    spoken = lambda path: f"`sigma{jax.tree_util.keystr(path)}`"
+    sigma = jax.tree_util.tree_map_with_path(lambda path, s: numbers(s, spoken(path)), sigma, is_leaf=is_vector)
     values = sigma if values is None else values  # of an experiment that is only planned
     spread = lambda s, v: jnp.broadcast_to(jnp.asarray(s, jnp.result_type(v, float)), jnp.shape(v))
     try:
@@ -168,8 +191,12 @@ def _deviations(sigma, values):
         raise ValueError(
             f"`sigma` must be a number or structured like `values`, but does not fit: {error}. Give one for each channel."
         ) from None
-    if any(is_concrete(s) and not np.all(np.asarray(s) > 0) for s in jax.tree.leaves(sigma)):
-        raise ValueError("`sigma` must be positive, but has an entry that is not. Give the standard deviation of the noise.")
+    for s in jax.tree.leaves(sigma):
+        if is_concrete(s) and not np.all((np.asarray(s) > 0) & np.isfinite(s)):
+            raise ValueError(
+                "`sigma` must be positive and finite, but has an entry that is not. Give the standard deviation of the noise; "
+                "mark samples that are not to count by NaN in `values`."
+            )
     return sigma
 
 

@@ -17,6 +17,7 @@ from jaxtyping import Array, Bool, Float
 
 from ._kinks import Kinks, kinks_of
 from ._multipliers import constrained_acceleration
+from ._numbers import count, number
 from ._system import Flat
 
 
@@ -228,6 +229,9 @@ class StickSlip:
 
     max_transitions: int = 10_000
 
+    def __post_init__(self):
+        count(self.max_transitions, "`max_transitions`", least=0, cure="The default is 10_000.")
+
 
 @dataclasses.dataclass(frozen=True)
 class Regularised:
@@ -247,6 +251,10 @@ class Regularised:
     """
 
     width: float
+
+    def __post_init__(self):
+        width = number(self.width, "`width`", positive=True, cure="Take some thousandths of the velocities that occur.")
+        object.__setattr__(self, "width", float(width))
 
     def smooth(self, flat: Flat, kinks: Kinks) -> Flat:
         """The system with smooth friction."""

@@ -52,7 +52,7 @@ def fit(
     **Arguments:**
 
     - `experiments`: one `Experiment` or several, of any lengths.
-    - `params`: a mapping with all parameters; those in `free` are starting values. `jaxlag.regress` finds such.
+    - `params`: all parameters, a mapping or any pytree with named parts; those in `free` are starting values. `jaxlag.regress` finds such.
     - `free`: names of the entries of `params` to be identified, or paths to parts of them, `"arm.length"`, `"joints[0]"`.
     - `bounds`: (lower, upper) by name, None for none: `{"b": (0, None)}` keeps b positive. Kept by a change of variables.
     - `priors`: (mean, standard deviation) by name, of what is known beforehand; the experiments need their sigma then.

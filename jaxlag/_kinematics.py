@@ -10,8 +10,10 @@ import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
 
-from ._arguments import call, names
-from ._system import System, Terms, ravel_like, role
+from ._arguments import call, check_function, names
+from ._compiled import is_concrete
+from ._numbers import numbers
+from ._system import System, Terms, flat_like, role
 
 
 def rate(coordinate: Callable) -> Callable:
@@ -33,6 +35,7 @@ def rate(coordinate: Callable) -> Callable:
     jl.rate(front)(0.0, *state, {"a": 1.5})  # ẏ + a φ̇ = 0.5
     ```
     """
+    check_function(coordinate, "`coordinate`")
     return _Rate(coordinate)
 
 
@@ -61,7 +64,11 @@ def virtual_work(coordinate: Callable, effort: Any) -> Callable:
     jl.acceleration(car, {"x": 0.0}, {"x": 0.0}, {"m": 10.0, "r": 0.5, "M0": 20.0}).qddot["x"]  # 4.0
     ```
     """
-    return _VirtualWork(coordinate, effort if callable(effort) else _Constant(_hashable(effort)))
+    check_function(coordinate, "`coordinate`")
+    if not callable(effort):
+        return _VirtualWork(coordinate, _Constant.of(effort))
+    check_function(effort, "`effort`")
+    return _VirtualWork(coordinate, effort)
 
 
 def substitute(system: System, coordinates: Callable) -> System:
@@ -88,6 +95,8 @@ def substitute(system: System, coordinates: Callable) -> System:
     jl.acceleration(pendulum, 0.5, 0.0, {"m": 1.0, "g": 9.81, "l": 2.0}).qddot  # −(g/l) sin φ = −2.35
     ```
     """
+
+    check_function(coordinates, "`coordinates`")
 
     def pulled(slot: str, kind: type) -> dict[str, Callable]:
         terms: Terms = getattr(system, slot)
@@ -132,16 +141,27 @@ class _Rate(_Stated):
     def _names(self):
         return ("t", "q", "qdot", "params")
 
-    def __call__(self, t, q, qdot, params=None):
+    def __call__(self, t=None, q=None, qdot=None, params=None):
+        if t is None and not names(self.coordinate, "t"):
+            t = 0.0
+        for name, value in (("t", t), ("q", q), ("qdot", qdot)):
+            if value is None:
+                raise TypeError(f"a rate must be given t, q and qdot, but `{name}` is missing. Call it `rate(x)(t, q, qdot, params)`.")
         return _moving(self.coordinate, "`coordinate`", t, q, qdot, params)[1]
 
 
 @dataclasses.dataclass(frozen=True)
 class _Constant:
-    value: Any
+    value: Any  # a number, or tuples of them
+
+    @classmethod
+    def of(cls, effort: Any) -> "_Constant":
+        if not is_concrete(effort):
+            raise TypeError("`effort` must be known when it is stated, but is traced. Make it an entry of params: `lambda F: F`.")
+        return cls(_tuples(np.asarray(numbers(effort, "`effort`")).tolist()))
 
     def __call__(self):
-        return jnp.asarray(self.value, float)
+        return np.asarray(self.value)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -153,8 +173,8 @@ class _VirtualWork(_Stated):
         return ("t", "q", "qdot", "params", *_multipliers_of(self.effort))
 
     def __call__(self, t, q, qdot, params, **multipliers):
-        x, pull = jax.vjp(lambda q: call(self.coordinate, "`coordinate`", params, t=t, q=q), q)
-        effort = call(self.effort, "`effort`", params, t=t, q=q, qdot=qdot, **multipliers)
+        x, pull = jax.vjp(lambda q: _vectors(call(self.coordinate, "`coordinate`", params, t=t, q=q)), q)
+        effort = _vectors(call(self.effort, "`effort`", params, t=t, q=q, qdot=qdot, **multipliers))
         need, have = (jax.tree.map(jnp.shape, tree) for tree in (x, effort))
         if need != have:
             raise ValueError(
@@ -175,7 +195,7 @@ class _PulledBack(_Stated):
         return ("t", "q", "qdot", "params", *_multipliers_of(self.function))
 
     def __call__(self, t, q, qdot, params, **multipliers):
-        x, xdot = _moving(self.coordinates, "`coordinates`", t, q, qdot, params)
+        x, xdot = map(_vectors, _moving(self.coordinates, "`coordinates`", t, q, qdot, params))
         return call(self.function, self.spoken, params, t=t, q=x, qdot=xdot, **multipliers)
 
 
@@ -186,7 +206,7 @@ class _PulledPosition(_PulledBack):
         return ("t", "q", "params")
 
     def __call__(self, t, q, params):
-        x = call(self.coordinates, "`coordinates`", params, t=t, q=q)
+        x = _vectors(call(self.coordinates, "`coordinates`", params, t=t, q=q))
         return call(self.function, self.spoken, params, t=t, q=x)
 
 
@@ -195,10 +215,16 @@ class _PulledForce(_PulledBack):
 
     def __call__(self, t, q, qdot, params, **multipliers):
         force = super().__call__(t, q, qdot, params, **multipliers)
-        x, pull = jax.vjp(lambda q: call(self.coordinates, "`coordinates`", params, t=t, q=q), q)
-        zeros = jax.tree.map(jnp.zeros_like, x)
-        return pull(ravel_pytree(zeros)[1](ravel_like(zeros, force)))[0]
+        x, pull = jax.vjp(lambda q: _vectors(call(self.coordinates, "`coordinates`", params, t=t, q=q)), q)
+        return pull(ravel_pytree(x)[1](flat_like(x, self.spoken, force)))[0]
 
 
-def _hashable(effort: Any) -> Any:
-    return tuple(map(_hashable, np.asarray(effort).tolist())) if np.ndim(effort) else float(effort)
+def _vectors(tree: Any) -> Any:
+    """Lists and plain tuples of numbers as vectors: a point (x, 0.0) is one."""
+    is_number = lambda x: isinstance(x, (jax.Array, np.ndarray)) and x.shape == ()
+    is_vector = lambda node: type(node) in (list, tuple) and len(node) > 0 and all(map(is_number, node))
+    return jax.tree.map(lambda node: jnp.stack(node) if is_vector(node) else node, tree, is_leaf=is_vector)
+
+
+def _tuples(lists: Any) -> Any:
+    return tuple(map(_tuples, lists)) if isinstance(lists, list) else lists

@@ -14,6 +14,7 @@ from ._checks import at_state, coordinates
 from ._compiled import is_concrete
 from ._mechanics import constraint_rows, inertia, position_residual, velocity_residual
 from ._multipliers import NO_INERTIA, is_determined, saddle_point
+from ._numbers import count, number
 from ._system import Flat, System
 
 
@@ -35,6 +36,9 @@ class Projection:
     """
 
     iterations: int = 2
+
+    def __post_init__(self):
+        count(self.iterations, "`iterations`", cure="Two suffice nearly always.")
 
     def feedback(self):
         """None: the accelerations stay as they are."""
@@ -66,6 +70,11 @@ class Baumgarte:
 
     alpha: float = 10.0
     beta: float = 10.0
+
+    def __post_init__(self):
+        for name in ("alpha", "beta"):
+            gain = number(getattr(self, name), f"`{name}`", least=0.0, cure="Take some tenths of 1/(time of a step).")
+            object.__setattr__(self, name, float(gain))
 
     def feedback(self):
         """2α ψ + β² g, added to γ."""

@@ -15,6 +15,7 @@ from jax.sharding import Mesh, PartitionSpec
 from jaxtyping import Array, PyTree
 
 from ._checks import checked, coordinates, parameters, sample_times, state
+from ._compiled import jitted
 from ._experiment import is_within
 from ._friction import Regularised, StickSlip
 from ._integrate import simulate, trajectory_of
@@ -111,7 +112,7 @@ def _differing(everything, over):
     return {"params": of_params, **of_starts}
 
 
-@eqx.filter_jit
+@jitted
 def _simulate_many(system, how, steps, own, shared, ts, tolerances):
     first = eqx.combine(jax.tree.map(lambda leaf: leaf[0], own), shared)
     q0, qdot0 = state(first["q0"], first["qdot0"], ("q0", "qdot0"))

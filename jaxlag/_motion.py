@@ -8,12 +8,12 @@ Works are there where they were asked for, the last four where D has kinks.
 import dataclasses
 from typing import Any, NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, PyTree
 
+from ._compiled import jitted
 from ._friction import (
     Mode,
     Regularised,
@@ -184,7 +184,7 @@ class Equations:
         return Sample(*unraveled, named, rubbing, counts)
 
 
-@eqx.filter_jit  # so that diffrax's many calls trace it once
+@jitted  # so that diffrax's many calls trace it once
 def _accelerated(equations: Equations, t, y, params):
     q, v, _, sigma, *_ = equations.parts(y)
     _, mode, _ = equations.mode(t, q, v, sigma, params)
@@ -192,7 +192,7 @@ def _accelerated(equations: Equations, t, y, params):
     return scalarised(lambda t, q, v: constrained_acceleration(mode, t, q, v, feedback))(t, q, v)
 
 
-@eqx.filter_jit
+@jitted
 def _rates(equations: Equations, t, y, params):
     q, v, works, sigma, held, transitions, time_stuck = equations.parts(y)
     _, mode, kinks = equations.mode(t, q, v, sigma, params)
@@ -202,7 +202,7 @@ def _rates(equations: Equations, t, y, params):
     return jnp.concatenate([v, qddot, powers, 0 * sigma, 0 * held, 0 * transitions, stuck])
 
 
-@eqx.filter_jit
+@jitted
 def _margins(equations: Equations, t, y, params):
     q, v, _, sigma, held, *_ = equations.parts(y)
     flat, _, kinks = equations.mode(t, q, v, sigma, params)
@@ -211,7 +211,7 @@ def _margins(equations: Equations, t, y, params):
     return jnp.concatenate([jnp.where(held > 0, 1, found.margin), found.bound])
 
 
-@eqx.filter_jit
+@jitted
 def _changed(equations: Equations, t, y, args, ended):
     params, scales = args
     q, v, _, sigma, held, *_ = equations.parts(y)
@@ -233,7 +233,7 @@ def in_other_mode(equations: Equations, kinks: Kinks, y, mode: Mode):
     return jnp.concatenate([q, v, works, mode.sigma, mode.held.astype(y.dtype), transitions + changes, time_stuck])
 
 
-@eqx.filter_jit
+@jitted
 def _kept(equations: Equations, t, y, params):
     q, v, works, sigma, held, *counts = equations.parts(y)
     _, mode, kinks = equations.mode(t, q, v, sigma, params)

@@ -15,7 +15,7 @@ from jaxtyping import PyTree
 from ._arguments import call
 from ._checks import at_state
 from ._compiled import is_concrete
-from ._experiment import Experiment, is_within, start_entries
+from ._experiment import Experiment, is_within, start_entries, with_own
 from ._free import Free
 from ._integrate import simulate
 from ._manifold import consistent_state
@@ -124,7 +124,7 @@ def _ways(system, params, e):
     free = [[i for i in part if any(is_within(entries[i], name) for name in e.unknown)] for part in (range(n), range(n, 2 * n))]
     blocks = [np.eye(2 * n)[:, part] for part in free]
     if system.constraints and any(free):
-        every = {**params, **e.params}
+        every = with_own(params, e.params)
         q, qdot = consistent_state(system, e.q0, e.qdot0, every, t=e.ts[0])
         for k, rows in enumerate(at_state(_rows, system, q, qdot, every, e.ts[0])):
             at = np.array(free[k], int) - k * n
@@ -180,7 +180,7 @@ class Model(eqx.Module):
     def predicted(self, params, e: Stack, z) -> tuple[PyTree, Trajectory]:
         """What the sensors of one experiment should see, and the motion itself."""
         q0, qdot0, own = e.started(z)
-        params = {**params, **own}
+        params = with_own(params, own)
         ts = e.ts
         if e.delay is not None:
             delay = call(e.delay, "`delay`", params) if callable(e.delay) else e.delay

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import PyTree
 
 from ._compiled import compiled
-from ._experiment import Experiment, measured
+from ._experiment import Experiment, measured, with_own
 from ._fit import plus_minus
 from ._free import Free
 from ._kinks import kinks_of
@@ -129,7 +129,7 @@ class _Equations(eqx.Module):
     def along(cls, system, e, params):
         motion = smooth(e, params, between=True)
         ts = jnp.asarray(motion.ts)
-        every = {**params, **e.params}
+        every = with_own(params, e.params)
         flat = bind(system, e.q0, every)
         used = np.abs(np.linspace(-1, 1, ts.size)) <= 1 - 2 * ENDS
         point = tuple(jnp.asarray(x) for x in (motion.q[0], motion.v[0]))
@@ -143,7 +143,7 @@ class _Equations(eqx.Module):
 
     def rows(self, params, t, q, v, a):
         """P (M q̈ − f), g and a."""
-        flat = bind(self.system, self.like, {**params, **self.own})
+        flat = bind(self.system, self.like, with_own(params, self.own))
         M, inertial = inertia(flat, t, q, v)
         _, G, _ = constraint_rows(flat, t, q, v)
         force = lambda multipliers: M.mv(a) - inertial - applied_force(flat, t, q, v, multipliers)

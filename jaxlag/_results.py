@@ -15,6 +15,7 @@ class RESULTS(dfx.RESULTS):  # pyright: ignore
     """Why a motion ended: the reasons of diffrax, and those of mechanics."""
 
     not_finite = "`q0`, `qdot0`, `ts` and `params` must be finite, but there is a NaN or an infinity among them. Look for missing values."
+    unordered = "`ts` must increase, but a time is smaller than the one before it. Sort the times, and what was measured along with them."
     no_inertia = NO_INERTIA
     impossible_start = IMPOSSIBLE
     negative_bound = "`dissipation` must have bounds of friction that are not negative, but one is. Take `jnp.abs` of a normal force."
@@ -28,7 +29,7 @@ class RESULTS(dfx.RESULTS):  # pyright: ignore
     )
 
 
-OF_THE_INPUT = (RESULTS.not_finite, RESULTS.no_inertia, RESULTS.impossible_start, RESULTS.negative_bound)
+OF_THE_INPUT = (RESULTS.not_finite, RESULTS.unordered, RESULTS.no_inertia, RESULTS.impossible_start, RESULTS.negative_bound)
 
 
 def reason_of(result: Any) -> str:

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
 
-from ._experiment import Experiment
+from ._experiment import Experiment, with_own
 from ._least_squares import INTERRUPTED, MAX_STEPS, Outcome, levenberg_marquardt
 from ._manifold import consistent_state
 from ._problem import Links, Problem, linearise
@@ -77,7 +77,7 @@ def _piece(problem, e, motion, a, b):
         _, unravel = ravel_pytree((e.q0, e.qdot0))
         q0, qdot0 = unravel(jnp.asarray(np.concatenate([motion.q[a], motion.v[a]])))
         if problem.model.system.constraints:
-            q0, qdot0 = consistent_state(problem.model.system, q0, qdot0, {**problem.free.params, **e.params}, t=e.ts[a])
+            q0, qdot0 = consistent_state(problem.model.system, q0, qdot0, with_own(problem.free.params, e.params), t=e.ts[a])
     if a:
         unknown = ("q0", "qdot0")
     return Experiment(

@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Array, Float, PyTree
 
 from ._compiled import is_concrete
+from ._numbers import numbers
 
 KINDS = ("hold", "linear", "cubic")
 
@@ -61,7 +62,7 @@ class Signal(eqx.Module):
     def __init__(self, ts: Any, values: Any, kind: str = "hold"):
         if kind not in KINDS:
             raise ValueError(f"`kind` must be one of {', '.join(map(repr, KINDS))}, but is {kind!r}. Take 'hold' if in doubt.")
-        self.ts, self.values, self.bends, self.kind = _real(ts, "ts"), _real(values, "values"), None, kind
+        self.ts, self.values, self.bends, self.kind = numbers(ts, "`ts`"), numbers(values, "`values`"), None, kind
         _check(self.ts, self.values)
 
     def __call__(self, t: Any) -> Float[Array, "..."]:
@@ -143,21 +144,6 @@ class _Delayed(eqx.Module):
 def is_signal(node: Any) -> bool:
     """Whether a node of a pytree is a `Signal`."""
     return isinstance(node, Signal)
-
-
-def _real(given: Any, name: str) -> Array:
-    """`given` as a floating array; what is masked is missing."""
-    if isinstance(given, np.ma.MaskedArray):
-        given = np.ma.filled(given.astype(float), np.nan)
-    try:
-        array = jnp.asarray(given)
-    except (TypeError, ValueError):
-        raise TypeError(
-            f"`{name}` must be an array of real numbers, but is a {type(given).__name__} that is none. Hand over rows of equal length."
-        ) from None
-    if array.dtype == bool or jnp.iscomplexobj(array):
-        raise TypeError(f"`{name}` must be real, but has dtype {array.dtype}. Hand over floating-point numbers.")
-    return array if jnp.issubdtype(array.dtype, jnp.floating) else array.astype(float)
 
 
 def _check(ts, values):

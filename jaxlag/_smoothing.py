@@ -2,14 +2,14 @@
 
 from typing import Any, NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
 
 from ._arguments import call
-from ._experiment import Experiment, is_within, start_entries
+from ._compiled import jitted
+from ._experiment import Experiment, is_within, start_entries, with_own
 
 DEGREE = 5  # accelerations are twice differentiable
 GROWTH = 1.4  # from one number of pieces to the next that is tried
@@ -39,7 +39,7 @@ def smooth(experiment: Experiment, params: Any, *, between: bool = False) -> Smo
         raise ValueError("`delay` must be none where the motion is read off the measurements, but there is one. Shift `ts` by it.")
     ts = np.asarray(e.ts)
     at = (ts[1:] + ts[:-1]) / 2 if between else ts
-    seen = _Sensors(e, {**params, **e.params})
+    seen = _Sensors(e, with_own(params, e.params))
     measured = int(np.sum(np.isfinite(seen.measured)))
     best, most = None, max(4, min(len(ts) // 2, measured // (2 * seen.n), 600))
     pieces = 4.0
@@ -76,7 +76,7 @@ class _Sensors:
             return ravel_pytree(call(e.observe, "`observe`", params, t=t, q=q, qdot=v, qddot=a, multipliers=nothing))[0]
 
         both = lambda t, x: (channels(t, x), jax.jacfwd(channels, argnums=1)(t, x))
-        self.of_motion = eqx.filter_jit(jax.vmap(both))
+        self.of_motion = jitted(jax.vmap(both))
 
 
 class _Unseen(dict):

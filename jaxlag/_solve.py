@@ -12,9 +12,11 @@ import numpy as np
 from jaxtyping import Array, Bool
 
 from ._compiled import is_concrete
+from ._friction import Regularised, StickSlip
 from ._kernel import in_one_kernel
-from ._manifold import nearest_state
+from ._manifold import Baumgarte, NoStabilisation, Projection, nearest_state
 from ._motion import Equations
+from ._numbers import count, number
 from ._progress import Bar
 from ._results import OF_THE_INPUT, RESULTS, reason_of
 from ._runge_kutta import Dop853, is_explicit
@@ -37,7 +39,21 @@ class How(eqx.Module):
 
     @classmethod
     def of(cls, solver, *rest) -> "How":
-        return cls(solver or Dop853(), *rest)
+        how = cls(Dop853() if solver is None else solver, *rest)
+        _check_kinds(how)
+        return how
+
+
+def _check_kinds(how: How) -> None:
+    for name, kinds, cure in (
+        ("solver", (dfx.AbstractSolver,), "`jaxlag.Dop853()` or `diffrax.Kvaerno5()`"),
+        ("stabilisation", (Projection, Baumgarte, NoStabilisation), "`Projection()`, `Baumgarte()` or `NoStabilisation()`"),
+        ("friction", (StickSlip, Regularised), "`StickSlip()` or `Regularised(width)`"),
+        ("adjoint", (dfx.AbstractAdjoint, type(None)), "`diffrax.RecursiveCheckpointAdjoint()`, or leave it out"),
+    ):
+        if not isinstance(given := getattr(how, name), kinds):
+            raise TypeError(f"`{name}` must be an object that makes the choice, but is {given!r}. Take e.g. {cure}.")
+    count(how.max_steps, "`max_steps`", cure="The default is 100_000.")
 
 
 def tolerances_of(rtol, atol, dtype) -> tuple[Array, Array]:
@@ -46,7 +62,8 @@ def tolerances_of(rtol, atol, dtype) -> tuple[Array, Array]:
     if single:
         _warn_of_single_precision()
     defaults = (1e-4, 1e-6) if single else (1e-8, 1e-10)
-    rtol, atol = (jnp.asarray(default if given is None else given, dtype) for given, default in zip((rtol, atol), defaults, strict=True))
+    rtol = number(defaults[0] if rtol is None else rtol, "`rtol`", dtype, least=0.0, cure=f"The default is {defaults[0]:g}.")
+    atol = number(defaults[1] if atol is None else atol, "`atol`", dtype, positive=True, cure=f"The default is {defaults[1]:g}.")
     return rtol, atol
 
 
@@ -84,7 +101,8 @@ def begun(equations: Equations, t0, q, v, params) -> Begun:
 def judged(ys, result, obstacles, inputs) -> tuple[Array, RESULTS]:
     """States that were not reached as NaN; and the reason that the motion ended, the start or the input included."""
     finite = jnp.all(jnp.array([jnp.all(jnp.isfinite(x)) for x in jax.tree.leaves(inputs) if eqx.is_inexact_array(x)]))
-    obstacles = (*obstacles, (finite, RESULTS.not_finite))
+    ordered = jnp.all(jnp.diff(inputs[-1]) >= 0)  # the times; traced ones may repeat the first or the last, as filling up does
+    obstacles = (*obstacles, (ordered, RESULTS.unordered), (finite, RESULTS.not_finite))
     for passed, reason in obstacles:
         result = RESULTS.where(passed, result, reason)
     started = jnp.all(jnp.stack([passed for passed, _ in obstacles]))
@@ -108,7 +126,7 @@ def states_at(equations: Any, how: How, adjoint: dfx.AbstractAdjoint, t0, y0, ts
         solver = StickSlipSolver(how.solver, kept, 2 * equations.size, behind, equations)
     elif kept is not None or behind is not None or how.audit:
         solver = Kept(how.solver, kept, 2 * equations.size, behind)
-    solution = dfx.diffeqsolve(
+    solution = dfx.diffeqsolve.__wrapped__(  # all is within a program already, and `equinox.filter_jit` would keep what it is given
         dfx.ODETerm(alone(equations.rates)),
         solver,
         t0,

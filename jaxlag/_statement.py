@@ -39,7 +39,8 @@ class Named(NamedTuple):
 
 def named(tree: PyTree, bare: str, positive: Collection[str] = ()) -> Named:
     """Symbols for a tree of numbers or of names: a string for a number, a list of strings for a vector, a set for a mapping of numbers."""
-    opened = jax.tree.map(lambda node: {name: name for name in node} if isinstance(node, (set, frozenset)) else node, tree)
+    mapping = lambda node: {name: name for name in node} if isinstance(node, (set, frozenset)) else dict(node)
+    opened = jax.tree.map(lambda node: mapping(node) if isinstance(node, (set, frozenset, Mapping)) else node, tree)
     is_leaf = lambda node: _is_names(node) or (bare == "q" and is_vector(node))  # in params, a list is a pytree
     leaves, structure = jax.tree_util.tree_flatten_with_path(opened, is_leaf=is_leaf)
     parts = [_named_leaf(jax.tree_util.keystr(path), _name(path, bare), leaf, bare == "q", positive) for path, leaf in leaves]

@@ -12,6 +12,7 @@ import numpy as np
 from equinox.internal import prevbefore
 from jaxtyping import Array, Float
 
+from ._compiled import jitted
 from ._friction import norms, settle, slip_of
 from ._motion import Equations, in_other_mode
 from ._power import energy_turnover
@@ -248,7 +249,7 @@ class StickSlipSolver(Kept):
         y, possible, ready = self.equations.changed(turn.cut, turn.first.y, args, which)
         return turn._replace(y_new=y, possible=possible, usable=turn.usable & ready)
 
-    @eqx.filter_jit
+    @jitted
     def _looked(self, t0, t1, dense, args, exactly):
         """What is seen of the margins along a step, on its dense output."""
         t0, t1, dense, args = jax.lax.stop_gradient((t0, t1, dense, args))
@@ -257,7 +258,7 @@ class StickSlipSolver(Kept):
         return first_end(margins, path.evaluate, t0, t1, self.equations.elements, args[1], exactly)
 
 
-@eqx.filter_jit
+@jitted
 def behind_a_jump(equations: Equations, t, y, args):
     """y behind a jump of an input at t, and whether a mode of friction agrees with its forces.
 

@@ -10,7 +10,7 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, PyTree
 
-from ._arguments import call, names
+from ._arguments import call, check_function, names, told
 from ._pickling import portable, restored
 
 Terms = tuple[tuple[str, Callable], ...]
@@ -35,14 +35,16 @@ class System:
 
     - `lagrangian`: L(t, q, q̇), a real scalar.
     - `dissipation`: D(t, q, q̇), a real scalar; the generalized force is −∂D/∂q̇.
-    - `force`: Q(t, q, q̇), shaped like q; where q is a mapping, coordinates may be left out.
+    - `force`: Q(t, q, q̇), shaped like q, with lists for vectors if you like; where q is a mapping, coordinates may be left out.
     - `holonomic`: g(t, q), any array or pytree of arrays, kept at zero.
     - `nonholonomic`: a(t, q, q̇), affine in q̇, kept at zero.
     - `one_sided`: names of holonomic constraints that push and never pull, as a table does: g ≥ 0 and λ ≥ 0, for λ > 0 pushes along +∇g.
       The motion is computed with g = 0 kept all the same; but where λ < 0 the contact would have opened, and `Trajectory.pulling()`,
       its card, `examine` and `plot.forces` say so.
 
-    Any consistent set of units. A system is immutable, hashable and compared by its functions.
+    Any consistent set of units. What a function returns may be plain numbers, integers or lists: it becomes floating arrays. A system
+    is immutable, hashable and compared by its functions: state it once, for one made anew from new functions is compiled anew. What
+    was compiled for it, and what its functions hold, stays until `jax.clear_caches()`.
 
     **Raises:** `TypeError` where a slot holds no function; `ValueError` where two terms share a name, or `one_sided` names no holonomic
     constraint.
@@ -138,13 +140,7 @@ def _terms(slot: str, given: Any) -> Terms:
                 f"`{slot}` must be a function or a mapping from names to functions, but it holds {function!r} under {name!r}. "
                 "Hand over the function itself, not its value."
             )
-        try:
-            hash(function)
-        except TypeError:
-            raise TypeError(
-                f"`{slot}` must hold hashable functions, but {name!r} is a {type(function).__name__} that holds arrays. "
-                "Put its arrays into params and let the function name them."
-            ) from None
+        check_function(function, role(slot, name))
     return terms
 
 
@@ -182,8 +178,8 @@ def bind(system: System, like: PyTree, params: PyTree) -> Flat:
         return call(function, role(slot, name), params, **state)
 
     def lagrangian(t, q, v):
-        total = sum((value("lagrangian", term, t, q, v) for term in system.lagrangian), start=jnp.zeros((), q.dtype))
-        return jnp.asarray(total, q.dtype)
+        terms = (jnp.asarray(value("lagrangian", term, t, q, v), q.dtype) for term in system.lagrangian)
+        return sum(terms, start=jnp.zeros((), q.dtype))
 
     def dissipation(term):
         def potential(t, q, v, multipliers):
@@ -197,9 +193,13 @@ def bind(system: System, like: PyTree, params: PyTree) -> Flat:
 
     def force(term):
         def generalized(t, q, v, multipliers):
-            return ravel_like(zeros, value("force", term, t, q, v, multipliers=unravel_multipliers(multipliers)))
+            force = value("force", term, t, q, v, multipliers=unravel_multipliers(multipliers))
+            return flat_like(zeros, role("force", term[0]), force)
 
         return generalized
+
+    def position(at, t, q):
+        return jax.tree.map(lambda x: jnp.asarray(x, q.dtype), call(at, "a position map", params, t=t, q=unravel(q)))
 
     one = jnp.zeros((), zero.dtype)
     shapes = [
@@ -218,7 +218,7 @@ def bind(system: System, like: PyTree, params: PyTree) -> Flat:
         forces={term[0]: force(term) for term in system.force},
         holonomic=lambda t, q: vector("holonomic", t, q, None),
         nonholonomic=lambda t, q, v: vector("nonholonomic", t, q, v),
-        position=lambda at, t, q: call(at, "a position map", params, t=t, q=unravel(q)),
+        position=position,
         unravel=unravel,
         unravel_multipliers=unravel_multipliers,
         needs_multipliers=any(names(function, "multipliers") for _, function in (*system.dissipation, *system.force)),
@@ -228,13 +228,49 @@ def bind(system: System, like: PyTree, params: PyTree) -> Flat:
     )
 
 
-def ravel_like(zeros: PyTree, partial: PyTree) -> Float[Array, " n"]:
-    """`partial`, which may leave out coordinates, as a flat vector in the order of `zeros`; raises KeyError on others."""
-    given = dict(jax.tree_util.tree_flatten_with_path(partial)[0])
-    leaves = [jnp.asarray(given.pop(path, zero), zero.dtype) for path, zero in jax.tree_util.tree_flatten_with_path(zeros)[0]]
-    for path in given:
-        raise KeyError(jax.tree_util.keystr(path))
-    return ravel_pytree(leaves)[0]
+def flat_like(like: PyTree, spoken: str, given: PyTree) -> Float[Array, " n"]:
+    """What a force returned, as a flat vector in the order of the coordinates `like`.
+
+    Entries of mappings may be left out, lists stand for arrays, and a plain 0 for zeros of any shape.
+    """
+    parts = jax.tree_util.tree_flatten_with_path(given)[0]
+    places = jax.tree_util.tree_flatten_with_path(like)[0]
+    for path, _ in parts:
+        if not any(path[: len(place)] == place for place, _ in places):
+            at = jax.tree_util.keystr(path) or "without a name"
+            raise ValueError(f"{spoken} must be shaped like q, but returned an entry {at} that q has not. {SHAPED}")
+    return jnp.concatenate([_part(place, leaf, parts, spoken) for place, leaf in places])
+
+
+SHAPED = "Return one entry for each coordinate; where q is a mapping, coordinates without a force may be left out."
+
+
+def _part(place, coordinate, parts, spoken):
+    """The force on one array of coordinates, flat."""
+    spoken_part, shape = f"{spoken}{jax.tree_util.keystr(place)}", coordinate.shape
+    own = [(path[len(place) :], x) for path, x in parts if path[: len(place)] == place]
+    if not own:
+        known = max((_common(place, path) for path, _ in parts), default=0)
+        if not (known < len(place) and isinstance(place[known], jax.tree_util.DictKey)):
+            raise ValueError(f"{spoken_part} must be real and of shape {shape}, but nothing was returned. {SHAPED}")
+        return jnp.zeros(coordinate.size, coordinate.dtype)
+    flat = []
+    for path, x in own:
+        rest = shape[len(path) :]
+        in_list = len(path) <= len(shape) and all(isinstance(key, jax.tree_util.SequenceKey) for key in path)
+        is_zero = isinstance(x, np.ndarray) and x.shape == () and x == 0  # a plain one
+        if not in_list or (x.shape != rest and not is_zero):
+            of = f" of {len(own)} entries with" if path else ""
+            raise ValueError(f"{spoken_part} must be real and of shape {shape}, but is{of} {told(x)}. {SHAPED}")
+        flat.append(jnp.ravel(jnp.broadcast_to(jnp.asarray(x, coordinate.dtype), rest)))
+    if sum(x.size for x in flat) != coordinate.size:
+        raise ValueError(f"{spoken_part} must be real and of shape {shape}, but has {len(own)} entries. {SHAPED}")
+    return jnp.concatenate(flat)
+
+
+def _common(one: tuple, other: tuple) -> int:
+    """How many keys two paths have in common."""
+    return next((i for i, pair in enumerate(zip(one, other, strict=False)) if pair[0] != pair[1]), min(len(one), len(other)))
 
 
 def rows_by_name(flat: Flat) -> dict[str, np.ndarray]:

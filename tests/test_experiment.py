@@ -1,5 +1,10 @@
 """Experiments as they come from a laboratory: gaps, tables, and data that cannot be right."""
 
+import dataclasses
+import datetime
+from typing import Any, NamedTuple
+
+import equinox as eqx
 import numpy as np
 import oscillator as osc
 import pytest
@@ -21,7 +26,28 @@ BAD = {
     "a channel of another length": (lambda: experiment(values={"x": X[:3]}), "`values['x']` must have one row for each of the 5 times"),
     "a channel without a sample": (lambda: experiment(values={"x": X, "y": X * np.nan}), "every sample of a channel is missing"),
     "an infinite sample": (lambda: experiment(values=np.where(T == 0.5, np.inf, X)), "Mark missing samples by NaN"),
-    "complex samples": (lambda: experiment(values=X * 1j), "must be an array of real numbers"),
+    "complex samples": (lambda: experiment(values=X * 1j), "`values` must be real, but has dtype complex128"),
+    "text for samples": (
+        lambda: experiment(values=X.astype(str)),
+        "`values` must be an array of real numbers, but is a ndarray that is text",
+    ),
+    "truth values for samples": (lambda: experiment(values=X > 0), "`values` must be real, but has dtype bool"),
+    "dates": (
+        lambda: experiment(ts=np.arange(5).astype("datetime64[s]")),
+        "`ts` must be an array of real numbers, but is a ndarray that is a date",
+    ),
+    "durations": (lambda: experiment(ts=np.arange(5).astype("timedelta64[s]")), "`ts` must be an array of real numbers"),
+    "dates of Python": (lambda: experiment(ts=[datetime.datetime(2024, 1, 1, 0, 0, i) for i in range(5)]), "(times - times[0])"),
+    "times as text": (
+        lambda: experiment(ts=["0", "1", "2", "3", "4"]),
+        "`ts` must be an array of real numbers, but is a list that is text",
+    ),
+    "an infinite sigma": (lambda: experiment(sigma=np.inf), "`sigma` must be positive and finite"),
+    "a sigma that is NaN": (lambda: experiment(sigma=np.nan), "`sigma` must be positive and finite"),
+    "a sigma of text": (lambda: experiment(sigma="0.1"), "`sigma` must be an array of real numbers, but is a str"),
+    "a sigma of truth": (lambda: experiment(sigma={"x": True}, values={"x": X}, observe=lambda q: {"x": q}), "`sigma['x']` must be real"),
+    "a delay that is NaN": (lambda: experiment(delay=np.nan), "`delay` must be finite, but is nan"),
+    "an observe that changes": (lambda: experiment(observe=Sensor(2.0)), "`observe` must be a hashable function, but is a Sensor"),
     "one number for a channel": (lambda: experiment(values=3.0), "must be an array of real numbers"),
     "a sigma of zero": (lambda: experiment(sigma=0.0), "`sigma` must be positive"),
     "a negative sigma at one sample": (lambda: experiment(sigma=[1.0, 1.0, -1.0, 1.0, 1.0]), "`sigma` must be positive"),
@@ -32,6 +58,14 @@ BAD = {
     "q0 and qdot0 that differ": (lambda: jl.Experiment(T, X, {"x": 1.0}, 0.0), "`qdot0` must be structured like `q0`"),
     "an unknown column": (lambda: jl.Experiment.from_dataframe(Frame(t=T, x=X), 1.0, 0.0, time="s"), "must have a column 's'"),
 }
+
+
+@dataclasses.dataclass
+class Sensor:
+    gain: float
+
+    def __call__(self, q):
+        return self.gain * q
 
 
 class Frame(dict):
@@ -81,7 +115,13 @@ BAD_FITS = {
     "a prior without spread": (lambda: fit(priors={"c": (4.0, 0.0)}), "`priors` of 'c' must have a positive standard deviation"),
     "no experiment": (lambda: fit(experiments=[]), "`experiments` must be an `Experiment` or a list of them"),
     "a plan": (lambda: fit(experiments=jl.Experiment(T, None, 1.0, 0.0)), "must have been measured, but number 0 has no values"),
-    "params that are no mapping": (lambda: fit(params=[1.0]), "params"),
+    "params without names": (lambda: fit(params=[1.0]), "`free` must name entries of params, but holds 'c'. There are 0."),
+    "params that are a number": (lambda: fit(params=1.0), "`params` must have entries that `free` can name, but is a float"),
+    "no params": (lambda: fit(params=None), "`params` must have entries that `free` can name, but is a NoneType"),
+    "params of its own over no mapping": (
+        lambda: jl.fit(BY_FIELD, experiment(params={"c": 4.0}), Oscillator(3.0, Damper(0.2)), free=("c",)),
+        "`params` must be a mapping where an experiment has params of its own to be put over them, but is a Oscillator",
+    ),
     "an integer to be fitted": (lambda: fit(params=osc.START | {"c": np.array(3)}), "must name real numbers, but 'c' holds none"),
     "sensors that see something else": (
         lambda: fit(observe=lambda q: {"y": q}),
@@ -89,6 +129,26 @@ BAD_FITS = {
     ),
     "sensors of another shape": (lambda: fit(observe=lambda q: {"x": q * np.ones(2)}), "must return real numbers of shape ()"),
 }
+
+
+class Damper(eqx.Module):
+    b: Any
+    kind: str = eqx.field(static=True, default="oil")
+
+
+class Oscillator(NamedTuple):
+    c: Any
+    damper: Any
+
+
+class Machine(eqx.Module):
+    c: Any
+    damper: Damper
+
+
+BY_FIELD = jl.System(
+    lambda q, qdot, params: 0.5 * qdot**2 - 0.5 * params.c * q**2, dissipation=lambda qdot, params: 0.5 * params.damper.b * qdot**2
+)
 
 
 def fit(experiments=None, params=osc.START, free=FREE, observe=lambda q: {"x": q}, **more):
@@ -131,3 +191,23 @@ def test_times_are_irregular_and_samples_missing():
     found = jl.fit(osc.SYSTEM, jl.Experiment(ts, values, 1.0, 0.0), osc.START, free=FREE)
     np.testing.assert_allclose([found.estimates[name] for name in FREE], [4.0, 0.3], rtol=1e-6)
     assert found.measurements == 40
+
+
+@pytest.mark.parametrize("kind", [Oscillator, Machine])
+def test_params_that_are_no_mapping_are_named_by_their_fields(kind):
+    """From starts far off, with the names `c` and `damper.b`; the same kind comes back, and all that a fit tells of."""
+    ts = np.linspace(0, 5, 40)
+    record = jl.Experiment(ts, osc.position(ts), 1.0, 0.0)
+    start = kind(3.0, Damper(0.1))
+    found = jl.fit(BY_FIELD, record, start, free=("c", "damper.b"), bounds={"damper.b": (0, 1)})
+    assert isinstance(found.params, kind) and found.params.damper.kind == "oil" and found.names == ("c", "damper.b")
+    np.testing.assert_allclose([found.estimates["c"], found.params.damper.b], [4.0, 0.3], rtol=1e-6)
+    np.testing.assert_allclose(found.predict(record).values, record.values, atol=1e-6)
+    if kind is Machine:
+        rough = jl.regress(BY_FIELD, record, kind(np.nan, Damper(np.nan)), free=("c", "damper"))
+        np.testing.assert_allclose([rough.params.c, rough.estimates["damper"].b], [4.0, 0.3], rtol=1e-2)
+
+
+def test_masked_samples_are_missing():
+    masked = np.ma.masked_array(X, [0, 0, 1, 0, 0])
+    np.testing.assert_array_equal(experiment(values=masked).values, np.where(np.arange(5) == 2, np.nan, X))
