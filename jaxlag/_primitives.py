@@ -5,7 +5,7 @@ Each rule takes the reader (`_entries`), the equation and its operands, and give
 
 import functools
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import jax
@@ -14,6 +14,7 @@ from jax import lax
 from jax.extend import core
 
 from ._folding import Arrays, Entry, Folding, objects
+from ._numbers import folded
 
 RULES: dict[str, Callable] = {}
 
@@ -51,10 +52,9 @@ def _broadcast(p, x):
 def _padded(p, x, value):
     low, high, inner = np.array(p["padding_config"], int).reshape(-1, 3).T
     out = np.broadcast_to(value, low + high + x.shape + inner * np.maximum(np.array(x.shape, int) - 1, 0)).copy()
-    for at in np.ndindex(x.shape):
-        place = low + at * (1 + inner)
-        if (place >= 0).all() and (place < out.shape).all():
-            out[tuple(place)] = x[at]
+    places = [first + np.arange(n) * (1 + step) for first, n, step in zip(low, x.shape, inner, strict=True)]
+    kept = [(place >= 0) & (place < n) for place, n in zip(places, out.shape, strict=True)]
+    out[np.ix_(*[place[keep] for place, keep in zip(places, kept, strict=True)])] = x[np.ix_(*kept)]
     return out
 
 
@@ -84,9 +84,9 @@ def _converted(reader, equation, x):
     def convert(x):
         if isinstance(x, Entry):
             return x if x.dtype == dtype else reader.entry(equation.primitive, equation.params, dtype, x)
-        return x.astype(dtype)
+        return folded(equation.primitive, equation.params, dtype, x)
 
-    return convert(x) if x.dtype != object else each(convert, x)
+    return np.asarray(convert(x)) if x.dtype != object else each(convert, x)
 
 
 @_rule("integer_pow", "square")
@@ -94,48 +94,74 @@ def _power(reader, equation, x):
     return each(functools.partial(reader.power, n=equation.params.get("y", 2)), x)
 
 
-def _reducing(name: str, primitive: core.Primitive, neutral: Any = None) -> None:
+def _at_once(reader, function: Callable, *arrays: np.ndarray) -> np.ndarray | None:
+    """A function of numbers; None where an entry is among them, or the algebra would have what comes out as an entry."""
+    if any(x.dtype == object for x in arrays):
+        return None
+    result = np.asarray(function(*arrays))
+    return result if np.all(reader.algebra.folds(result)) else None
+
+
+def _reducing(name: str, primitive: core.Primitive, ufunc: np.ufunc) -> None:
     def combining(reader, equation):
         return np.frompyfunc(functools.partial(reader.apply, primitive, {}, equation.outvars[0].aval.dtype), 2, 1)
 
     @_rule(f"reduce_{name}")
     def reduced(reader, equation, x):
+        axes = tuple(equation.params["axes"])
+        if (x.size == 0 and ufunc.identity is None) or _has_ties(reader, equation, x, math.prod(x.shape[axis] for axis in axes)):
+            return NotImplemented
+        numbers = _at_once(reader, lambda x: ufunc.reduce(x, axis=axes, dtype=x.dtype), x)
+        if numbers is not None:
+            return numbers
         combine, x = combining(reader, equation), objects(x)
-        if x.size == 0:
-            aval = equation.outvars[0].aval
-            return NotImplemented if neutral is None else np.full(aval.shape, neutral, aval.dtype)
-        for axis in sorted(equation.params["axes"], reverse=True):
+        for axis in sorted(axes, reverse=True):
             x = combine.reduce(x, axis)
         return np.asarray(x, object)
 
     @_rule(f"cum{name}")
     def cumulated(reader, equation, x):
-        turned = functools.partial(np.flip, axis=equation.params["axis"]) if equation.params["reverse"] else lambda x: x
-        return turned(combining(reader, equation).accumulate(turned(objects(x)), equation.params["axis"]))
+        axis = equation.params["axis"]
+        if _has_ties(reader, equation, x, x.shape[axis]):
+            return NotImplemented
+        turned = functools.partial(np.flip, axis=axis) if equation.params["reverse"] else lambda x: x
+        numbers = _at_once(reader, lambda x: turned(ufunc.accumulate(turned(x), axis, dtype=x.dtype)), x)
+        return turned(combining(reader, equation).accumulate(turned(objects(x)), axis)) if numbers is None else numbers
 
 
-_reducing("sum", lax.add_p, 0)
-_reducing("prod", lax.mul_p, 1)
-_reducing("and", lax.and_p, True)
-_reducing("or", lax.or_p, False)
-_reducing("max", lax.max_p)
-_reducing("min", lax.min_p)
+def _has_ties(reader, equation, x, several: int) -> bool:
+    """Whether the derivative depends on how the largest of several is taken: of three that are equal each has a third of it."""
+    extremal = equation.primitive.name.endswith(("max", "min"))
+    return extremal and several > 2 and x.dtype == object and reader.algebra.block(equation) is not None
+
+
+_reducing("sum", lax.add_p, np.add)
+_reducing("prod", lax.mul_p, np.multiply)
+_reducing("and", lax.and_p, np.bitwise_and)
+_reducing("or", lax.or_p, np.bitwise_or)
+_reducing("max", lax.max_p, np.maximum)
+_reducing("min", lax.min_p, np.minimum)
 
 
 @_rule("dot_general")
 def _dot(reader, equation, x, y):
-    (x_sum, y_sum), (x_batch, y_batch) = equation.params["dimension_numbers"]
-    aval = equation.outvars[0].aval
-    if any(atom.aval.dtype != aval.dtype for atom in equation.invars):
+    p, aval = equation.params, equation.outvars[0].aval
+    (x_sum, y_sum), (x_batch, y_batch) = p["dimension_numbers"]
+    plain = p["precision"] is None or set(np.ravel(p["precision"])) <= set(lax.Precision)  # type: ignore[arg-type]
+    if not plain or aval.dtype.kind != "f" or any(atom.aval.dtype != aval.dtype for atom in equation.invars):
         return NotImplemented
 
     def rows(array, batch, summed):
         free = [d for d in range(array.ndim) if d not in (*batch, *summed)]
         sizes = [math.prod(array.shape[d] for d in dims) for dims in (batch, free, summed)]
-        return objects(array).transpose(*batch, *free, *summed).reshape(sizes)
+        return array.transpose(*batch, *free, *summed).reshape(sizes)
 
     x, y = rows(x, x_batch, x_sum), rows(y, y_batch, y_sum)
-    products = np.frompyfunc(reader.mul, 2, 1)(x[:, :, None], y[:, None])
+    numbers = _at_once(reader, lambda x, y: x @ y.swapaxes(1, 2), x, y)
+    if numbers is not None:
+        return numbers.reshape(aval.shape)
+    reader.spend(x.size * y.shape[1])
+    products = np.frompyfunc(reader.mul, 2, 1)(objects(x)[:, :, None], objects(y)[:, None])
     if products.size == 0:
         return np.zeros(aval.shape, aval.dtype)
     return np.frompyfunc(reader.add, 2, 1).reduce(products, -1).reshape(aval.shape)
@@ -171,12 +197,13 @@ def _gathered(reader, equation, x, starts):
     return out
 
 
-def _scattering(name: str, method: Callable) -> None:
+def _scattering(name: str, primitive: core.Primitive | None) -> None:
     @_rule(name)
     def scattered(reader, equation, x, starts, updates):
         p, how = equation.params, equation.params["dimension_numbers"]
-        if starts.dtype == object:
-            return NotImplemented
+        if starts.dtype == object or (primitive is None and p["update_jaxpr"] is not None):
+            return NotImplemented  # the latter applies a function to what stands there
+        combine = functools.partial(reader.apply, primitive, {}, equation.outvars[0].aval.dtype)
         x, updates = objects(x).copy(), objects(updates)
         part = np.moveaxis(updates, [d for d in range(updates.ndim) if d not in how.update_window_dims], range(starts.ndim - 1))
         gone = (*how.inserted_window_dims, *how.operand_batching_dims)
@@ -186,13 +213,14 @@ def _scattering(name: str, method: Callable) -> None:
         clip = p["mode"] == lax.GatherScatterMode.CLIP
         for at, window in _windows(starts, x.shape, sizes, how.scatter_dims_to_operand_dims, *batch, clip):
             if window is not None:
-                x[window] = each(functools.partial(method, reader), x[window], part[(*at, ...)].reshape(sizes))
+                update = part[(*at, ...)].reshape(sizes)
+                x[window] = update if primitive is None else each(combine, x[window], update)
         return x
 
 
-_scattering("scatter", lambda reader, old, new: new)
-_scattering("scatter-add", Folding.add)
-_scattering("scatter-mul", Folding.mul)
+_scattering("scatter", None)
+_scattering("scatter-add", lax.add_p)
+_scattering("scatter-mul", lax.mul_p)
 
 
 @_rule("dynamic_slice", "dynamic_update_slice")
@@ -280,14 +308,44 @@ def _linear_solve(reader, equation, *operands):
 
 # Calls and loops.
 
+LONG = 1000  # operations on numbers: some 20 ms in Python, less than a program takes to compile
+
 
 CALLS = ("jit", "pjit", "closed_call", "core_call", "remat", "remat2", "checkpoint")  # equations that call a program and do nothing else
+
+RULED = ("custom_jvp_call", "custom_vjp_call", "custom_vjp_call_jaxpr")  # and those that have a derivative rule of their own
 
 
 def body(equation: Any) -> Any:
     """The program that an equation calls, closed."""
-    program = next(equation.params[name] for name in ("jaxpr", "call_jaxpr", "fun_jaxpr") if name in equation.params)
+    p = equation.params
+    program = p["jaxprs"].solve if "jaxprs" in p else next(p[name] for name in ("jaxpr", "call_jaxpr", "fun_jaxpr") if name in p)
     return program if hasattr(program, "consts") else core.ClosedJaxpr(program, ())
+
+
+def primitives(program: Any) -> Iterator[str]:
+    """The names of all that a program does, also within the programs it calls."""
+    for equation in getattr(program, "jaxpr", program).eqns:
+        yield equation.primitive.name
+        for value in equation.params.values():
+            for part in value if isinstance(value, (tuple, list)) else [value]:
+                if hasattr(part, "eqns") or hasattr(part, "jaxpr"):
+                    yield from primitives(part)
+
+
+def turns(equation: Any) -> int | float:
+    """How many operations a rule here would make of numbers one by one."""
+    name, p = equation.primitive.name, equation.params
+    if name == "while":
+        return math.inf  # as long as it takes
+    if name == "cond":
+        return max(sum(map(turns, branch.jaxpr.eqns)) for branch in p["branches"])
+    if name in (*CALLS, *RULED, "scan", "custom_linear_solve"):
+        return p.get("length", 1) * sum(map(turns, body(equation).jaxpr.eqns))
+    if name in ("cholesky", "lu", "triangular_solve"):
+        return equation.invars[0].aval.size * equation.invars[0].aval.shape[-1]
+    windows = math.prod(equation.invars[1].aval.shape[:-1]) if name.startswith(("gather", "scatter")) else 1
+    return windows + equation.invars[0].aval.size if name.startswith("scatter") else windows
 
 
 @_rule(*CALLS)
@@ -298,7 +356,7 @@ def _called(reader, equation, *operands):
     return reader.inner(body(equation), operands)
 
 
-@_rule("custom_jvp_call", "custom_vjp_call", "custom_vjp_call_jaxpr")
+@_rule(*RULED)
 def _with_rule(reader, equation, *operands):
     """Taken apart, unless the algebra differentiates what is no number: then it stays in one piece, with its rule."""
     results, known = _called(reader, equation, *operands), all(x.dtype != object for x in operands)
@@ -322,7 +380,7 @@ def _while(reader, equation, *operands):
     p = equation.params
     i, j = p["cond_nconsts"], p["cond_nconsts"] + p["body_nconsts"]
     condition, consts, state = operands[:i], operands[i:j], list(operands[j:])
-    while (goes_on := reader.inner(p["cond_jaxpr"], [*condition, *state])[0]).dtype != object:
+    while (goes_on := reader.inner(p["cond_jaxpr"], [*condition, *state])[0]).dtype != object and goes_on.ndim == 0:
         if not goes_on:
             return state
         state = reader.inner(p["body_jaxpr"], [*consts, *state])

@@ -12,8 +12,9 @@ import numpy as np
 from jax import lax
 from jax.extend import core
 
-from ._entries import Reader, evaluate, on_arrays, opened, shaped
+from ._entries import Reader, evaluate, opened, shaped
 from ._folding import Algebra, Arrays, TooLong, UnknownPrimitive, filled, is_number, objects
+from ._numbers import on_arrays
 
 
 class _Jax(Algebra):

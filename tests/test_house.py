@@ -13,6 +13,7 @@ import jaxlag
 
 PACKAGE = pathlib.Path(jaxlag.__file__).parent
 ORDER = [
+    "_numbers",
     "_folding",
     "_primitives",
     "_entries",
