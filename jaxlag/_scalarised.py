@@ -82,12 +82,13 @@ def _together(array: np.ndarray, dtype) -> jax.Array:
 def _free(arrays: Iterable[np.ndarray]) -> tuple[list, Callable[[list], Arrays]]:
     """The scalars of arrays that are no numbers, and the arrays with others in their place."""
     arrays = list(arrays)
-    flat = [x for array in arrays for x in array.flat]
-    places = [i for i, x in enumerate(flat) if not is_number(x)]
+    flat, shapes = [x for array in arrays for x in array.flat], [array.shape for array in arrays]
+    numbers = {i: x for i, x in enumerate(flat) if is_number(x)}  # no others: what is traced would be held for as long as the program is
+    places = [i for i in range(len(flat)) if i not in numbers]
 
     def filled(scalars):
-        every = dict(enumerate(flat)) | dict(zip(places, scalars, strict=True))
-        return shaped([every[i] for i in range(len(flat))], [array.shape for array in arrays])
+        every = numbers | dict(zip(places, scalars, strict=True))
+        return shaped([every[i] for i in range(len(every))], shapes)
 
     return [flat[i] for i in places], filled
 
@@ -117,6 +118,7 @@ def _linear_solve_in_scalars(equation, *arrays):
     """The solution x of A x = b as it was written out; its derivative solves A dx = db − dA x, as `custom_linear_solve` has it."""
     lengths, jaxprs, avals = equation.params["const_lengths"], equation.params["jaxprs"], [v.aval for v in equation.outvars]
     (x, with_x), (given, with_given) = _free(arrays[: len(avals)]), _free(arrays[len(avals) :])
+    is_free = [not is_number(entry) for array in arrays[: len(avals)] for entry in array.flat]
     splits = np.cumsum([0, *lengths])
     joined = lambda arrays: _together(np.concatenate([objects(x).reshape(-1) for x in arrays]), avals[0].dtype)
 
@@ -138,7 +140,6 @@ def _linear_solve_in_scalars(equation, *arrays):
         _, right = jax.jvp(defect, (given,), (tangents[1],))
         symmetric = jaxprs.vecmat is jaxprs.matvec
         dx = lax.custom_linear_solve(function(0, given), right, function(2, given), function(3, given), symmetric=symmetric)
-        is_free = [not is_number(entry) for array in arrays[: len(avals)] for entry in array.flat]
         return x, [entry for entry, free in zip(_apart(dx).flat, is_free, strict=True) if free]
 
     return with_x(solution(x, given))
