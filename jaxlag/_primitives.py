@@ -13,7 +13,7 @@ import numpy as np
 from jax import lax
 from jax.extend import core
 
-from ._folding import Arrays, Entry, Folding, objects
+from ._folding import Arrays, Entry, objects
 from ._numbers import folded
 
 RULES: dict[str, Callable] = {}

@@ -20,7 +20,7 @@ from jaxlag import _scalarised
 from jaxlag._entries import Reader, opened
 from jaxlag._folding import TooLong, UnknownPrimitive, filled
 from jaxlag._numbers import KNOWN, folded
-from jaxlag._primitives import CALLS, RULED, body, primitives
+from jaxlag._primitives import CALLS, RULED, body
 
 SIZE = 3  # of x and of v
 LIMIT = 5000
@@ -110,12 +110,12 @@ class OnNumbers(type(_scalarised.JAX_ALGEBRA)):
         return lambda *numbers: folded(primitive, params, dtype, *numbers)
 
     def block(self, equation):
-        return lambda *arrays: [
-            filled(np.shape(x), np.asarray(x).reshape(-1)[:])
-            for x in once(
-                equation, *(np.array(a.tolist(), v.aval.dtype).reshape(a.shape) for a, v in zip(arrays, equation.invars, strict=True))
-            )
-        ]
+        def whole(*arrays):
+            given = arrays[-len(equation.invars) :]  # a linear solve hands over its solution before them
+            numbers = [np.array(x.tolist(), atom.aval.dtype).reshape(x.shape) for x, atom in zip(given, equation.invars, strict=True)]
+            return [filled(x.shape, x.reshape(-1)) for x in map(np.asarray, once(equation, *numbers))]
+
+        return whole
 
 
 def rewritten(closed, *operands):
@@ -217,8 +217,11 @@ def chosen(rng, kinds, values):
     same, places = None, []
     for kind, shape in kinds.split(","):
         shapes = {"v": (3,), "m": (2, 3), "q": (3, 3), ".": ()}
-        fits = lambda x: x.dtype == jnp.dtype(DTYPES[kind]) and (  # noqa: B023 - used at once
-            x.shape == shapes[shape] if shape in shapes else shape == "a" or x.shape == (same if same is not None else x.shape)  # noqa: B023
+        fits = lambda x: (
+            x.dtype == jnp.dtype(DTYPES[kind])
+            and (  # noqa: B023 - used at once
+                x.shape == shapes[shape] if shape in shapes else shape == "a" or x.shape == (same if same is not None else x.shape)  # noqa: B023
+            )
         )
         candidates = [k for k, x in enumerate(values) if fits(x)]
         if not candidates:
@@ -252,12 +255,18 @@ FORMS = {
 }
 
 
+NO_DERIVATIVE = ("not implemented", "rule", "differentiat", "Reverse-mode", "forward-mode", "complex", "float0", "NYI")
+
+
 def traced(function, *arguments):
     """Its program; None where JAX has no derivative of it, or one of a loop that it must know beforehand."""
     try:
         return jax.make_jaxpr(function)(*arguments)
     except (NotImplementedError, TypeError, ValueError) as error:
-        if any(part in str(error) for part in ("not implemented", "rule", "differentiat", "Reverse-mode", "complex", "float0", "forward-mode", "NYI")):
+        if any(
+            part in str(error)
+            for part in ("not implemented", "rule", "differentiat", "Reverse-mode", "complex", "float0", "forward-mode", "NYI")
+        ):
             return None
         raise
 
