@@ -14,6 +14,7 @@ import jax
 import numpy as np
 from jax.extend import core
 
+from . import _elimination as _elimination  # its rules
 from ._folding import Algebra, Arrays, Entry, Folding, TooLong, UnknownPrimitive, filled, is_number, objects
 from ._numbers import ELEMENTWISE, by_jax, folded, is_extended, is_known
 from ._numbers import on_arrays as on_arrays

@@ -24,7 +24,7 @@ def is_extended(atom: Any) -> bool:
 def folded(primitive: core.Primitive, params: dict, dtype: Any, *numbers: Any) -> Any:
     """An element-wise primitive of numbers, as JAX computes it."""
     function = ELEMENTWISE.get(primitive.name)
-    result = converted(*numbers, dtype) if primitive.name == "convert_element_type" else function(*numbers) if function else None
+    result = converted(numbers[0], dtype) if primitive.name == "convert_element_type" else function(*numbers) if function else None
     if result is None:
         with jax.ensure_compile_time_eval():
             return np.asarray(primitive.bind(*numbers, **params))[()]

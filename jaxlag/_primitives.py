@@ -29,10 +29,12 @@ def each(function: Callable, *arrays: np.ndarray) -> np.ndarray:
     return np.asarray(np.frompyfunc(function, len(arrays), 1)(*map(objects, arrays)), object)
 
 
-def _rule(*names: str) -> Callable:
-    def register(rule: Callable) -> Callable:
-        RULES.update(dict.fromkeys(names, rule))
-        return rule
+def rule(*names: str) -> Callable:
+    """Registers a function as the rule of these primitives."""
+
+    def register(function: Callable) -> Callable:
+        RULES.update(dict.fromkeys(names, function))
+        return function
 
     return register
 
@@ -77,7 +79,7 @@ _moving(
 )
 
 
-@_rule("convert_element_type")
+@rule("convert_element_type")
 def _converted(reader, equation, x):
     dtype = equation.params["new_dtype"]
 
@@ -89,7 +91,7 @@ def _converted(reader, equation, x):
     return np.asarray(convert(x)) if x.dtype != object else each(convert, x)
 
 
-@_rule("integer_pow", "square")
+@rule("integer_pow", "square")
 def _power(reader, equation, x):
     return each(functools.partial(reader.power, n=equation.params.get("y", 2)), x)
 
@@ -106,7 +108,7 @@ def _reducing(name: str, primitive: core.Primitive, ufunc: np.ufunc) -> None:
     def combining(reader, equation):
         return np.frompyfunc(functools.partial(reader.apply, primitive, {}, equation.outvars[0].aval.dtype), 2, 1)
 
-    @_rule(f"reduce_{name}")
+    @rule(f"reduce_{name}")
     def reduced(reader, equation, x):
         axes = tuple(equation.params["axes"])
         if (x.size == 0 and ufunc.identity is None) or _has_ties(reader, equation, x, math.prod(x.shape[axis] for axis in axes)):
@@ -119,7 +121,7 @@ def _reducing(name: str, primitive: core.Primitive, ufunc: np.ufunc) -> None:
             x = combine.reduce(x, axis)
         return np.asarray(x, object)
 
-    @_rule(f"cum{name}")
+    @rule(f"cum{name}")
     def cumulated(reader, equation, x):
         axis = equation.params["axis"]
         if _has_ties(reader, equation, x, x.shape[axis]):
@@ -143,7 +145,7 @@ _reducing("max", lax.max_p, np.maximum)
 _reducing("min", lax.min_p, np.minimum)
 
 
-@_rule("dot_general")
+@rule("dot_general")
 def _dot(reader, equation, x, y):
     p, aval = equation.params, equation.outvars[0].aval
     (x_sum, y_sum), (x_batch, y_batch) = p["dimension_numbers"]
@@ -179,7 +181,7 @@ def _windows(starts, shape, sizes, start_dims, batch_dims, start_batch_dims, cli
         yield at, tuple(slice(i, i + n) for i, n in zip(start, sizes, strict=True)) if fits else None
 
 
-@_rule("gather")
+@rule("gather")
 def _gathered(reader, equation, x, starts):
     p, how = equation.params, equation.params["dimension_numbers"]
     if starts.dtype == object:
@@ -198,7 +200,7 @@ def _gathered(reader, equation, x, starts):
 
 
 def _scattering(name: str, primitive: core.Primitive | None) -> None:
-    @_rule(name)
+    @rule(name)
     def scattered(reader, equation, x, starts, updates):
         p, how = equation.params, equation.params["dimension_numbers"]
         if starts.dtype == object or (primitive is None and p["update_jaxpr"] is not None):
@@ -223,7 +225,7 @@ _scattering("scatter-add", lax.add_p)
 _scattering("scatter-mul", lax.mul_p)
 
 
-@_rule("dynamic_slice", "dynamic_update_slice")
+@rule("dynamic_slice", "dynamic_update_slice")
 def _at_start(reader, equation, x, *rest):
     updates, starts = (rest[:1], rest[1:]) if equation.primitive is lax.dynamic_update_slice_p else ((), rest)
     if any(start.dtype == object for start in starts):
@@ -235,75 +237,6 @@ def _at_start(reader, equation, x, *rest):
     x, update = alike(x.copy(), updates[0])
     x[window] = update
     return x
-
-
-# Linear algebra.
-
-
-@_rule("cholesky")
-def _cholesky(reader, equation, A):
-    dtype = equation.outvars[0].aval.dtype
-    L = objects(np.zeros(A.shape, dtype))
-    for at in np.ndindex(A.shape[:-2]):
-        a, l = objects(A[at]), L[at]
-        for j in range(len(a)):
-            for i in range(j, len(a)):
-                rest = functools.reduce(reader.sub, map(reader.mul, l[i, :j], l[j, :j]), a[i, j])
-                l[i, j] = reader.mul(rest, reader.div(dtype.type(1), l[j, j])) if i > j else reader.apply(lax.sqrt_p, {}, dtype, rest)
-    return L
-
-
-@_rule("triangular_solve")
-def _triangular_solve(reader, equation, A, B):
-    p, one = equation.params, equation.outvars[0].aval.dtype.type(1)
-    turned = p["transpose_a"] == p["left_side"]  # A X = B is solved, with A or Aᵀ, for X or, where X stands on the left, Xᵀ
-    A, X = objects(A.swapaxes(-1, -2) if turned else A), objects(B).copy()
-    for at in np.ndindex(A.shape[:-2]):
-        a, x = A[at], X[at] if p["left_side"] else X[at].T
-        upwards = p["lower"] == turned
-        for i in reversed(range(len(a))) if upwards else range(len(a)):
-            known = slice(i + 1, None) if upwards else slice(i)
-            for k in range(x.shape[1]):
-                rest = functools.reduce(reader.sub, map(reader.mul, a[i, known], x[known, k]), x[i, k])
-                x[i, k] = rest if p["unit_diagonal"] else reader.mul(rest, reader.div(one, a[i, i]))
-    return X
-
-
-@_rule("lu")
-def _lu(reader, equation, A):
-    """P A = L U where the algebra has no numbers to choose pivots by: the first that is not zero serves."""
-    if reader.algebra.block(equation) is not None:
-        return NotImplemented
-    *batch, rows, columns = A.shape
-    A = objects(A).copy()
-    pivots = np.zeros((*batch, min(rows, columns)), np.int32)
-    permutation = np.broadcast_to(np.arange(rows, dtype=np.int32), (*batch, rows)).copy()
-    for at in np.ndindex(*batch):
-        a = A[at]
-        for j in range(min(rows, columns)):
-            k = pivots[(*at, j)] = next((i for i in range(j, rows) if isinstance(a[i, j], Entry) or a[i, j] != 0), j)
-            for swapped in (a, permutation[at]):
-                swapped[[j, k]] = swapped[[k, j]]
-            for i in range(j + 1, rows):
-                a[i, j] = reader.div(a[i, j], a[j, j])
-                a[i, j + 1 :] = [reader.sub(x, reader.mul(a[i, j], y)) for x, y in zip(a[i, j + 1 :], a[j, j + 1 :], strict=True)]
-    return [A, pivots, permutation]
-
-
-@_rule("custom_linear_solve")
-def _linear_solve(reader, equation, *operands):
-    """The solution written out; where the algebra differentiates, it gets its derivative from the equation it solves."""
-    lengths, solve = equation.params["const_lengths"], equation.params["jaxprs"].solve
-    before, right, function = lengths.matvec + lengths.vecmat, operands[sum(lengths) :], reader.algebra.block(equation)
-    if function is not None:
-        held = lambda x: reader.new(x.dtype, "held", lax.stop_gradient, (x,)) if isinstance(x, Entry) else x
-        right = [each(held, x) for x in right]
-    x = reader.inner(solve, [*operands[before : before + lengths.solve], *right])
-    if function is None:
-        return x
-    # What comes out as a number is one whatever the operands are, and so is its derivative.
-    whole = reader.block(function, [*x, *operands], equation.outvars)
-    return [each(lambda x, entry: entry if isinstance(x, Entry) else x, *pair) for pair in zip(x, whole, strict=True)]
 
 
 # Calls and loops.
@@ -348,7 +281,7 @@ def turns(equation: Any) -> int | float:
     return windows + equation.invars[0].aval.size if name.startswith("scatter") else windows
 
 
-@_rule(*CALLS)
+@rule(*CALLS)
 def _called(reader, equation, *operands):
     shortcut = reader.algebra.shortcut(equation)
     if shortcut is not None and any(x.dtype == object for x in operands):
@@ -356,26 +289,26 @@ def _called(reader, equation, *operands):
     return reader.inner(body(equation), operands)
 
 
-@_rule(*RULED)
+@rule(*RULED)
 def _with_rule(reader, equation, *operands):
     """Taken apart, unless the algebra differentiates what is no number: then it stays in one piece, with its rule."""
     results, known = _called(reader, equation, *operands), all(x.dtype != object for x in operands)
     return results if known or reader.algebra.block(equation) is None else NotImplemented
 
 
-@_rule("platform_index")
+@rule("platform_index")
 def _platform(reader, equation):
     fits = [names is None or jax.default_backend() in names for names in equation.params["platforms"]]
     return np.asarray(fits.index(True), np.int32)
 
 
-@_rule("cond")
+@rule("cond")
 def _branch(reader, equation, index, *operands):
     branches = equation.params["branches"]
     return NotImplemented if index.dtype == object else reader.inner(branches[min(max(int(index), 0), len(branches) - 1)], operands)
 
 
-@_rule("while")
+@rule("while")
 def _while(reader, equation, *operands):
     p = equation.params
     i, j = p["cond_nconsts"], p["cond_nconsts"] + p["body_nconsts"]
@@ -387,7 +320,7 @@ def _while(reader, equation, *operands):
     return NotImplemented
 
 
-@_rule("scan")
+@rule("scan")
 def _scan(reader, equation, *operands):
     p = equation.params
     i, j = p["num_consts"], p["num_consts"] + p["num_carry"]

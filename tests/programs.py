@@ -20,7 +20,7 @@ from jaxlag import _scalarised
 from jaxlag._entries import Reader, opened
 from jaxlag._folding import TooLong, UnknownPrimitive, filled
 from jaxlag._numbers import KNOWN, folded
-from jaxlag._primitives import CALLS, RULED, body
+from jaxlag._primitives import CALLS, RULED, body, primitives
 
 SIZE = 3  # of x and of v
 LIMIT = 5000
@@ -216,17 +216,11 @@ def chosen(rng, kinds, values):
     """Where operands of these kinds stand: a letter for the dtype, then one for the shape, where "s" is the same for all."""
     same, places = None, []
     for kind, shape in kinds.split(","):
-        shapes = {"v": (3,), "m": (2, 3), "q": (3, 3), ".": ()}
-        fits = lambda x: (
-            x.dtype == jnp.dtype(DTYPES[kind])
-            and (  # noqa: B023 - used at once
-                x.shape == shapes[shape] if shape in shapes else shape == "a" or x.shape == (same if same is not None else x.shape)  # noqa: B023
-            )
-        )
-        candidates = [k for k, x in enumerate(values) if fits(x)]
-        if not candidates:
+        wanted = {"v": (3,), "m": (2, 3), "q": (3, 3), ".": (), "s": same}.get(shape)
+        alike = [k for k, x in enumerate(values) if x.dtype == jnp.dtype(DTYPES[kind]) and wanted in (None, x.shape)]
+        if not alike:
             return None
-        places.append(int(rng.choice(candidates[-6:] if rng.random() < 0.7 else candidates)))
+        places.append(int(rng.choice(alike[-6:] if rng.random() < 0.7 else alike)))
         same = values[places[-1]].shape if shape == "s" else same
     return tuple(places)
 
@@ -261,7 +255,8 @@ NO_DERIVATIVE = ("not implemented", "rule", "differentiat", "Reverse-mode", "for
 def traced(function, *arguments):
     """Its program; None where JAX has no derivative of it, or one of a loop that it must know beforehand."""
     try:
-        return jax.make_jaxpr(function)(*arguments)
+        closed = jax.make_jaxpr(function)(*arguments)
+        return None if "custom_lin" in primitives(closed) else closed
     except (NotImplementedError, TypeError, ValueError) as error:
         if any(
             part in str(error)

@@ -16,6 +16,7 @@ ORDER = [
     "_numbers",
     "_folding",
     "_primitives",
+    "_elimination",
     "_entries",
     "_scalarised",
     "_kernel",
