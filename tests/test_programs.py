@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from jax import lax
 from operations import NOT_COVERED, OPERATIONS
-from programs import FORMS, compared, plain, rewritten
+from programs import FORMS, compared, plain, program, rewritten
 
 import jaxlag as jl
 from jaxlag._entries import evaluate
@@ -21,7 +21,7 @@ from jaxlag._jacobian import dependence
 from jaxlag._products import matrix
 from jaxlag._scalarised import JAX_ALGEBRA, scalarised
 
-SEEDS, BLOCKS = 1000, 4
+SEEDS, BLOCKS = 320, 4
 Q, V = np.array([0.3, 0.5, -0.2]), np.array([1.0, -0.5, 0.2])
 rng = np.random.default_rng(0)
 Z = rng.normal(size=(3, 3)) + 1j * rng.normal(size=(3, 3))
@@ -33,6 +33,28 @@ def test_random_programs_are_the_plain_ones(block):
     results = [compared(seed) for seed in range(block, SEEDS, BLOCKS)]
     assert [(seed, form, error) for seed, (form, _, error, _) in zip(range(block, SEEDS, BLOCKS), results, strict=True) if error] == []
     assert sum(other for _, other, _, _ in results) > len(results) / 2  # most were rewritten: the rest is what stays plain
+
+
+@pytest.mark.parametrize("seed", [18])
+def test_accelerations_and_reactions_of_random_energies(seed):
+    """With constraint and dissipation, compiled, and their derivatives: against a dense solve in plain JAX."""
+    run, x, v = program(seed)
+    wave = lambda q, v: 0.1 * jnp.sin(run.scalar(q, v) / 10)
+    L, D = lambda q, qdot: qdot @ qdot + wave(q, qdot), lambda q, qdot: 0.5 * (1 + wave(q, q)) * qdot @ qdot
+    g = lambda q: q @ q + wave(q, q)
+
+    def solved(q, v):
+        p, rate = jax.grad(L, 1), lambda q: jax.jvp(g, (q,), (v,))[1]
+        f = jax.grad(L)(q, v) - jax.jvp(lambda q: p(q, v), (q,), (v,))[1] - jax.grad(D, 1)(q, v)
+        M, G, gamma = jax.jacfwd(p, 1)(q, v), jax.grad(g)(q)[None], jax.jvp(rate, (q,), (v,))[1][None]
+        z = jnp.linalg.solve(jnp.block([[M, -G.T], [G, jnp.zeros((1, 1))]]), jnp.concatenate([f, -gamma]))
+        return z[:3], z[3] * G[0]
+
+    system = jl.System(L, dissipation=D, holonomic={"g": g})
+    found = lambda q, v: (jl.acceleration(system, q, v).qddot, jl.constraint_force(system, q, v)["g"])
+    both = lambda f: jax.jit(lambda q, v: (f(q, v), jax.jacfwd(f, (0, 1))(q, v)))(x, v)
+    for a, b in zip(jax.tree.leaves(both(found)), jax.tree.leaves(both(solved)), strict=True):
+        np.testing.assert_allclose(a, b, rtol=1e-10, atol=1e-10)
 
 
 def test_every_documented_operation_is_among_them_or_said_why_not():
