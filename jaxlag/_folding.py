@@ -14,7 +14,7 @@ import numpy as np
 from jax import lax
 from jax.extend import core, source_info_util
 
-from ._numbers import folded
+from ._arithmetic import folded
 
 Arrays = list[np.ndarray]  # each of numbers or, where at least one entry is not known, of objects: NumPy scalars and `Entry`s
 

@@ -14,7 +14,7 @@ from jax import lax
 from jax.extend import core
 
 from ._folding import Arrays, Entry, objects
-from ._numbers import folded
+from ._arithmetic import folded
 
 RULES: dict[str, Callable] = {}
 

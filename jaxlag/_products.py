@@ -17,7 +17,7 @@ from jaxtyping import Array, Float
 from ._entries import Reader, settled
 from ._folding import Algebra, UnknownPrimitive
 from ._kernel import length
-from ._numbers import is_extended, is_known, on_arrays
+from ._arithmetic import is_extended, is_known, on_arrays
 from ._primitives import CALLS, body
 
 SHORT = 200  # equations; what is longer is scalar code, whose entries cost less one by one

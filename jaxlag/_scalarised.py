@@ -14,7 +14,7 @@ from jax.extend import core
 
 from ._entries import Reader, evaluate, opened, shaped
 from ._folding import Algebra, Arrays, TooLong, UnknownPrimitive, filled, is_number, objects
-from ._numbers import on_arrays
+from ._arithmetic import on_arrays
 
 
 class _Jax(Algebra):

@@ -13,7 +13,7 @@ import jaxlag
 
 PACKAGE = pathlib.Path(jaxlag.__file__).parent
 ORDER = [
-    "_numbers",
+    "_arithmetic",
     "_folding",
     "_primitives",
     "_elimination",
