@@ -14,8 +14,13 @@ import jax
 import numpy as np
 from jax.extend import core
 
-from ._folding import ELEMENTWISE, Algebra, Arrays, Entry, Folding, TooLong, UnknownPrimitive, filled, folded, is_number, objects
-from ._primitives import RULES, each
+from . import _elimination as _elimination  # its rules
+from ._folding import Algebra, Arrays, Entry, Folding, TooLong, UnknownPrimitive, filled, is_number, objects
+from ._arithmetic import ELEMENTWISE, by_jax, folded, is_extended, is_known
+from ._arithmetic import on_arrays as on_arrays
+from ._primitives import LONG, RULES, each, primitives, turns
+
+SIGNED = {"atan2", "bitcast_convert_type"}  # to which the sign of a zero matters: an angle of π or −π
 
 
 def evaluate(closed: Any, algebra: Algebra, *arguments: Any, limit: int | float = math.inf) -> Arrays:
@@ -26,6 +31,7 @@ def evaluate(closed: Any, algebra: Algebra, *arguments: Any, limit: int | float 
     **Raises:** `UnknownPrimitive`, which names it and its line; `TooLong` where there are more than `limit` entries.
     """
     reader = Reader(algebra, limit)
+    reader.keeps_signs = not SIGNED.isdisjoint(primitives(closed))
     inputs: Arrays = []
     values: dict[Entry, Any] = {}
     for argument, variable in zip(arguments, closed.jaxpr.invars, strict=True):
@@ -47,6 +53,7 @@ def opened(closed: Any, reader: "Reader") -> tuple[Arrays, Arrays]:
     jaxpr = closed.jaxpr.replace(constvars=[], invars=[*closed.jaxpr.constvars, *closed.jaxpr.invars])
     if closed.effects or any(map(is_extended, jaxpr.invars)):
         raise TooLong
+    reader.keeps_signs = not SIGNED.isdisjoint(primitives(closed))
     given = [*closed.consts, *([None] * len(closed.jaxpr.invars))]
     inputs = [
         np.asarray(x)
@@ -79,7 +86,14 @@ class Reader(Folding):
         primitive = equation.primitive
         results: Any = NotImplemented
         self.where.append(equation.source_info)
-        if primitive.name in RULES:
+        numbers = all(x.dtype != object for x in operands)
+        atoms = [*equation.invars, *equation.outvars]
+        self.spend(10 + (0 if numbers else sum(atom.aval.size for atom in atoms)))
+        if any(map(is_extended, atoms)) or not (numbers or all(map(is_known, atoms))):
+            raise UnknownPrimitive(primitive, self.where)
+        if numbers and (not all(map(is_known, atoms)) or turns(equation) > LONG):
+            results = self.whole(equation, operands)
+        elif primitive.name in RULES:
             results = RULES[primitive.name](self, equation, *operands)
         elif primitive.name in ELEMENTWISE:
             results = self.elementwise(primitive, equation.params, equation.outvars[0].aval.dtype, *operands)
@@ -98,11 +112,8 @@ class Reader(Folding):
 
     def whole(self, equation: Any, operands: Arrays) -> Arrays:
         """The outputs of an equation that is not taken apart."""
-        if any(is_extended(atom) for atom in [*equation.invars, *equation.outvars]):
-            raise UnknownPrimitive(equation.primitive, self.where)
         if all(x.dtype != object for x in operands) and not equation.effects:
-            with jax.ensure_compile_time_eval():
-                return [self.known(np.asarray(x)) for x in on_arrays(equation)(*operands)]
+            return [self.known(x) for x in by_jax(equation, operands)]
         function = self.algebra.block(equation)
         if function is None:
             raise UnknownPrimitive(equation.primitive, self.where)
@@ -118,11 +129,6 @@ class Reader(Folding):
         return shaped(items, [aval.shape for aval in avals])
 
 
-def is_extended(atom: Any) -> bool:
-    """Whether its entries are no numbers at all, as those of a random key."""
-    return jax.dtypes.issubdtype(atom.aval.dtype, jax.dtypes.extended)
-
-
 def shaped(flat: Any, shapes: Any) -> Arrays:
     """Scalars in a row as arrays of these shapes."""
     splits = np.cumsum([0, *(math.prod(shape) for shape in shapes)])
@@ -132,17 +138,3 @@ def shaped(flat: Any, shapes: Any) -> Arrays:
 def settled(array: np.ndarray, dtype: Any) -> np.ndarray:
     """As numbers, where all entries are known."""
     return array.astype(dtype) if array.dtype == object and not any(isinstance(x, Entry) for x in array.flat) else array
-
-
-def on_arrays(equation: Any) -> Callable[..., list]:
-    """The equation as a function of its operands."""
-    places = {atom: i for i, atom in enumerate(equation.invars) if not isinstance(atom, core.Literal)}
-    jaxpr = _nothing().replace(invars=list(places), outvars=equation.outvars, eqns=[equation], effects=equation.effects)
-    function = core.jaxpr_as_fun(core.ClosedJaxpr(jaxpr, ()))
-    return lambda *operands: function(*(operands[i] for i in places.values()))
-
-
-@functools.cache
-def _nothing() -> Any:
-    """A program that does nothing."""
-    return jax.make_jaxpr(lambda: ())().jaxpr

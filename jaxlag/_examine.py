@@ -10,8 +10,9 @@ from jaxtyping import PyTree
 
 from ._checks import at_state, coordinates
 from ._friction import settled
-from ._mechanics import constraint_rows, inertia, position_residual
+from ._mechanics import applied_force, constraint_rows, inertia, position_residual, velocity_residual
 from ._multipliers import constrained_acceleration
+from ._scalarised import scalarised
 from ._system import Flat, System, leaf_names, rows_by_name
 
 
@@ -93,9 +94,11 @@ def examine(system: System, q: PyTree, qdot: PyTree, params: PyTree = None, *, t
         "dissipated": {name: float(np.min(value)) for name, value in found["dissipated"].items()},
         "time_constants": constants,
     }
+    off, size, rows_off, rows_size = found["defects"].max(axis=0)
+    defect = max(off / max(size, eps), rows_off / max(rows_size, eps) if rank == G.shape[0] else 0)  # rows may contradict each other
     no_inertia = inertia_on_N.size > 0 and smallest <= 100 * M.shape[0] * eps * np.max(np.abs(M), initial=0.0)
     pulling = _pulling(system, found["multipliers"])
-    return Examination(**numbers, findings=(*_findings(numbers, no_inertia, found["M"].dtype), *pulling))
+    return Examination(**numbers, findings=(*_findings(numbers, no_inertia, defect, found["M"].dtype), *pulling))
 
 
 def _pulling(system, multipliers):
@@ -109,7 +112,12 @@ def _pulling(system, multipliers):
             )
 
 
-def _findings(numbers, no_inertia, dtype):
+def _findings(numbers, no_inertia, defect, dtype):
+    if defect > float(jnp.finfo(dtype).eps) ** 0.5:
+        yield (
+            f"the accelerations miss Lagrange's equations, as JAX alone differentiates them, by {defect:.2g} of the largest term: "
+            "do not trust them, and report the functions of this system as an error of jaxlag"
+        )
     if no_inertia:
         yield "a direction that no constraint holds has no inertia: add the missing mass, or a constraint"
     if numbers["degrees_of_freedom"] == 0:
@@ -141,7 +149,10 @@ def _measure(flat: Flat, t, q, v):
     """All that needs derivatives, in one compiled program."""
     _, G, _ = constraint_rows(flat, t, q, v)
     mode = settled(flat, t, q, v)
-    multipliers = constrained_acceleration(mode, t, q, v).multipliers
+    beside = jnp.linspace(-0.1, 0.1, q.size, dtype=q.dtype)
+    around = jnp.stack([jnp.zeros_like(beside), beside, -beside[::-1]])
+    multipliers, defects = jax.vmap(lambda near: _defects(mode, t, q + near, v + near))(around)
+    multipliers = multipliers[0]
     rates = lambda y: jnp.concatenate([y[q.size :], constrained_acceleration(mode, t, y[: q.size], y[q.size :]).x])
     scale = 1 + jnp.max(jnp.abs(v))
     near = v[None] + 0.1 * scale * jax.random.normal(jax.random.key(0), (64, v.size), v.dtype)
@@ -158,7 +169,25 @@ def _measure(flat: Flat, t, q, v):
         "velocity": {name: psi[rows] for name, rows in split.items()},
         "dissipated": fed,
         "multipliers": {name: multipliers[rows] for name, rows in split.items()},
+        "defects": defects,
     }
+
+
+def _defects(mode, t, q, v):
+    """λ; and how far q̈ and λ, by the program as it is rewritten, are from the equations as JAX alone differentiates them.
+
+    Of M q̈ − f − Gᵀλ and of G q̈ + γ: what is left, and beside it the largest term; zeros where inertia is missing.
+    """
+    qddot, multipliers, determined = scalarised(lambda t, q, v: constrained_acceleration(mode, t, q, v))(t, q, v)
+    one, L, psi = jnp.ones_like(t), mode.lagrangian, lambda t, q, v: velocity_residual(mode, t, q, v)
+    _, rate = jax.jvp(jax.grad(L, argnums=2), (t, q, v), (one, v, qddot))
+    _, gamma = jax.jvp(lambda t, q: psi(t, q, v), (t, q), (one, v))
+    G = jax.jacfwd(psi, argnums=2)(t, q, v)
+    terms = rate, -jax.grad(L, argnums=1)(t, q, v), -applied_force(mode, t, q, v, multipliers), -G.T @ multipliers
+    largest = lambda *terms: jnp.max(jnp.abs(jnp.concatenate(terms)), initial=0)
+    in_equations = largest(sum(terms)), largest(*terms)
+    in_rows = largest(G @ qddot + gamma), largest(jnp.abs(G) @ jnp.abs(qddot), gamma)
+    return multipliers, jnp.where(determined & jnp.all(jnp.isfinite(qddot)), jnp.stack([*in_equations, *in_rows]), 0)
 
 
 def _null_space(G, eps):

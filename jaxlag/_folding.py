@@ -5,16 +5,20 @@ the same entries is the same entry. What the entries stand for is left to the al
 """
 
 import dataclasses
+import functools
 import math
 from collections.abc import Callable, Iterable
 from typing import Any
 
-import jax
 import numpy as np
 from jax import lax
 from jax.extend import core, source_info_util
 
+from ._arithmetic import folded
+
 Arrays = list[np.ndarray]  # each of numbers or, where at least one entry is not known, of objects: NumPy scalars and `Entry`s
+
+EFFORT = 50  # steps for each operation that is allowed; mechanical systems take up to 20
 
 
 class UnknownPrimitive(NotImplementedError):
@@ -71,9 +75,10 @@ class Folding:
     """The entries made so far, each once, after those that it needs; and the arithmetic that makes more of them."""
 
     def __init__(self, algebra: Algebra, limit: int | float = math.inf):
-        self.algebra, self.limit = algebra, limit
+        self.algebra, self.limit, self.spent = algebra, limit, 0
         self.entries: list[Entry] = []
         self.made: dict[tuple, Entry] = {}
+        self.keeps_signs = False  # of zeros: x − y and −(y − x) differ by it where x = y, and so does the angle that atan2 gives
         self.where: list = []  # where in the user's code, for messages
 
     def new(self, *what: Any) -> Entry:
@@ -82,6 +87,12 @@ class Folding:
             raise TooLong
         self.entries.append(Entry(len(self.entries), *what))
         return self.entries[-1]
+
+    def spend(self, operations: int) -> None:
+        """Counts what is done, for zeros and numbers make no entries but take time."""
+        self.spent += operations
+        if self.spent > EFFORT * self.limit:
+            raise TooLong
 
     def argument(self, dtype: Any) -> Entry:
         """An entry whose value comes from outside."""
@@ -102,7 +113,7 @@ class Folding:
 
     def entry(self, primitive: core.Primitive, params: dict, dtype: Any, *operands: Any) -> Entry:
         """The entry of one operation, not simplified."""
-        key = (primitive.name, *filter(None, params.values()), *(x if isinstance(x, Entry) else (x.dtype, x.tobytes()) for x in operands))
+        key = (primitive.name, dtype, *params.items(), *(x if isinstance(x, Entry) else (x.dtype, x.tobytes()) for x in operands))
         if key not in self.made:
             function = self.algebra.function(primitive, params, dtype)
             if function is None:
@@ -151,17 +162,19 @@ class Folding:
             a, u, b, v = b, v, a, u
         if u is v:
             return self.scaled(a + b, u)
-        if u is None and a == 0:
+        if u is None and a == 0 and (b > 0 or not self.keeps_signs):
             return self.scaled(b, v)
-        if u is not None and a < 0:
-            return self.negative(self.total(-a, u, -b, v))
+        if u is not None and a < 0 and (b > 0 or not self.keeps_signs):
+            return self.total(b, v, a, u) if self.keeps_signs else self.negative(self.total(-a, u, -b, v))
         (c, root), (d, same) = _rooted(u), _rooted(v)
         if root is not None and root is same:
             return self.mul(self.add(self.mul(a, c), self.mul(b, d)), root)
         x, y = self.scaled(a, u), self.scaled(abs(b), v)
-        if b < 0 and place(x) > place(y):
+        if b > 0:
+            return self.entry(lax.add_p, {}, v.dtype, *sorted((x, y), key=place))
+        if place(x) > place(y) and not self.keeps_signs:
             return self.negative(self.entry(lax.sub_p, {}, v.dtype, y, x))
-        return self.entry(lax.sub_p if b < 0 else lax.add_p, {}, v.dtype, *sorted((x, y), key=place))
+        return self.entry(lax.sub_p, {}, v.dtype, x, y)
 
     def add(self, x: Any, y: Any) -> Any:
         """The sum x + y."""
@@ -181,7 +194,9 @@ class Folding:
         """The product x y."""
         (a, u), (b, v) = _factored(x), _factored(y)
         if u is None or v is None:
-            return self.scaled(a * b, u or v)
+            number, factor, entry, whole = (a, b, v, y) if u is None else (b, a, u, x)
+            merges = entry is None or number == 0 or abs(factor) == 1 or _is_moderate(number, entry.dtype)
+            return self.scaled(a * b, entry) if merges else self.scaled(number, whole)
         (c, root), (d, same) = _rooted(u), _rooted(v)
         if root is not None and root is same:  # (c/√s) (d/√s) = c d (1/s): so Cholesky's factors act as L D Lᵀ, without a root
             inverse = self.div(u.dtype.type(1), root.operands[1].operands[0])
@@ -193,7 +208,7 @@ class Folding:
         (a, u), (b, v) = _factored(x), _factored(y)
         if u is None and v is None:
             return self.apply(lax.div_p, {}, x.dtype, x, y)
-        if v is None and math.frexp(b)[0] in (-0.5, 0.5):  # by a power of two: exact
+        if v is None and math.frexp(b)[0] in (-0.5, 0.5) and _is_moderate(b, x.dtype):  # by a power of two: exact
             return self.scaled(a / b, u)
         if u is None and a == 0:
             return x
@@ -205,8 +220,8 @@ class Folding:
         """The power xⁿ by repeated squaring."""
         if n < 2:
             return x if n == 1 else x.dtype.type(1) if n == 0 else self.div(x.dtype.type(1), self.power(x, -n))
-        half = self.power(x, n // 2)
-        return self.mul(self.mul(half, half), x) if n % 2 else self.mul(half, half)
+        half, times = self.power(x, n // 2), functools.partial(self.apply, lax.mul_p, {}, x.dtype)
+        return times(times(half, half), x) if n % 2 else times(half, half)
 
 
 def is_number(x: Any) -> bool:
@@ -225,7 +240,17 @@ def _factored(x) -> tuple[Any, Any]:
         return x, None
     if x.name == "neg":
         return -1, x.operands[0]
-    return x.operands if x.name == "mul" and is_number(x.operands[0]) else (1, x)  # type: ignore[return-value]
+    is_multiple = x.name == "mul" and is_number(x.operands[0]) and _is_moderate(x.operands[0], x.dtype)
+    return x.operands if is_multiple else (1, x)  # type: ignore[return-value]
+
+
+def _is_moderate(number: Any, dtype: Any) -> bool:
+    """Whether a factor may be taken out of products: one far from 1 may be what keeps its entry from overflow or underflow."""
+    least, most = MODERATE[dtype]
+    return bool(least < abs(number) < most)
+
+
+MODERATE = {np.dtype(dtype): (float(np.finfo(dtype).tiny) ** (1 / 8), float(np.finfo(dtype).max) ** (1 / 8)) for dtype in ("f4", "f8")}
 
 
 def _rooted(x) -> tuple[Any, Entry | None]:
@@ -253,38 +278,6 @@ def objects(array: np.ndarray) -> np.ndarray:
     return array if array.dtype == object else filled(array.shape, array.flat)
 
 
-def folded(primitive: core.Primitive, params: dict, dtype: Any, *numbers: Any) -> Any:
-    """An element-wise primitive of numbers, as JAX computes it."""
-    function = ELEMENTWISE[primitive.name]
-    if function is None:
-        with jax.ensure_compile_time_eval():
-            return np.asarray(primitive.bind(*numbers, **params))[()]
-    return np.asarray(function(*numbers)).astype(dtype)[()]
-
-
-# Element-wise primitives, and how numbers are folded; None: by JAX itself.
-
-ELEMENTWISE: dict[str, Callable | None] = {
-    **dict(add=np.add, add_any=np.add, sub=np.subtract, mul=np.multiply, neg=np.negative, abs=np.abs, sign=np.sign, pow=np.power),
-    **dict(exp=np.exp, exp2=np.exp2, log=np.log, log1p=np.log1p, expm1=np.expm1, sqrt=np.sqrt, cbrt=np.cbrt, rem=np.fmod),
-    **dict(sin=np.sin, cos=np.cos, tan=np.tan, asin=np.arcsin, acos=np.arccos, atan=np.arctan, atan2=np.arctan2),
-    **dict(sinh=np.sinh, cosh=np.cosh, tanh=np.tanh, asinh=np.arcsinh, acosh=np.arccosh, atanh=np.arctanh),
-    **dict(eq=np.equal, ne=np.not_equal, lt=np.less, le=np.less_equal, gt=np.greater, ge=np.greater_equal, is_finite=np.isfinite),
-    "max": np.maximum,
-    "min": np.minimum,
-    "and": np.bitwise_and,
-    "or": np.bitwise_or,
-    "xor": np.bitwise_xor,
-    "not": np.invert,
-    "div": lambda x, y: (x - np.fmod(x, y)) // y if np.issubdtype(x.dtype, np.integer) else x / y,
-    "rsqrt": lambda x: 1 / np.sqrt(x),
-    "floor": np.floor,
-    "ceil": np.ceil,
-    "clamp": lambda low, x, high: np.minimum(np.maximum(low, x), high),
-    "select_n": lambda which, *cases: np.choose(which, cases),
-    "stop_gradient": lambda x: x,
-    **dict.fromkeys(("round", "logistic", "erf", "erfc", "erf_inv", "lgamma", "digamma")),
-}
 ODD = frozenset(("sin", "tan", "asin", "atan", "sinh", "tanh", "asinh", "atanh", "cbrt", "erf"))
 EVEN = frozenset(("cos", "cosh"))  # not abs: there the derivative at 0 would change its sign
 
@@ -292,15 +285,16 @@ EVEN = frozenset(("cos", "cosh"))  # not abs: there the derivative at 0 would ch
 # What is simplified before it becomes an entry; None where nothing is.
 
 
-def _if_signed(method: Callable, kinds: str = "fi") -> Callable:
-    return lambda folding, *operands: method(folding, *operands) if all(np.dtype(x.dtype).kind in kinds for x in operands) else None
+def _if_real(method: Callable) -> Callable:
+    """Of floating-point numbers: the arithmetic of integers wraps around, and stays as it is."""
+    return lambda folding, *operands: method(folding, *operands) if all(x.dtype.kind == "f" for x in operands) else None
 
 
 def _selected(folding, which, *cases):
     if not isinstance(which, Entry):
-        return cases[int(which)]
+        return cases[min(max(int(which), 0), len(cases) - 1)]
     one = cases[0]
-    return one if all(x is one or (is_number(x) and is_number(one) and x == one) for x in cases) else None
+    return one if all(x is one or (is_number(x) and is_number(one) and x.tobytes() == one.tobytes()) for x in cases) else None
 
 
 def _raised(folding, x, n):
@@ -320,8 +314,8 @@ def _junction(neutral: bool) -> Callable:
 
 
 SIMPLER: dict[str, Callable] = {
-    **dict(add=_if_signed(Folding.add), add_any=_if_signed(Folding.add), sub=_if_signed(Folding.sub), neg=_if_signed(Folding.negative)),
-    **dict(mul=_if_signed(Folding.mul), div=_if_signed(Folding.div, "f"), pow=_raised, select_n=_selected),
+    **dict(add=_if_real(Folding.add), add_any=_if_real(Folding.add), sub=_if_real(Folding.sub), neg=_if_real(Folding.negative)),
+    **dict(mul=_if_real(Folding.mul), div=_if_real(Folding.div), pow=_raised, select_n=_selected),
     "and": _junction(True),
     "or": _junction(False),
 }

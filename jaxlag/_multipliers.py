@@ -169,7 +169,7 @@ def _by_eigenvalues(scaled, D):
     kept = values > jnp.finfo(scaled.dtype).eps ** 0.625 * values[-1]
     inverse = U @ (jnp.where(kept, 1 / jnp.where(kept, values, 1), 0)[:, None] * U.T) * jnp.outer(D, D)
     # Least norm in the units given: take out of range and domain what lies in the null space of S, spanned by V.
-    V = D[:, None] * U * ~kept[None, :]
+    V = jnp.where(kept, 0, D[:, None] * U)
     gram = jnp.linalg.cholesky(V.T @ V + jnp.diag(kept.astype(scaled.dtype)))
     out = jnp.eye(len(D), dtype=scaled.dtype) - V @ jax.scipy.linalg.cho_solve((gram, True), V.T)
     return out @ inverse @ out

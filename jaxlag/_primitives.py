@@ -5,7 +5,7 @@ Each rule takes the reader (`_entries`), the equation and its operands, and give
 
 import functools
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import jax
@@ -13,7 +13,8 @@ import numpy as np
 from jax import lax
 from jax.extend import core
 
-from ._folding import Arrays, Entry, Folding, objects
+from ._folding import Arrays, Entry, objects
+from ._arithmetic import folded
 
 RULES: dict[str, Callable] = {}
 
@@ -28,10 +29,12 @@ def each(function: Callable, *arrays: np.ndarray) -> np.ndarray:
     return np.asarray(np.frompyfunc(function, len(arrays), 1)(*map(objects, arrays)), object)
 
 
-def _rule(*names: str) -> Callable:
-    def register(rule: Callable) -> Callable:
-        RULES.update(dict.fromkeys(names, rule))
-        return rule
+def rule(*names: str) -> Callable:
+    """Registers a function as the rule of these primitives."""
+
+    def register(function: Callable) -> Callable:
+        RULES.update(dict.fromkeys(names, function))
+        return function
 
     return register
 
@@ -51,10 +54,9 @@ def _broadcast(p, x):
 def _padded(p, x, value):
     low, high, inner = np.array(p["padding_config"], int).reshape(-1, 3).T
     out = np.broadcast_to(value, low + high + x.shape + inner * np.maximum(np.array(x.shape, int) - 1, 0)).copy()
-    for at in np.ndindex(x.shape):
-        place = low + at * (1 + inner)
-        if (place >= 0).all() and (place < out.shape).all():
-            out[tuple(place)] = x[at]
+    places = [first + np.arange(n) * (1 + step) for first, n, step in zip(low, x.shape, inner, strict=True)]
+    kept = [(place >= 0) & (place < n) for place, n in zip(places, out.shape, strict=True)]
+    out[np.ix_(*[place[keep] for place, keep in zip(places, kept, strict=True)])] = x[np.ix_(*kept)]
     return out
 
 
@@ -77,65 +79,91 @@ _moving(
 )
 
 
-@_rule("convert_element_type")
+@rule("convert_element_type")
 def _converted(reader, equation, x):
     dtype = equation.params["new_dtype"]
 
     def convert(x):
         if isinstance(x, Entry):
             return x if x.dtype == dtype else reader.entry(equation.primitive, equation.params, dtype, x)
-        return x.astype(dtype)
+        return folded(equation.primitive, equation.params, dtype, x)
 
-    return convert(x) if x.dtype != object else each(convert, x)
+    return np.asarray(convert(x)) if x.dtype != object else each(convert, x)
 
 
-@_rule("integer_pow", "square")
+@rule("integer_pow", "square")
 def _power(reader, equation, x):
     return each(functools.partial(reader.power, n=equation.params.get("y", 2)), x)
 
 
-def _reducing(name: str, primitive: core.Primitive, neutral: Any = None) -> None:
+def _at_once(reader, function: Callable, *arrays: np.ndarray) -> np.ndarray | None:
+    """A function of numbers; None where an entry is among them, or the algebra would have what comes out as an entry."""
+    if any(x.dtype == object for x in arrays):
+        return None
+    result = np.asarray(function(*arrays))
+    return result if np.all(reader.algebra.folds(result)) else None
+
+
+def _reducing(name: str, primitive: core.Primitive, ufunc: np.ufunc) -> None:
     def combining(reader, equation):
         return np.frompyfunc(functools.partial(reader.apply, primitive, {}, equation.outvars[0].aval.dtype), 2, 1)
 
-    @_rule(f"reduce_{name}")
+    @rule(f"reduce_{name}")
     def reduced(reader, equation, x):
+        axes = tuple(equation.params["axes"])
+        if (x.size == 0 and ufunc.identity is None) or _has_ties(reader, equation, x, math.prod(x.shape[axis] for axis in axes)):
+            return NotImplemented
+        numbers = _at_once(reader, lambda x: ufunc.reduce(x, axis=axes, dtype=x.dtype), x)
+        if numbers is not None:
+            return numbers
         combine, x = combining(reader, equation), objects(x)
-        if x.size == 0:
-            aval = equation.outvars[0].aval
-            return NotImplemented if neutral is None else np.full(aval.shape, neutral, aval.dtype)
-        for axis in sorted(equation.params["axes"], reverse=True):
+        for axis in sorted(axes, reverse=True):
             x = combine.reduce(x, axis)
         return np.asarray(x, object)
 
-    @_rule(f"cum{name}")
+    @rule(f"cum{name}")
     def cumulated(reader, equation, x):
-        turned = functools.partial(np.flip, axis=equation.params["axis"]) if equation.params["reverse"] else lambda x: x
-        return turned(combining(reader, equation).accumulate(turned(objects(x)), equation.params["axis"]))
+        axis = equation.params["axis"]
+        if _has_ties(reader, equation, x, x.shape[axis]):
+            return NotImplemented
+        turned = functools.partial(np.flip, axis=axis) if equation.params["reverse"] else lambda x: x
+        numbers = _at_once(reader, lambda x: turned(ufunc.accumulate(turned(x), axis, dtype=x.dtype)), x)
+        return turned(combining(reader, equation).accumulate(turned(objects(x)), axis)) if numbers is None else numbers
 
 
-_reducing("sum", lax.add_p, 0)
-_reducing("prod", lax.mul_p, 1)
-_reducing("and", lax.and_p, True)
-_reducing("or", lax.or_p, False)
-_reducing("max", lax.max_p)
-_reducing("min", lax.min_p)
+def _has_ties(reader, equation, x, several: int) -> bool:
+    """Whether the derivative depends on how the largest of several is taken: of three that are equal each has a third of it."""
+    extremal = equation.primitive.name.endswith(("max", "min"))
+    return extremal and several > 2 and x.dtype == object and reader.algebra.block(equation) is not None
 
 
-@_rule("dot_general")
+_reducing("sum", lax.add_p, np.add)
+_reducing("prod", lax.mul_p, np.multiply)
+_reducing("and", lax.and_p, np.bitwise_and)
+_reducing("or", lax.or_p, np.bitwise_or)
+_reducing("max", lax.max_p, np.maximum)
+_reducing("min", lax.min_p, np.minimum)
+
+
+@rule("dot_general")
 def _dot(reader, equation, x, y):
-    (x_sum, y_sum), (x_batch, y_batch) = equation.params["dimension_numbers"]
-    aval = equation.outvars[0].aval
-    if any(atom.aval.dtype != aval.dtype for atom in equation.invars):
+    p, aval = equation.params, equation.outvars[0].aval
+    (x_sum, y_sum), (x_batch, y_batch) = p["dimension_numbers"]
+    plain = p["precision"] is None or set(np.ravel(p["precision"])) <= set(lax.Precision)  # type: ignore[arg-type]
+    if not plain or aval.dtype.kind != "f" or any(atom.aval.dtype != aval.dtype for atom in equation.invars):
         return NotImplemented
 
     def rows(array, batch, summed):
         free = [d for d in range(array.ndim) if d not in (*batch, *summed)]
         sizes = [math.prod(array.shape[d] for d in dims) for dims in (batch, free, summed)]
-        return objects(array).transpose(*batch, *free, *summed).reshape(sizes)
+        return array.transpose(*batch, *free, *summed).reshape(sizes)
 
     x, y = rows(x, x_batch, x_sum), rows(y, y_batch, y_sum)
-    products = np.frompyfunc(reader.mul, 2, 1)(x[:, :, None], y[:, None])
+    numbers = _at_once(reader, lambda x, y: x @ y.swapaxes(1, 2), x, y)
+    if numbers is not None:
+        return numbers.reshape(aval.shape)
+    reader.spend(x.size * y.shape[1])
+    products = np.frompyfunc(reader.mul, 2, 1)(objects(x)[:, :, None], objects(y)[:, None])
     if products.size == 0:
         return np.zeros(aval.shape, aval.dtype)
     return np.frompyfunc(reader.add, 2, 1).reduce(products, -1).reshape(aval.shape)
@@ -153,7 +181,7 @@ def _windows(starts, shape, sizes, start_dims, batch_dims, start_batch_dims, cli
         yield at, tuple(slice(i, i + n) for i, n in zip(start, sizes, strict=True)) if fits else None
 
 
-@_rule("gather")
+@rule("gather")
 def _gathered(reader, equation, x, starts):
     p, how = equation.params, equation.params["dimension_numbers"]
     if starts.dtype == object:
@@ -171,12 +199,13 @@ def _gathered(reader, equation, x, starts):
     return out
 
 
-def _scattering(name: str, method: Callable) -> None:
-    @_rule(name)
+def _scattering(name: str, primitive: core.Primitive | None) -> None:
+    @rule(name)
     def scattered(reader, equation, x, starts, updates):
         p, how = equation.params, equation.params["dimension_numbers"]
-        if starts.dtype == object:
-            return NotImplemented
+        if starts.dtype == object or (primitive is None and p["update_jaxpr"] is not None):
+            return NotImplemented  # the latter applies a function to what stands there
+        combine = functools.partial(reader.apply, primitive, {}, equation.outvars[0].aval.dtype)
         x, updates = objects(x).copy(), objects(updates)
         part = np.moveaxis(updates, [d for d in range(updates.ndim) if d not in how.update_window_dims], range(starts.ndim - 1))
         gone = (*how.inserted_window_dims, *how.operand_batching_dims)
@@ -186,16 +215,17 @@ def _scattering(name: str, method: Callable) -> None:
         clip = p["mode"] == lax.GatherScatterMode.CLIP
         for at, window in _windows(starts, x.shape, sizes, how.scatter_dims_to_operand_dims, *batch, clip):
             if window is not None:
-                x[window] = each(functools.partial(method, reader), x[window], part[(*at, ...)].reshape(sizes))
+                update = part[(*at, ...)].reshape(sizes)
+                x[window] = update if primitive is None else each(combine, x[window], update)
         return x
 
 
-_scattering("scatter", lambda reader, old, new: new)
-_scattering("scatter-add", Folding.add)
-_scattering("scatter-mul", Folding.mul)
+_scattering("scatter", None)
+_scattering("scatter-add", lax.add_p)
+_scattering("scatter-mul", lax.mul_p)
 
 
-@_rule("dynamic_slice", "dynamic_update_slice")
+@rule("dynamic_slice", "dynamic_update_slice")
 def _at_start(reader, equation, x, *rest):
     updates, starts = (rest[:1], rest[1:]) if equation.primitive is lax.dynamic_update_slice_p else ((), rest)
     if any(start.dtype == object for start in starts):
@@ -209,88 +239,49 @@ def _at_start(reader, equation, x, *rest):
     return x
 
 
-# Linear algebra.
-
-
-@_rule("cholesky")
-def _cholesky(reader, equation, A):
-    dtype = equation.outvars[0].aval.dtype
-    L = objects(np.zeros(A.shape, dtype))
-    for at in np.ndindex(A.shape[:-2]):
-        a, l = objects(A[at]), L[at]
-        for j in range(len(a)):
-            for i in range(j, len(a)):
-                rest = functools.reduce(reader.sub, map(reader.mul, l[i, :j], l[j, :j]), a[i, j])
-                l[i, j] = reader.mul(rest, reader.div(dtype.type(1), l[j, j])) if i > j else reader.apply(lax.sqrt_p, {}, dtype, rest)
-    return L
-
-
-@_rule("triangular_solve")
-def _triangular_solve(reader, equation, A, B):
-    p, one = equation.params, equation.outvars[0].aval.dtype.type(1)
-    turned = p["transpose_a"] == p["left_side"]  # A X = B is solved, with A or Aᵀ, for X or, where X stands on the left, Xᵀ
-    A, X = objects(A.swapaxes(-1, -2) if turned else A), objects(B).copy()
-    for at in np.ndindex(A.shape[:-2]):
-        a, x = A[at], X[at] if p["left_side"] else X[at].T
-        upwards = p["lower"] == turned
-        for i in reversed(range(len(a))) if upwards else range(len(a)):
-            known = slice(i + 1, None) if upwards else slice(i)
-            for k in range(x.shape[1]):
-                rest = functools.reduce(reader.sub, map(reader.mul, a[i, known], x[known, k]), x[i, k])
-                x[i, k] = rest if p["unit_diagonal"] else reader.mul(rest, reader.div(one, a[i, i]))
-    return X
-
-
-@_rule("lu")
-def _lu(reader, equation, A):
-    """P A = L U where the algebra has no numbers to choose pivots by: the first that is not zero serves."""
-    if reader.algebra.block(equation) is not None:
-        return NotImplemented
-    *batch, rows, columns = A.shape
-    A = objects(A).copy()
-    pivots = np.zeros((*batch, min(rows, columns)), np.int32)
-    permutation = np.broadcast_to(np.arange(rows, dtype=np.int32), (*batch, rows)).copy()
-    for at in np.ndindex(*batch):
-        a = A[at]
-        for j in range(min(rows, columns)):
-            k = pivots[(*at, j)] = next((i for i in range(j, rows) if isinstance(a[i, j], Entry) or a[i, j] != 0), j)
-            for swapped in (a, permutation[at]):
-                swapped[[j, k]] = swapped[[k, j]]
-            for i in range(j + 1, rows):
-                a[i, j] = reader.div(a[i, j], a[j, j])
-                a[i, j + 1 :] = [reader.sub(x, reader.mul(a[i, j], y)) for x, y in zip(a[i, j + 1 :], a[j, j + 1 :], strict=True)]
-    return [A, pivots, permutation]
-
-
-@_rule("custom_linear_solve")
-def _linear_solve(reader, equation, *operands):
-    """The solution written out; where the algebra differentiates, it gets its derivative from the equation it solves."""
-    lengths, solve = equation.params["const_lengths"], equation.params["jaxprs"].solve
-    before, right, function = lengths.matvec + lengths.vecmat, operands[sum(lengths) :], reader.algebra.block(equation)
-    if function is not None:
-        held = lambda x: reader.new(x.dtype, "held", lax.stop_gradient, (x,)) if isinstance(x, Entry) else x
-        right = [each(held, x) for x in right]
-    x = reader.inner(solve, [*operands[before : before + lengths.solve], *right])
-    if function is None:
-        return x
-    # What comes out as a number is one whatever the operands are, and so is its derivative.
-    whole = reader.block(function, [*x, *operands], equation.outvars)
-    return [each(lambda x, entry: entry if isinstance(x, Entry) else x, *pair) for pair in zip(x, whole, strict=True)]
-
-
 # Calls and loops.
+
+LONG = 1000  # operations on numbers: some 20 ms in Python, less than a program takes to compile
 
 
 CALLS = ("jit", "pjit", "closed_call", "core_call", "remat", "remat2", "checkpoint")  # equations that call a program and do nothing else
 
+RULED = ("custom_jvp_call", "custom_vjp_call", "custom_vjp_call_jaxpr")  # and those that have a derivative rule of their own
+
 
 def body(equation: Any) -> Any:
     """The program that an equation calls, closed."""
-    program = next(equation.params[name] for name in ("jaxpr", "call_jaxpr", "fun_jaxpr") if name in equation.params)
+    p = equation.params
+    program = p["jaxprs"].solve if "jaxprs" in p else next(p[name] for name in ("jaxpr", "call_jaxpr", "fun_jaxpr") if name in p)
     return program if hasattr(program, "consts") else core.ClosedJaxpr(program, ())
 
 
-@_rule(*CALLS)
+def primitives(program: Any) -> Iterator[str]:
+    """The names of all that a program does, also within the programs it calls."""
+    for equation in getattr(program, "jaxpr", program).eqns:
+        yield equation.primitive.name
+        for value in equation.params.values():
+            for part in value if isinstance(value, (tuple, list)) else [value]:
+                if hasattr(part, "eqns") or hasattr(part, "jaxpr"):
+                    yield from primitives(part)
+
+
+def turns(equation: Any) -> int | float:
+    """How many operations a rule here would make of numbers one by one."""
+    name, p = equation.primitive.name, equation.params
+    if name == "while":
+        return math.inf  # as long as it takes
+    if name == "cond":
+        return max(sum(map(turns, branch.jaxpr.eqns)) for branch in p["branches"])
+    if name in (*CALLS, *RULED, "scan", "custom_linear_solve"):
+        return p.get("length", 1) * sum(map(turns, body(equation).jaxpr.eqns))
+    if name in ("cholesky", "lu", "triangular_solve"):
+        return equation.invars[0].aval.size * equation.invars[0].aval.shape[-1]
+    windows = math.prod(equation.invars[1].aval.shape[:-1]) if name.startswith(("gather", "scatter")) else 1
+    return windows + equation.invars[0].aval.size if name.startswith("scatter") else windows
+
+
+@rule(*CALLS)
 def _called(reader, equation, *operands):
     shortcut = reader.algebra.shortcut(equation)
     if shortcut is not None and any(x.dtype == object for x in operands):
@@ -298,38 +289,38 @@ def _called(reader, equation, *operands):
     return reader.inner(body(equation), operands)
 
 
-@_rule("custom_jvp_call", "custom_vjp_call", "custom_vjp_call_jaxpr")
+@rule(*RULED)
 def _with_rule(reader, equation, *operands):
     """Taken apart, unless the algebra differentiates what is no number: then it stays in one piece, with its rule."""
     results, known = _called(reader, equation, *operands), all(x.dtype != object for x in operands)
     return results if known or reader.algebra.block(equation) is None else NotImplemented
 
 
-@_rule("platform_index")
+@rule("platform_index")
 def _platform(reader, equation):
     fits = [names is None or jax.default_backend() in names for names in equation.params["platforms"]]
     return np.asarray(fits.index(True), np.int32)
 
 
-@_rule("cond")
+@rule("cond")
 def _branch(reader, equation, index, *operands):
     branches = equation.params["branches"]
     return NotImplemented if index.dtype == object else reader.inner(branches[min(max(int(index), 0), len(branches) - 1)], operands)
 
 
-@_rule("while")
+@rule("while")
 def _while(reader, equation, *operands):
     p = equation.params
     i, j = p["cond_nconsts"], p["cond_nconsts"] + p["body_nconsts"]
     condition, consts, state = operands[:i], operands[i:j], list(operands[j:])
-    while (goes_on := reader.inner(p["cond_jaxpr"], [*condition, *state])[0]).dtype != object:
+    while (goes_on := reader.inner(p["cond_jaxpr"], [*condition, *state])[0]).dtype != object and goes_on.ndim == 0:
         if not goes_on:
             return state
         state = reader.inner(p["body_jaxpr"], [*consts, *state])
     return NotImplemented
 
 
-@_rule("scan")
+@rule("scan")
 def _scan(reader, equation, *operands):
     p = equation.params
     i, j = p["num_consts"], p["num_consts"] + p["num_carry"]

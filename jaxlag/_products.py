@@ -14,9 +14,10 @@ import numpy as np
 from jax.extend.core import Literal
 from jaxtyping import Array, Float
 
-from ._entries import Reader, is_extended, on_arrays, settled
+from ._entries import Reader, settled
 from ._folding import Algebra, UnknownPrimitive
 from ._kernel import length
+from ._arithmetic import is_extended, is_known, on_arrays
 from ._primitives import CALLS, body
 
 SHORT = 200  # equations; what is longer is scalar code, whose entries cost less one by one
@@ -67,7 +68,8 @@ def _step(equation, operands):
     """The outputs of one equation."""
     name, moving = equation.primitive.name, [isinstance(x, list) for x in operands]
     shapes = [atom.aval.shape for atom in equation.invars]
-    if any(map(is_extended, [*equation.invars, *equation.outvars])):
+    atoms = [*equation.invars, *equation.outvars]
+    if any(map(is_extended, atoms)) or (any(moving) and not all(map(is_known, atoms))):
         raise UnknownPrimitive(equation.primitive, [equation.source_info])
     if name in CALLS or (name == "custom_jvp_call" and any(moving)):
         return _run(body(equation).jaxpr, body(equation).consts, operands)

@@ -12,8 +12,9 @@ import numpy as np
 from jax import lax
 from jax.extend import core
 
-from ._entries import Reader, evaluate, on_arrays, opened, shaped
+from ._entries import Reader, evaluate, opened, shaped
 from ._folding import Algebra, Arrays, TooLong, UnknownPrimitive, filled, is_number, objects
+from ._arithmetic import on_arrays
 
 
 class _Jax(Algebra):
@@ -37,7 +38,8 @@ def scalarised(function: Callable, *, limit: int = 700) -> Callable:
     """`function` of pytrees of arrays as scalar code: the same values and derivatives, to rounding, in less time where it is small.
 
     What is not taken apart (a decomposition, a loop of unknown length) works on arrays as before, and a function of more than
-    `limit` scalar operations does so altogether. What an infinity or a NaN would have made of 0·x or x − x is not kept.
+    `limit` scalar operations does so altogether, and so does one with complex numbers or half precision among what varies. What an
+    infinity or a NaN would have made of 0·x, x − x or (1/√x)² is not kept, nor the sign of a zero but where an angle asks for it.
     """
     # 700: a chain of 5 links has 633, and takes half the time of arrays; one of 6 links has 838, and its first derivative would take
     # four times as long to compile, a further one twice as long (tests/benchmarks/bench_entries.py --limit 100000).
@@ -81,12 +83,13 @@ def _together(array: np.ndarray, dtype) -> jax.Array:
 def _free(arrays: Iterable[np.ndarray]) -> tuple[list, Callable[[list], Arrays]]:
     """The scalars of arrays that are no numbers, and the arrays with others in their place."""
     arrays = list(arrays)
-    flat = [x for array in arrays for x in array.flat]
-    places = [i for i, x in enumerate(flat) if not is_number(x)]
+    flat, shapes = [x for array in arrays for x in array.flat], [array.shape for array in arrays]
+    numbers = {i: x for i, x in enumerate(flat) if is_number(x)}  # no others: what is traced would be held for as long as the program is
+    places = [i for i in range(len(flat)) if i not in numbers]
 
     def filled(scalars):
-        every = dict(enumerate(flat)) | dict(zip(places, scalars, strict=True))
-        return shaped([every[i] for i in range(len(flat))], [array.shape for array in arrays])
+        every = numbers | dict(zip(places, scalars, strict=True))
+        return shaped([every[i] for i in range(len(every))], shapes)
 
     return [flat[i] for i in places], filled
 
@@ -116,6 +119,7 @@ def _linear_solve_in_scalars(equation, *arrays):
     """The solution x of A x = b as it was written out; its derivative solves A dx = db − dA x, as `custom_linear_solve` has it."""
     lengths, jaxprs, avals = equation.params["const_lengths"], equation.params["jaxprs"], [v.aval for v in equation.outvars]
     (x, with_x), (given, with_given) = _free(arrays[: len(avals)]), _free(arrays[len(avals) :])
+    is_free = [not is_number(entry) for array in arrays[: len(avals)] for entry in array.flat]
     splits = np.cumsum([0, *lengths])
     joined = lambda arrays: _together(np.concatenate([objects(x).reshape(-1) for x in arrays]), avals[0].dtype)
 
@@ -137,7 +141,6 @@ def _linear_solve_in_scalars(equation, *arrays):
         _, right = jax.jvp(defect, (given,), (tangents[1],))
         symmetric = jaxprs.vecmat is jaxprs.matvec
         dx = lax.custom_linear_solve(function(0, given), right, function(2, given), function(3, given), symmetric=symmetric)
-        is_free = [not is_number(entry) for array in arrays[: len(avals)] for entry in array.flat]
         return x, [entry for entry, free in zip(_apart(dx).flat, is_free, strict=True) if free]
 
     return with_x(solution(x, given))

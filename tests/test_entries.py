@@ -11,10 +11,11 @@ import pytest
 from jax import lax
 
 import jaxlag as jl
-from jaxlag import _entries
+from jaxlag import _arithmetic
 from jaxlag._entries import evaluate
-from jaxlag._folding import Algebra, TooLong, UnknownPrimitive, filled, folded
+from jaxlag._folding import Algebra, TooLong, UnknownPrimitive, filled
 from jaxlag._multipliers import constrained_acceleration
+from jaxlag._arithmetic import folded
 from jaxlag._scalarised import JAX_ALGEBRA, _apart, scalarised
 from jaxlag._system import bind
 from jaxlag.examples import pendulum, vehicle
@@ -375,7 +376,7 @@ def test_numbers_are_computed_without_being_compiled(monkeypatch):
     cube.defjvp(lambda primals, tangents: (cube(*primals), 3 * primals[0] ** 2 * tangents[0]))
     scaled = lambda x: lax.optimization_barrier(x) * jnp.sqrt(cube(jnp.arange(1.0, 5.0)))
     with monkeypatch.context() as patched:
-        patched.setattr(_entries, "on_arrays", None)
+        patched.setattr(_arithmetic, "on_arrays", None)
         names = operations(scalarised(scaled), v)
     assert {name: names.count(name) for name in ("mul", "sqrt", "integer_pow")} == {"mul": 3, "sqrt": 0, "integer_pow": 0}
     close(scalarised(scaled)(v), scaled(v))

@@ -13,8 +13,10 @@ import jaxlag
 
 PACKAGE = pathlib.Path(jaxlag.__file__).parent
 ORDER = [
+    "_arithmetic",
     "_folding",
     "_primitives",
+    "_elimination",
     "_entries",
     "_scalarised",
     "_kernel",

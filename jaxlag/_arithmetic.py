@@ -1,0 +1,95 @@
+"""Equations of numbers, computed while a program is read: by NumPy, which compiles nothing, or by JAX itself where they are not alike."""
+
+import functools
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import numpy as np
+from jax.extend import core
+
+KNOWN = frozenset(map(np.dtype, ("bool", *(f"{sign}int{bits}" for sign in ("", "u") for bits in (8, 16, 32, 64)), "float32", "float64")))
+
+
+def is_known(atom: Any) -> bool:
+    """Whether NumPy and JAX compute alike with its entries; with complex numbers or half precision that is not certain."""
+    return not is_extended(atom) and np.dtype(atom.aval.dtype) in KNOWN
+
+
+def is_extended(atom: Any) -> bool:
+    """Whether its entries are no numbers at all, as those of a random key."""
+    return jax.dtypes.issubdtype(atom.aval.dtype, jax.dtypes.extended)
+
+
+def folded(primitive: core.Primitive, params: dict, dtype: Any, *numbers: Any) -> Any:
+    """An element-wise primitive of numbers, as JAX computes it."""
+    function = ELEMENTWISE.get(primitive.name)
+    result = converted(numbers[0], dtype) if primitive.name == "convert_element_type" else function(*numbers) if function else None
+    if result is None:
+        with jax.ensure_compile_time_eval():
+            return np.asarray(primitive.bind(*numbers, **params))[()]
+    return np.asarray(result).astype(dtype)[()]
+
+
+def converted(x: Any, dtype: Any) -> Any:
+    """In another dtype; None where a number has no place in it, which NumPy and XLA take differently."""
+    if np.dtype(dtype).kind in "iu" and x.dtype.kind == "f":
+        ends = np.iinfo(dtype)
+        return x.astype(dtype) if np.all((x > float(ends.min)) & (x < float(ends.max))) else None
+    return x.astype(dtype)
+
+
+def _quotient(x, y):
+    if x.dtype.kind == "f":
+        return x / y
+    return None if np.any(y == 0) else (x - np.fmod(x, y)) // y
+
+
+def _remainder(x, y):
+    return None if x.dtype.kind != "f" and np.any(y == 0) else np.fmod(x, y)
+
+
+# Element-wise primitives, and how numbers are folded; None: by JAX itself, as where the function gives None.
+
+ELEMENTWISE: dict[str, Callable | None] = {
+    **dict(add=np.add, add_any=np.add, sub=np.subtract, mul=np.multiply, neg=np.negative, abs=np.abs, sign=np.sign, pow=np.power),
+    **dict(exp=np.exp, exp2=np.exp2, log=np.log, log1p=np.log1p, expm1=np.expm1, sqrt=np.sqrt, cbrt=np.cbrt),
+    **dict(sin=np.sin, cos=np.cos, tan=np.tan, asin=np.arcsin, acos=np.arccos, atan=np.arctan, atan2=np.arctan2),
+    **dict(sinh=np.sinh, cosh=np.cosh, tanh=np.tanh, asinh=np.arcsinh, acosh=np.arccosh, atanh=np.arctanh),
+    **dict(eq=np.equal, ne=np.not_equal, lt=np.less, le=np.less_equal, gt=np.greater, ge=np.greater_equal, is_finite=np.isfinite),
+    "max": np.maximum,
+    "min": np.minimum,
+    "and": np.bitwise_and,
+    "or": np.bitwise_or,
+    "xor": np.bitwise_xor,
+    "not": np.invert,
+    "div": _quotient,
+    "rem": _remainder,
+    "rsqrt": lambda x: 1 / np.sqrt(x),
+    "floor": np.floor,
+    "ceil": np.ceil,
+    "clamp": lambda low, x, high: np.minimum(np.maximum(low, x), high),
+    "select_n": lambda which, *cases: np.choose(which, cases, mode="clip"),
+    "stop_gradient": lambda x: x,
+    **dict.fromkeys(("round", "logistic", "erf", "erfc", "erf_inv", "lgamma", "digamma")),
+}
+
+
+def on_arrays(equation: Any) -> Callable[..., list]:
+    """The equation as a function of its operands."""
+    places = {atom: i for i, atom in enumerate(equation.invars) if not isinstance(atom, core.Literal)}
+    jaxpr = _nothing().replace(invars=list(places), outvars=equation.outvars, eqns=[equation], effects=equation.effects)
+    function = core.jaxpr_as_fun(core.ClosedJaxpr(jaxpr, ()))
+    return lambda *operands: function(*(operands[i] for i in places.values()))
+
+
+@functools.cache
+def _nothing() -> Any:
+    """A program that does nothing."""
+    return jax.make_jaxpr(lambda: ())().jaxpr
+
+
+def by_jax(equation: Any, operands: Any) -> list[np.ndarray]:
+    """The outputs of an equation of numbers, as JAX computes them now."""
+    with jax.ensure_compile_time_eval():
+        return [np.asarray(x) for x in on_arrays(equation)(*operands)]

@@ -1,0 +1,330 @@
+"""Random programs over the operations of `jax.lax`, and their rewritten form beside the plain one.
+
+python tests/programs.py FIRST LAST     compares the programs of these seeds and prints what differs
+
+Programs are not compiled, which is what takes time: the plain one is run by JAX, equation by equation, and the rewritten one on NumPy's
+scalars, with what is not taken apart run by JAX.
+"""
+
+import functools
+import sys
+from typing import NamedTuple
+
+import jax
+import jax.extend
+import jax.numpy as jnp
+import numpy as np
+from operations import OPERATIONS, SHAPES
+
+from jaxlag import _scalarised
+from jaxlag._entries import Reader, opened
+from jaxlag._folding import TooLong, UnknownPrimitive, filled
+from jaxlag._arithmetic import KNOWN, folded
+from jaxlag._primitives import CALLS, RULED, body, primitives
+
+SIZE = 3  # of x and of v
+LIMIT = 5000
+LARGE = 50.0  # numbers that grow beyond say little about what comes after
+DTYPES = {"f": "float64", "g": "float32", "c": "complex128", "i": "int32", "u": "uint8", "b": "bool", "h": "bfloat16", "e": "float16"}
+
+
+# The plain program, equation by equation.
+
+
+def plain(program, *operands):
+    """The outputs of a program, as JAX computes its equations one by one; loops turn in Python."""
+    jaxpr, consts = getattr(program, "jaxpr", program), getattr(program, "consts", ())
+    env = dict(zip([*jaxpr.constvars, *jaxpr.invars], [*consts, *operands], strict=True))
+    read = lambda atom: atom.val if hasattr(atom, "val") else env[atom]
+    for equation in jaxpr.eqns:
+        env |= dict(zip(equation.outvars, once(equation, *map(read, equation.invars)), strict=True))
+    return [read(atom) for atom in jaxpr.outvars]
+
+
+def _broadcast(p, x):
+    x = np.expand_dims(x, [d for d in range(len(p["shape"])) if d not in p["broadcast_dimensions"]])
+    return np.broadcast_to(x, p["shape"])
+
+
+def _elementwise(**functions):
+    return {name: lambda p, *operands, function=function: function(*operands) for name, function in functions.items()}
+
+
+# What most equations do, and on arrays of many shapes, each of which JAX would compile; NumPy and JAX agree on double precision.
+BY_NUMPY = {
+    **_elementwise(add=np.add, add_any=np.add, sub=np.subtract, mul=np.multiply, div=np.divide, neg=np.negative, sin=np.sin, cos=np.cos),
+    **_elementwise(exp=np.exp, log=np.log, sqrt=np.sqrt, tanh=np.tanh, square=np.square, abs=np.abs, sign=np.sign, copy=np.array),
+    **_elementwise(gt=np.greater, lt=np.less, ge=np.greater_equal, le=np.less_equal, eq=np.equal, ne=np.not_equal),
+    **_elementwise(select_n=lambda which, no, yes: np.where(which, yes, no), convert_element_type=lambda x: x),
+    "reshape": lambda p, x: np.reshape(x, p["new_sizes"]),
+    "squeeze": lambda p, x: np.squeeze(x, tuple(p["dimensions"])),
+    "transpose": lambda p, x: x.transpose(p["permutation"]),
+    "broadcast_in_dim": _broadcast,
+    "concatenate": lambda p, *xs: np.concatenate(xs, p["dimension"]),
+    "reduce_sum": lambda p, x: np.sum(x, tuple(p["axes"])),
+    "integer_pow": lambda p, x: x ** float(p["y"]),
+}
+
+
+def once(equation, *operands):
+    """The outputs of one equation."""
+    name, p = equation.primitive.name, equation.params
+    if name in (*CALLS, *RULED):
+        return plain(body(equation), *operands)
+    if name == "custom_linear_solve":
+        lengths = p["const_lengths"]
+        at = lengths.matvec + lengths.vecmat
+        return plain(p["jaxprs"].solve, *operands[at : at + lengths.solve], *operands[sum(lengths) :])
+    if name == "cond":
+        return plain(p["branches"][min(max(int(operands[0]), 0), len(p["branches"]) - 1)], *operands[1:])
+    if name == "while":
+        i, j = p["cond_nconsts"], p["cond_nconsts"] + p["body_nconsts"]
+        state = operands[j:]
+        while np.any(goes_on := plain(p["cond_jaxpr"], *operands[:i], *state)[0]):  # in a batch, until the last has ended
+            turned = plain(p["body_jaxpr"], *operands[i:j], *state)
+            which = [np.reshape(goes_on, np.shape(goes_on) + (1,) * (np.ndim(new) - np.ndim(goes_on))) for new in turned]
+            state = [np.where(*parts) for parts in zip(which, turned, state, strict=True)]
+        return list(state)
+    if name == "scan":
+        i, j = p["num_consts"], p["num_consts"] + p["num_carry"]
+        carry, rows = operands[i:j], {}
+        for k in reversed(range(p["length"])) if p["reverse"] else range(p["length"]):
+            outs = plain(p["jaxpr"], *operands[:i], *carry, *(np.asarray(x)[k] for x in operands[j:]))
+            carry, rows[k] = outs[: p["num_carry"]], outs[p["num_carry"] :]
+        return [*carry, *(np.stack(column) for column in zip(*(map(np.asarray, rows[k]) for k in sorted(rows)), strict=True))]
+    given = [np.asarray(x, atom.aval.dtype) for x, atom in zip(operands, equation.invars, strict=True)]
+    if name in BY_NUMPY and all(v.aval.dtype in (np.float64, np.bool_) for v in (*equation.invars, *equation.outvars)):
+        with np.errstate(all="ignore"):
+            return [np.asarray(BY_NUMPY[name](p, *given), equation.outvars[0].aval.dtype)]
+    outs = equation.primitive.bind(*given, **p)
+    return [np.asarray(out) for out in (outs if equation.primitive.multiple_results else [outs])]
+
+
+# The rewritten one.
+
+
+class OnNumbers(type(_scalarised.JAX_ALGEBRA)):
+    """What production takes apart, on NumPy's scalars."""
+
+    def function(self, primitive, params, dtype):
+        return lambda *numbers: folded(primitive, params, dtype, *numbers)
+
+    def block(self, equation):
+        def whole(*arrays):
+            given = arrays[-len(equation.invars) :]  # a linear solve hands over its solution before them
+            numbers = [np.array(x.tolist(), atom.aval.dtype).reshape(x.shape) for x, atom in zip(given, equation.invars, strict=True)]
+            return [filled(x.shape, x.reshape(-1)) for x in map(np.asarray, once(equation, *numbers))]
+
+        return whole
+
+
+def rewritten(closed, *operands):
+    """The outputs of the rewritten program, and whether it is another one than the plain."""
+    reader = Reader(OnNumbers(), LIMIT)
+    try:
+        inputs, outputs = opened(closed, reader)
+    except (TooLong, UnknownPrimitive):
+        return plain(closed, *operands), False
+    arrays = [*closed.consts, *operands]
+    pairs = [(entries, np.asarray(array)) for entries, array in zip(inputs, arrays, strict=True) if entries.dtype == object]
+    given = {entry: x for entries, array in pairs for entry, x in zip(entries.flat, array.flat, strict=True)}
+    with np.errstate(all="ignore"):
+        found = reader.values(outputs, given)
+    return [np.array(x.tolist(), v.aval.dtype).reshape(x.shape) for x, v in zip(found, closed.jaxpr.outvars, strict=True)], True
+
+
+# Programs.
+
+
+class Program(NamedTuple):
+    """A function of two vectors: steps that each take earlier values, shared among them."""
+
+    steps: tuple  # (name, function, where its operands stand)
+    constants: tuple
+    weights: np.ndarray
+
+    def __call__(self, x, v):
+        """All that the last steps give, as real numbers."""
+        values = [x, v, *map(jnp.asarray, self.constants)]
+        for _, function, places in self.steps:
+            values += function(*(values[k] for k in places))
+        return jnp.concatenate([jnp.ravel(real(value)) for value in values[-3:]])
+
+    def scalar(self, x, v):
+        """A weighted sum of it."""
+        parts = self(x, v)
+        return jnp.sum(parts * self.weights[: parts.size]) + jnp.sum(parts**2) / 8
+
+    @property
+    def names(self):
+        """Of its operations."""
+        return [name for name, _, _ in self.steps]
+
+
+def real(value):
+    """Its numbers as real ones."""
+    value = jnp.asarray(value)
+    if jnp.iscomplexobj(value):
+        value = jnp.stack([value.real, value.imag])
+    return value.astype(float)
+
+
+def program(seed, longest=60):
+    """The program of a seed, with the numbers at which it is run."""
+    rng = np.random.default_rng(seed)
+    x, v = rng.uniform(-1.5, 1.5, SIZE), rng.uniform(-1.5, 1.5, SIZE)
+    constants = [constant(rng, kind, SHAPES[rng.integers(len(SHAPES))]) for kind in rng.choice([*DTYPES, "f", "f", "f"], 3)]
+    values, steps = [x, v, *constants], []
+    real_only = rng.random() < 0.6  # one operation of another kind leaves the whole as it is
+    length = 5 + int((longest - 4) * rng.random() ** 3)  # most are short, and tell as much in less time
+    for _ in range(3 * length):
+        if len(steps) == length:
+            break
+        at = int(rng.integers(len(OPERATIONS)))
+        name, kinds, _ = OPERATIONS[at]
+        if real_only and set(kinds) & set("che"):
+            continue
+        places = chosen(rng, kinds, values)
+        if places is None:
+            continue
+        given = [values[k] for k in places]
+        closed = operation(at, *(jax.ShapeDtypeStruct(x.shape, x.dtype) for x in given))
+        outs = plain(closed, *given)
+        if real_only and any(o.dtype not in KNOWN for o in outs):
+            continue
+        if all(o.size <= 12 and is_tame(o) for o in outs):
+            steps.append((name, jax.extend.core.jaxpr_as_fun(closed), places))
+            values += outs
+    return Program(tuple(steps), tuple(constants), rng.uniform(0.5, 1.5, 200)), x, v
+
+
+@functools.cache
+def operation(at, *shapes):
+    """One of the operations as a program, traced once."""
+    return jax.make_jaxpr(OPERATIONS[at][2])(*shapes)
+
+
+def constant(rng, kind, shape):
+    """Numbers of a kind, a zero and equal ones among them."""
+    numbers = rng.choice([0.0, 1.0, -1.0, 2.0, 0.5, *rng.uniform(-2, 2, 4)], shape)
+    return np.asarray(numbers + 1j * rng.uniform(-1, 1, shape) if kind == "c" else np.abs(numbers) if kind == "u" else numbers).astype(
+        jnp.dtype(DTYPES[kind])
+    )
+
+
+def chosen(rng, kinds, values):
+    """Where operands of these kinds stand: a letter for the dtype, then one for the shape, where "s" is the same for all."""
+    same, places = None, []
+    for kind, shape in kinds.split(","):
+        wanted = {"v": (3,), "m": (2, 3), "q": (3, 3), ".": (), "s": same}.get(shape)
+        alike = [k for k, x in enumerate(values) if x.dtype == jnp.dtype(DTYPES[kind]) and wanted in (None, x.shape)]
+        if not alike:
+            return None
+        places.append(int(rng.choice(alike[-6:] if rng.random() < 0.7 else alike)))
+        same = values[places[-1]].shape if shape == "s" else same
+    return tuple(places)
+
+
+def is_tame(array):
+    return bool(np.all(np.isfinite(array.astype(complex))) and np.all(np.abs(array.astype(complex)) < LARGE))
+
+
+# What is compared.
+
+
+def energies(run):
+    """Lagrange's terms of ½ v·v + a program, in plain JAX: ∂L/∂q, p, M, the force of Coriolis and centrifugal terms."""
+    L = lambda x, v: 0.5 * v @ v + run.scalar(x, v)
+    p = jax.grad(L, 1)
+    return lambda x, v: [jax.grad(L)(x, v), p(x, v), jax.jacfwd(p, 1)(x, v), jax.jvp(lambda x: p(x, v), (x,), (v,))[1]]
+
+
+FORMS = {
+    "value": lambda run: lambda x, v: [run(x, v)],
+    "batch": lambda run: lambda x, v: [jax.vmap(run)(jnp.stack([x, v]), jnp.stack([v, x]))],
+    "gradient": lambda run: lambda x, v: jax.grad(run.scalar, (0, 1))(x, v),
+    "Jacobian": lambda run: lambda x, v: [jax.jacfwd(run)(x, v)],
+    "energies": energies,
+    "curvature of a batch": lambda run: lambda x, v: [jax.vmap(jax.jacfwd(jax.grad(run.scalar)))(jnp.stack([x, v]), jnp.stack([v, x]))],
+}
+
+
+NO_DERIVATIVE = ("not implemented", "rule", "differentiat", "Reverse-mode", "forward-mode", "complex", "float0", "NYI")
+
+
+def traced(function, *arguments):
+    """Its program; None where JAX has no derivative of it, or one of a loop that it must know beforehand."""
+    try:
+        closed = jax.make_jaxpr(function)(*arguments)
+        return None if "custom_lin" in primitives(closed) else closed
+    except (NotImplementedError, TypeError, ValueError) as error:
+        if any(
+            part in str(error)
+            for part in ("not implemented", "rule", "differentiat", "Reverse-mode", "complex", "float0", "forward-mode", "NYI")
+        ):
+            return None
+        raise
+
+
+def differs(found, run, x, v, single):
+    """How far numbers are from those of a plain program, beyond what an error of some roundings in its input makes of them."""
+    expected = run(x, v)
+    rounding = 1e-6 if single else 1e-14
+    scale = 1 + max((np.max(np.abs(b)) for b in expected if np.size(b)), default=0)
+    if not np.isfinite(scale):
+        return 0.0
+    error = max((np.max(np.abs(np.asarray(a) - b)) for a, b in zip(found, expected, strict=True) if np.size(b)), default=0)
+    if error <= 1e4 * rounding * scale:
+        return 0.0
+    rng = np.random.default_rng(0)
+    near = lambda z: z * (1 + rounding * rng.uniform(-1, 1, z.shape))
+    spread = max(np.max(np.abs(a - b)) for _ in range(6) for a, b in zip(run(near(x), near(v)), expected, strict=True) if np.size(b))
+    return 0.0 if error <= 1e3 * spread or not np.isfinite(spread) else float(error)
+
+
+def compared(seed):
+    """For the program of a seed, and a form of it: the form, whether it was rewritten, the error."""
+    run, x, v = program(seed)
+    form = list(FORMS)[seed % len(FORMS)]
+    closed = traced(FORMS[form](run), x, v)
+    if closed is None:
+        form, closed = "value", jax.make_jaxpr(FORMS["value"](run))(x, v)
+    single = "f32[" in str(closed)
+    found, other = rewritten(closed, x, v)
+    error = differs(found, functools.partial(plain, closed), x, v, single)
+    if other and not error and seed % 8 == 0:  # derivatives of the rewritten program itself, as production makes it
+        written_out, one = _scalarised._written_out(FORMS[form](run), LIMIT), np.ones(SIZE)
+        along = lambda f: lambda x, v: jax.jvp(f, (x, v), (one, -one))[1]
+        closed = traced(along(FORMS[form](run)), x, v)
+        if closed is not None:
+            slope = traced(along(written_out), x, v)
+            error = differs(plain(slope, x, v), functools.partial(plain, closed), x, v, single)
+            form = f"slope of {form}"
+    return form, other, error, run
+
+
+def main(first, last):
+    """Prints what differs, and how many programs were compared."""
+    jax.config.update("jax_enable_x64", True)
+    changed, operations, bad = 0, set(), 0
+    for seed in range(first, last):
+        try:
+            form, other, error, run = compared(seed)
+        except Exception as problem:  # a hunt goes on
+            print(f"seed {seed}: {type(problem).__name__}: {str(problem)[:300]}", flush=True)
+            bad += 1
+            continue
+        changed += other
+        operations |= set(run.names)
+        if error:
+            bad += 1
+            print(f"seed {seed}: {form} is off by {error:.3g}: {' '.join(run.names)}", flush=True)
+        if (seed + 1) % 100 == 0:
+            print(f"... {seed + 1 - first} programs, {changed} rewritten, {len(operations)} operations, {bad} bad", flush=True)
+            if (seed + 1) % 20_000 == 0:
+                jax.clear_caches()
+    print(f"{last - first} programs, {changed} rewritten, {len(operations)} operations, {bad} bad")
+
+
+if __name__ == "__main__":
+    main(*map(int, sys.argv[1:]))
