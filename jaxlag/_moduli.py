@@ -14,11 +14,11 @@ import numpy as np
 from jax import lax
 
 from ._folding import Entry, is_number
-from ._structure import Structure
+from ._structure import ORDER, Structure, factored
 
 Product = frozenset  # of pairs of a factor (an entry, a modulus, a sign) and its exponent
 Polynomial = dict[Product, float]  # the number before each product
-ORDER = {"gt": 1, "ge": 1, "lt": -1, "le": -1}
+Powers = dict[Any, Any]  # exponents of entries
 TERMS = 32  # a longer polynomial is not looked at
 
 
@@ -91,6 +91,9 @@ class Moduli:
             number, slip = factored(of[0])
             if name == "sign":
                 return {Product([(Sign(slip), 1)]): np.sign(number)}
+            inner = self._modulus_of(slip)
+            if inner is not None:
+                return {Product([(Modulus((inner,)), 1)]): abs(number)}
             self.hard.add(Modulus((slip,)))
             return self._absolute(of[0], abs(number))
         if name in ("max", "min"):
@@ -162,10 +165,10 @@ class Moduli:
         self.hard.add(modulus)
         return {Product([(modulus, 1)]): unit}
 
-    def _squares(self, x) -> list[tuple[float, dict[Entry, float]]] | None:
+    def _squares(self, x) -> list[tuple[float, Powers]] | None:
         """The roots of squares that add up to an entry, each a number and powers; none where one of them does not move."""
         found, still = [], False
-        waiting: list[tuple[float, dict[Entry, float], Any]] = [(1.0, {}, x)]
+        waiting: list[tuple[float, Powers, Any]] = [(1.0, {}, x)]
         while waiting:
             number, powers, x = waiting.pop()
             factor, entry = factored(x)
@@ -186,10 +189,19 @@ class Moduli:
                 continue
             if number <= 0 or any(powers[f] % 2 for f in moving):
                 return None
-            found.append((number, {f: n / 2 for f, n in powers.items()}))
+            halves: Powers = {}
+            for f, n in powers.items():
+                slip = self._modulus_of(f)  # |s|² = s²
+                halves = _joined(halves, {f if slip is None else slip: n / 2})
+            found.append((number, halves))
         return [] if still else found
 
-    def _factors(self, x) -> tuple[float, dict[Entry, float]]:
+    def _modulus_of(self, x) -> Entry | None:
+        """s of an entry that is |s|."""
+        moduli = [u for u in moduli_in(self.found.get(x, {})) if len(u.of) == 1]
+        return next((u.of[0] for u in moduli if self.found[x] == {Product([(u, 1)]): 1.0}), None)
+
+    def _factors(self, x) -> tuple[float, Powers]:
         """An entry as a number and powers of entries."""
         number, waiting = 1.0, [] if x is None else [(x, 1)]
         powers: Counter = Counter()
@@ -291,13 +303,3 @@ def _together(x: Product, y: Product) -> Product:
             here, there = next(((a, b) for a, b in ((sign.of, modulus), (modulus, sign.of)) if powers.get(a, 0) >= 1), (None, sign))
             powers = _joined(powers, {there: 1}, {here: -1} if here is not None else {})
     return Product(powers.items())
-
-
-def factored(x: Any) -> tuple[Any, Any]:
-    """A number and the entry it multiplies; None for a number alone."""
-    if is_number(x):
-        return x, None
-    if x.name == "neg":
-        number, entry = factored(x.operands[0])
-        return -number, entry
-    return x.operands if x.name == "mul" and is_number(x.operands[0]) else (1.0, x)

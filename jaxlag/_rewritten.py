@@ -16,11 +16,11 @@ from ._entries import on_arrays
 from ._folding import Entry
 from ._moduli import Modulus, Polynomial
 from ._primitives import body
-from ._structure import Path
+from ._structure import Path, Place
 
 INPUTS: Path = (-1,)
 Seen = dict[Path, Sequence[Any]]  # what equations that are looked for gave
-Places = Mapping[Entry, tuple[Path, int, int]]
+Places = Mapping[Entry, Place]
 
 
 def sources(polynomials: Iterable[Polynomial], places: Places) -> set[Path]:
@@ -32,16 +32,17 @@ def values(polynomials: Sequence[Polynomial], places: Places, seen: Seen, moduli
     """The values of polynomials, of which the moduli have the values u."""
     where: dict[Any, int] = {modulus: i for i, modulus in enumerate(moduli)}
     parts, offsets, size = [jnp.asarray(u)] if moduli else [], {}, len(moduli)
-    for path, i, _ in dict.fromkeys((*places[f][:2], 0) for p in polynomials for product in p for f, _ in product if isinstance(f, Entry)):
+    entries = [f for p in polynomials for product in p for f, _ in product if isinstance(f, Entry)]
+    for path, i in dict.fromkeys(places[entry][:2] for entry in entries):
         parts.append(jnp.ravel(seen[path][i]))
         offsets[path, i] = size
         size += np.size(seen[path][i])
 
     def position(factor):
         if not isinstance(factor, Entry):
-            return where[factor]
-        path, i, k = places[factor]
-        return offsets[path, i] + k
+            return where[factor], 1.0
+        path, i, k, number = places[factor]
+        return offsets[path, i] + k, number
 
     dtype = jnp.result_type(*(part.dtype for part in parts if jnp.issubdtype(part.dtype, jnp.inexact)))
     pool = jnp.concatenate([part.astype(dtype) for part in parts])
@@ -49,15 +50,18 @@ def values(polynomials: Sequence[Polynomial], places: Places, seen: Seen, moduli
     longest = max(map(len, rows))
     width = max(len(factors) for row in rows for _, factors in row)
     numbers = np.zeros((len(rows), longest), dtype)
-    index, exponents = np.full((*numbers.shape, max(width, 1)), -1), np.ones((*numbers.shape, max(width, 1)))
+    shape = (*numbers.shape, width)
+    index, scales, exponents = np.full(shape, -1), np.ones(shape, dtype), np.ones(shape)
     for at, row in enumerate(rows):
         for m, (number, factors) in enumerate(row):
             numbers[at, m] = number
             for k, (factor, exponent) in enumerate(factors):
-                index[at, m, k], exponents[at, m, k] = position(factor), exponent
+                (index[at, m, k], scales[at, m, k]), exponents[at, m, k] = position(factor), exponent
     products = jnp.asarray(numbers) if np.any(numbers != 1) else 1
     for k in range(width):
-        products = products * _power(_taken(pool, index[..., k]), exponents[..., k])
+        taken = _taken(pool, index[..., k])
+        taken = taken if np.all(scales[..., k] == 1) else taken * scales[..., k]
+        products = products * _power(taken, exponents[..., k])
     return jnp.sum(jnp.broadcast_to(products, numbers.shape), axis=1) if longest > 1 else jnp.broadcast_to(products, numbers.shape)[:, 0]
 
 
@@ -111,7 +115,7 @@ def evaluated(
             if here in branches:
                 return call(p["branches"][branches[here]], operands, (*here, 0))
             cases = [call(branch, operands, (*here, k)) for k, branch in enumerate(p["branches"])]
-            which = lax.clamp(0, jnp.asarray(index, np.int32), len(cases) - 1)
+            which = lax.clamp(np.int32(0), jnp.asarray(index, np.int32), np.int32(len(cases) - 1))
             return [lax.select_n(which, *column) for column in zip(*cases, strict=True)]
         if equation.primitive.name == "scan":
             i, j = p["num_consts"], p["num_consts"] + p["num_carry"]

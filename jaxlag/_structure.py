@@ -12,12 +12,14 @@ import numpy as np
 from jax import lax
 
 from ._entries import Reader, is_extended
-from ._folding import Algebra, Arrays, Entry, filled, objects
+from ._folding import Algebra, Arrays, Entry, filled, is_number, objects
 from ._primitives import CALLS
 
 Path = tuple[int, ...]  # to an equation: its number in the program, that of the call within it, that of the equation in there, ...
+Place = tuple[Path, int, int, float]  # the equation, its output, the entry therein, and the number it is to be multiplied by
 OPENED = frozenset((*CALLS, "custom_jvp_call", "custom_vjp_call", "custom_vjp_call_jaxpr", "scan", "cond"))
 LINEAR = frozenset(("add", "sub", "add_any", "neg", "copy", "stop_gradient"))
+ORDER = {"gt": 1, "ge": 1, "lt": -1, "le": -1}
 NONLINEAR = 9
 LARGE = 2_000  # a product of arrays with more multiplications is not followed entry by entry
 
@@ -46,7 +48,7 @@ class Structure(Reader):
         """Forgets where entries stand: a program of its own follows."""
         self.path: list[int] = []
         self.sealed = 0
-        self.places: dict[Entry, tuple[Path, int, int]] = {}
+        self.places: dict[Entry, Place] = {}
         self.fresh: dict[Path, list[list[tuple[int, Entry]]]] = {}
         self.branches: dict[Path, int] = {}
 
@@ -119,7 +121,10 @@ class Structure(Reader):
         if array.dtype == object:
             for k, x in enumerate(array.flat):
                 if isinstance(x, Entry):
-                    self.places.setdefault(x, (path, i, k))
+                    self.places.setdefault(x, (path, i, k, 1.0))
+                    number, entry = factored(x)
+                    if entry is not x and number != 0:
+                        self.places.setdefault(entry, (path, i, k, 1 / float(number)))
 
     def whole(self, equation: Any, operands: Arrays) -> Arrays:
         if all(x.dtype != object for x in operands) and not any(map(is_extended, [*equation.invars, *equation.outvars])):
@@ -157,15 +162,22 @@ class Structure(Reader):
         select = lambda *of: self.apply(lax.select_n_p, {}, of[0].dtype, which, *of)
         return [np.asarray(np.frompyfunc(select, len(branches), 1)(*column), object) for column in zip(*cases, strict=True)]
 
-    def where_zero(self, x: Any, zeros: Iterable[Entry]) -> Any:
-        """What an entry becomes where others are zero."""
+    def where_zero(self, x: Any, zeros: Iterable[Entry], positive: frozenset[Entry]) -> Any:
+        """What an entry becomes where others are zero. Of a power 0^p with an unknown p it is assumed that p > 0, and of a threshold
+        among `positive`, with which a zero is compared, that it is what it says.
+        """
         values: dict[Any, Any] = {entry: entry.dtype.type(0) for entry in zeros}
         for entry in self.below([x]):
             if entry not in values:
                 operands = tuple(values.get(y, y) for y in entry.operands)
                 changed = any(a is not b for a, b in zip(operands, entry.operands, strict=True))
                 again = self.new if entry.name in ("block", "item") else None
-                if changed:
+                if changed and entry.name == "pow" and is_number(operands[0]) and operands[0] == 0:
+                    values[entry] = entry.dtype.type(0)
+                elif changed and entry.name in ORDER and any(is_number(y) and y == 0 for y in operands):
+                    sizes = [y.dtype.type(np.sign(factored(y)[0])) if factored(y)[1] in positive else y for y in operands]
+                    values[entry] = entry.function(*sizes)  # type: ignore[misc]
+                elif changed:
                     rebuilt = again(entry.dtype, entry.name, entry.function, operands) if again else entry.function(*operands)  # type: ignore[misc]
                     values[entry] = rebuilt
         return values.get(x, x)
@@ -179,6 +191,16 @@ class Structure(Reader):
                 found.add(entry)
                 waiting += [x for x in entry.operands if isinstance(x, Entry)]
         return sorted(found, key=lambda entry: entry.place)
+
+
+def factored(x: Any) -> tuple[Any, Any]:
+    """A number and the entry it multiplies; None for a number alone."""
+    if is_number(x):
+        return x, None
+    if x.name == "neg":
+        number, entry = factored(x.operands[0])
+        return -number, entry
+    return x.operands if x.name == "mul" and is_number(x.operands[0]) else (1.0, x)
 
 
 def is_hypot(equation: Any) -> bool:
