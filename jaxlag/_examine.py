@@ -10,9 +10,10 @@ from jaxtyping import PyTree
 
 from ._checks import at_state, coordinates
 from ._friction import settled
+from ._kinks import unread_friction
 from ._mechanics import constraint_rows, inertia, position_residual
 from ._multipliers import constrained_acceleration
-from ._system import Flat, System, leaf_names, rows_by_name
+from ._system import Flat, System, bind, leaf_names, rows_by_name
 
 
 @dataclasses.dataclass(frozen=True)
@@ -94,7 +95,15 @@ def examine(system: System, q: PyTree, qdot: PyTree, params: PyTree = None, *, t
         "time_constants": constants,
     }
     no_inertia = inertia_on_N.size > 0 and smallest <= 100 * M.shape[0] * eps * np.max(np.abs(M), initial=0.0)
-    return Examination(**numbers, findings=tuple(_findings(numbers, no_inertia, found["M"].dtype)))
+    findings = (*_findings(numbers, no_inertia, found["M"].dtype), *_of_friction(system, q, qdot, params, t))
+    return Examination(**numbers, findings=findings)
+
+
+def _of_friction(system, q, qdot, params, t):
+    """Dry friction that is written in a way that is not read as such."""
+    q = coordinates(q, "q")
+    v = jax.flatten_util.ravel_pytree(coordinates(qdot, "qdot"))[0]
+    return unread_friction(bind(system, q, params), jnp.asarray(t, v.dtype), jax.flatten_util.ravel_pytree(q)[0], v)
 
 
 def _findings(numbers, no_inertia, dtype):

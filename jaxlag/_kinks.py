@@ -6,7 +6,7 @@ that is zero whatever the state and the parameters, as of k|v|³, D is smooth; w
 """
 
 import itertools
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Container, Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -15,7 +15,7 @@ import numpy as np
 from jax.extend.core import Jaxpr
 from jaxtyping import Array, Float
 
-from ._folding import Entry, TooLong, is_number
+from ._folding import Entry, TooLong, is_number, objects
 from ._moduli import Moduli, Modulus, moduli_in
 from ._rewritten import evaluated, sources, values
 from ._structure import Path, Structure
@@ -76,6 +76,37 @@ def kinks_of(flat: Flat, t, q, v) -> Kinks | None:
     return Kinks(slip, {name: lifted(name) for name in terms}, np.repeat(np.arange(len(first)), sizes), rows_of_term)
 
 
+def unread_friction(flat: Flat, t, q, v, read: Container[str] | None = None) -> list[str]:
+    """What of dry friction is not read as such, in words: forces that jump with a velocity; and of a motion that has failed, in which
+    it was `read` in some terms, what else of D may be a kink.
+    """
+    state, structure = (t, q, v, jnp.zeros(flat.rows, v.dtype)), Structure(LIMIT)
+    findings = []
+    for slot, terms in (("force", flat.forces), ("dissipation", flat.dissipations)):
+        for name, function in terms.items():
+            term = _Term.read(structure, function, state)
+            if term.moduli is None:
+                continue
+            if slot == "force" and term.moduli.jumps():
+                findings.append(
+                    f"{role(slot, name)} jumps with a velocity, as dry friction does, but sticking is not found in a force: "
+                    "write it as `dissipation`, D = F * jnp.abs(v), whose force is -F * sign(v)"
+                )
+            elif slot == "force" or read is None or name in read:
+                continue
+            elif term.kinks(role(slot, name)):
+                findings.append(
+                    f"{role(slot, name)} is dry friction for these parameters alone, as |v|**p is for p = 1, which is not looked for: "
+                    "write F * jnp.abs(v)"
+                )
+            elif term.moduli.unresolved:
+                findings.append(
+                    f"{role(slot, name)} depends on the sign or the root of a velocity in a way that is not read as dry friction: "
+                    "if it is, write F * jnp.abs(v), or F * jnp.linalg.norm(v) of a vector"
+                )
+    return findings
+
+
 class _Term(NamedTuple):
     """One term of D and what there is of moduli in it."""
 
@@ -94,7 +125,7 @@ class _Term(NamedTuple):
             (result,) = _entries(structure, jaxpr, closed.consts, state)
         except TooLong:
             return cls(jaxpr, closed.consts, state, None, {}, {})
-        moduli = Moduli(structure, result.item())
+        moduli = Moduli(structure, objects(result).flat)
         return cls(jaxpr, closed.consts, state, moduli, structure.fresh, structure.branches)
 
     def kinks(self, spoken: str) -> list[Modulus]:

@@ -8,6 +8,7 @@ Where no sign is left over, the entry is made of moduli: v sign(v), relu(v) + re
 """
 
 from collections import Counter
+from collections.abc import Iterable
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -37,14 +38,14 @@ class Sign(NamedTuple):
 class Moduli:
     """Which entries of one program are made of moduli, and of which."""
 
-    def __init__(self, structure: Structure, result: Any):
-        self.structure, self.places = structure, structure.places
+    def __init__(self, structure: Structure, results: Iterable[Any]):
+        self.structure, self.places, self.results = structure, structure.places, list(results)
         self.rows: dict[Modulus, list[Polynomial]] = {}
         self.hard: set[Modulus] = set()  # those that are an absolute value or a norm, not a maximum or a selection alone
         self.found: dict[Entry, Polynomial] = {}
         self.unresolved: set[Entry] = set()  # entries that jump or bend with a velocity in another way
         self.forms: dict[Entry, Polynomial | None] = {}  # of entries with signs within them
-        cone = structure.below([result])
+        self.cone = cone = structure.below(self.results)
         self.slips = {x for entry in cone for x in self._slip(entry)}
         for entry in cone:
             self._look(entry)
@@ -52,6 +53,33 @@ class Moduli:
     def used(self) -> set[Modulus]:
         """Those that stand in what was found."""
         return set().union(*map(moduli_in, self.found.values()))
+
+    def jumps(self) -> bool:
+        """Whether a result jumps where a velocity changes its sign, or does all but that."""
+        jumps = any(self._jumps(x) for x in self.results if x in self.forms)
+        hidden = any(x in self.unresolved for x in self.results) and any(x.name == "sign" and self._depends(x) for x in self.cone)
+        directions = [x for x in self.cone if x.name == "div" and x.operands[1] in self.found and self._depends(x.operands[0])]
+        steep = [factored(x.operands[0])[0] for x in self.cone if x.name in STEPS and self._depends(x)]
+        return bool(jumps or hidden or directions or any(abs(number) >= STEEP for number in steep))
+
+    def _jumps(self, x) -> bool:
+        """Whether what stands beside a sign is anything but zero where the sign changes."""
+        form = self.forms[x] or {}
+        for sign in {factor for product in form for factor, _ in product if isinstance(factor, Sign)}:
+            beside: Any = 0.0
+            for product, number in form.items():
+                others = [(self._where_zero(f, sign.of), n) for f, n in product if f is not sign and f != sign]
+                if len(others) == len(product):
+                    continue
+                if not all(is_number(value) for value, _ in others):
+                    return True
+                beside += number * np.prod([float(value) ** n for value, n in others])
+            if abs(beside) > 1e-12:
+                return True
+        return False
+
+    def _where_zero(self, factor, slip):
+        return self.structure.where_zero(factor, [slip], frozenset()) if isinstance(factor, Entry) else factor
 
     def _depends(self, x) -> bool:
         return self.structure.degree(x) > 0
@@ -255,6 +283,8 @@ class Moduli:
         return factored(one)[1] is factored(square)[1]
 
 
+STEPS = frozenset(("tanh", "atan", "erf", "logistic"))
+STEEP = 100  # per unit of velocity
 SWITCHES = frozenset(("abs", "sign", "max", "min", "sqrt", "select_n", *ORDER))
 JUMPS = SWITCHES - {"sqrt"} | {"floor", "ceil", "round", "rem", "clamp", "eq", "ne"}
 

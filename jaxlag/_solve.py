@@ -12,7 +12,9 @@ import numpy as np
 from jaxtyping import Array, Bool
 
 from ._compiled import is_concrete
+from ._friction import Regularised, StickSlip
 from ._kernel import in_one_kernel
+from ._kinks import unread_friction
 from ._manifold import nearest_state
 from ._motion import Equations, slack_of
 from ._progress import Bar
@@ -36,8 +38,13 @@ class How(eqx.Module):
     audit: bool = eqx.field(static=True, default=False)
 
     @classmethod
-    def of(cls, solver, *rest) -> "How":
-        return cls(solver or Dop853(), *rest)
+    def of(cls, solver, stabilisation, friction, *rest) -> "How":
+        if not isinstance(friction, (StickSlip, Regularised)):
+            raise TypeError(
+                f"`friction` must be `StickSlip()` or `Regularised(width)`, but is {friction!r}. "
+                "Leave it out where D has no dry friction: nothing is done then."
+            )
+        return cls(solver or Dop853(), stabilisation, friction, *rest)
 
 
 def tolerances_of(rtol, atol, dtype) -> tuple[Array, Array]:
@@ -176,5 +183,13 @@ def raise_failure(trajectory: Trajectory) -> None:
     raise RuntimeError(
         f"the motion must reach t = {np.ravel(trajectory.ts)[-1]:g}, but stopped after {reached} of {samples} samples: {reason} "
         "Allow more `max_steps`, look at what was computed with `throw=False`, or take a solver for stiff systems, "
-        "`solver=diffrax.Kvaerno5()`."
+        f"`solver=diffrax.Kvaerno5()`.{_of_friction(trajectory)}"
     )
+
+
+def _of_friction(trajectory: Trajectory) -> str:
+    """What the system has of dry friction that was not read as such; of a batch, in its first motion."""
+    for _ in trajectory.ts.shape[1:]:
+        trajectory = jax.tree.map(lambda x: x[0], trajectory)
+    flat, (q, v) = trajectory._flat(), trajectory._vectors()
+    return "".join(f" And {finding}." for finding in unread_friction(flat, trajectory.ts[0], q[0], v[0], trajectory.friction))
