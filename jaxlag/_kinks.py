@@ -16,7 +16,8 @@ from jax.extend.core import Jaxpr
 from jaxtyping import Array, Float
 
 from ._folding import Entry, TooLong, is_number, objects
-from ._moduli import Moduli, Modulus, moduli_in
+from ._moduli import Moduli
+from ._polynomials import Modulus, moduli_in
 from ._rewritten import evaluated, sources, values
 from ._structure import Path, Structure
 from ._system import Flat, role

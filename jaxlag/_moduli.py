@@ -9,30 +9,16 @@ Where no sign is left over, the entry is made of moduli: v sign(v), relu(v) + re
 
 from collections import Counter
 from collections.abc import Iterable
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from jax import lax
 
 from ._folding import Entry, is_number
+from ._polynomials import Modulus, Polynomial, Product, Sign, added, joined, moduli_in, multiplied, scaled
 from ._structure import ORDER, Structure, factored
 
-Product = frozenset  # of pairs of a factor (an entry, a modulus, a sign) and its exponent
-Polynomial = dict[Product, float]  # the number before each product
 Powers = dict[Any, Any]  # exponents of entries
-TERMS = 32  # a longer polynomial is not looked at
-
-
-class Modulus(NamedTuple):
-    """u = ‖s‖ of the entries s, each but for a factor: of one entry the absolute value."""
-
-    of: tuple[Entry, ...]
-
-
-class Sign(NamedTuple):
-    """σ, the sign of an entry."""
-
-    of: Entry
 
 
 class Moduli:
@@ -148,7 +134,9 @@ class Moduli:
         """What an operand adds, times a number."""
         if is_number(x):
             return {Product(): number * float(x)}
-        if x in self.slips or x in self.found:
+        if x in self.found:
+            return scaled(self.found[x], number)
+        if x in self.slips:
             return {Product([(x, 1)]): number}
         if x in self.unresolved:
             return None
@@ -206,7 +194,7 @@ class Moduli:
                 waiting += [(-number if entry.name == "sub" else number, powers, y), (number, powers, x)]
                 continue
             numbers, factors = self._factors(entry)
-            number, powers = number * numbers, _joined(powers, factors)
+            number, powers = number * numbers, joined(powers, factors)
             moving = [f for f in powers if self._depends(f)]
             sums = [f for f in moving if f.name in ("add", "sub", "add_any") and powers[f] == 1]
             if len(moving) == 1 and sums:  # a weight before the sum
@@ -220,7 +208,7 @@ class Moduli:
             halves: Powers = {}
             for f, n in powers.items():
                 slip = self._modulus_of(f)  # |s|² = s²
-                halves = _joined(halves, {f if slip is None else slip: n / 2})
+                halves = joined(halves, {f if slip is None else slip: n / 2})
             found.append((number, halves))
         return [] if still else found
 
@@ -287,49 +275,3 @@ STEPS = frozenset(("tanh", "atan", "erf", "logistic"))
 STEEP = 100  # per unit of velocity
 SWITCHES = frozenset(("abs", "sign", "max", "min", "sqrt", "select_n", *ORDER))
 JUMPS = SWITCHES - {"sqrt"} | {"floor", "ceil", "round", "rem", "clamp", "eq", "ne"}
-
-
-def moduli_in(p: Polynomial) -> set[Modulus]:
-    """Those of a polynomial."""
-    return {factor for product in p for factor, _ in product if isinstance(factor, Modulus)}
-
-
-def _joined(*powers) -> dict:
-    whole: Counter = Counter()
-    for given in powers:
-        for x, n in given.items():
-            whole[x] += n
-    return {x: n for x, n in whole.items() if n}
-
-
-def added(*polynomials: Polynomial | None) -> Polynomial | None:
-    """The sum; None where one is none, or it is long."""
-    if any(p is None for p in polynomials):
-        return None
-    total: Polynomial = {}
-    for p in polynomials:
-        for product, number in (p or {}).items():
-            total[product] = total.get(product, 0.0) + number
-    return {product: number for product, number in total.items() if number} if len(total) <= TERMS else None
-
-
-def scaled(p: Polynomial | None, number: float) -> Polynomial | None:
-    """The polynomial times a number."""
-    return p and {product: number * before for product, before in p.items()}
-
-
-def multiplied(p: Polynomial | None, q: Polynomial | None) -> Polynomial | None:
-    """The product, with signs taken into the moduli."""
-    if p is None or q is None or len(p) * len(q) > TERMS**2:
-        return None
-    return added(*({_together(x, y): a * b} for x, a in p.items() for y, b in q.items()))
-
-
-def _together(x: Product, y: Product) -> Product:
-    powers = _joined(dict(x), dict(y))
-    for sign in [factor for factor in powers if isinstance(factor, Sign)]:
-        modulus = Modulus((sign.of,))
-        if powers.pop(sign) % 2:
-            here, there = next(((a, b) for a, b in ((sign.of, modulus), (modulus, sign.of)) if powers.get(a, 0) >= 1), (None, sign))
-            powers = _joined(powers, {there: 1}, {here: -1} if here is not None else {})
-    return Product(powers.items())

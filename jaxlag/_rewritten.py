@@ -14,7 +14,7 @@ from jax.extend.core import Jaxpr, Literal
 
 from ._entries import on_arrays
 from ._folding import Entry
-from ._moduli import Modulus, Polynomial
+from ._polynomials import Modulus, Polynomial
 from ._primitives import body
 from ._structure import Path, Place
 

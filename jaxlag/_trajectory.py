@@ -101,12 +101,7 @@ class Trajectory(eqx.Module):
 
     def slip(self) -> dict[str, Float[Array, "..."]]:
         """The slip velocities of each dissipation term with dry friction, shaped like `friction[name].force`."""
-        flat, (q, v) = self._flat(), self._vectors()
-        kinks = kinks_of(flat, self.ts[0], q[0], v[0]) if self.friction else None
-        if kinks is None:
-            return {}
-        slip = jax.vmap(kinks.slip)(self.ts, q, v)
-        return {name: slip[:, rows].reshape(self.friction[name].force.shape) for name, rows in kinks.rows_of_term.items()}
+        return _slips(self)
 
     def _vectors(self):
         return [jax.vmap(lambda leaf: ravel_pytree(leaf)[0])(tree) for tree in (self.q, self.qdot)]
@@ -138,6 +133,16 @@ class Trajectory(eqx.Module):
         of = f"{' × '.join(map(str, batch))} motions of " if batch else ""
         head = f"Trajectory: {of}{self.ts.shape[-1]} samples, t = {np.min(self.ts):g} … {np.max(self.ts):g}"
         return "\n".join([head, *(f"  {name:<15}{value}" for name, value in rows)])
+
+
+@compiled  # so that parameters are unknown, as they were in the motion: a friction of 0 is one, too
+def _slips(motion: Trajectory) -> dict[str, Float[Array, "..."]]:
+    flat, (q, v) = motion._flat(), motion._vectors()
+    kinks = kinks_of(flat, motion.ts[0], q[0], v[0]) if motion.friction else None
+    if kinks is None:
+        return {}
+    slip = jax.vmap(kinks.slip)(motion.ts, q, v)
+    return {name: slip[:, rows].reshape(motion.friction[name].force.shape) for name, rows in kinks.rows_of_term.items()}
 
 
 @compiled

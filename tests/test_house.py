@@ -29,6 +29,7 @@ ORDER = [
     "_mechanics",
     "_multipliers",
     "_structure",
+    "_polynomials",
     "_moduli",
     "_rewritten",
     "_kinks",
