@@ -140,14 +140,8 @@ class _Equations(eqx.Module):
         flat = bind(system, e.q0, every)
         used = np.abs(np.linspace(-1, 1, ts.size)) <= 1 - 2 * ENDS
         point = tuple(jnp.asarray(x) for x in (motion.q[0], motion.v[0]))
-        slip = _slips(
-            system,
-            e.q0,
-            jax.tree.map(lambda x: jnp.asarray(x) if isinstance(x, float) else x, every),
-            ts,
-            jnp.asarray(motion.q),
-            jnp.asarray(motion.v),
-        )
+        unknown = jax.tree.map(lambda x: jnp.asarray(x) if isinstance(x, float) else x, every)
+        slip = _slips(system, e.q0, unknown, ts, jnp.asarray(motion.q), jnp.asarray(motion.v))
         if slip is not None:
             slip = np.abs(np.asarray(slip))
             slides = np.all(slip > SLOW * np.max(slip[used], axis=0), axis=1)
