@@ -162,7 +162,7 @@ class _Term(NamedTuple):
         slope, slip = _entries(structure, jaxpr, [*closed.consts, *self.consts], (*self.state, u))
         constants = frozenset(x for c in self.consts if not _is_known(c) for x in structure.unknown(c).flat)
         found, rows = [], iter(slip.flat)
-        for x, du, modulus in zip(structure.unknown(u), slope, moduli, strict=True):
+        for x, du, modulus in zip(structure.unknown(u, len(self.state)), slope, moduli, strict=True):
             s = list(itertools.islice(rows, len(modulus.of)))
             at_rest = structure.where_zero(du, [y for y in (x, *s) if isinstance(y, Entry)], constants)
             found.append((at_rest, structure.degree(at_rest) > 0, all(structure.degree(y) == 1 for y in s)))
@@ -218,7 +218,7 @@ def _entries(structure: Structure, jaxpr: Jaxpr, consts: Sequence[Any], state: t
     """The outputs of a program at an unknown state, with what is known of what it closes over."""
     structure.begin()
     known = [structure.known(np.asarray(x)) if _is_known(x) else structure.unknown(x) for x in consts]
-    return structure.inner(jaxpr, [*known, *(structure.unknown(x, int(i == 2)) for i, x in enumerate(state))])
+    return structure.inner(jaxpr, [*known, *(structure.unknown(x, i, int(i == 2)) for i, x in enumerate(state))])
 
 
 def _is_known(x: Any) -> bool:

@@ -52,13 +52,14 @@ class Structure(Reader):
         self.fresh: dict[Path, list[list[tuple[int, Entry]]]] = {}
         self.branches: dict[Path, int] = {}
 
-    def unknown(self, array: Any, degree: int = 0) -> np.ndarray:
-        """Entries for what comes from outside; the same for the same array."""
-        if id(array) not in self.given:
+    def unknown(self, array: Any, argument: int = -1, degree: int = 0) -> np.ndarray:
+        """Entries for what comes from outside; the same for the same array, or for the same argument of a function."""
+        key = id(array) if argument < 0 else argument  # q and q̇ may be the same array
+        if key not in self.given:
             entries = filled(array.shape, [self.argument(array.dtype) for _ in range(array.size)])
-            self.given[id(array)] = array, entries
+            self.given[key] = array, entries
             self.degrees |= dict.fromkeys(entries.flat, degree)
-        return self.given[id(array)][1]
+        return self.given[key][1]
 
     def new(self, *what: Any) -> Entry:
         entry = super().new(*what)
