@@ -10,10 +10,11 @@ from jaxtyping import PyTree
 
 from ._checks import at_state, coordinates
 from ._friction import settled
+from ._kinks import unread_friction
 from ._mechanics import applied_force, constraint_rows, inertia, position_residual, velocity_residual
 from ._multipliers import constrained_acceleration
 from ._scalarised import scalarised
-from ._system import Flat, System, leaf_names, rows_by_name
+from ._system import Flat, System, bind, leaf_names, rows_by_name
 
 
 @dataclasses.dataclass(frozen=True)
@@ -97,8 +98,15 @@ def examine(system: System, q: PyTree, qdot: PyTree, params: PyTree = None, *, t
     off, size, rows_off, rows_size = found["defects"].max(axis=0)
     defect = max(off / max(size, eps), rows_off / max(rows_size, eps) if rank == G.shape[0] else 0)  # rows may contradict each other
     no_inertia = inertia_on_N.size > 0 and smallest <= 100 * M.shape[0] * eps * np.max(np.abs(M), initial=0.0)
-    pulling = _pulling(system, found["multipliers"])
-    return Examination(**numbers, findings=(*_findings(numbers, no_inertia, defect, found["M"].dtype), *pulling))
+    found_in_words = (*_findings(numbers, no_inertia, defect, found["M"].dtype), *_pulling(system, found["multipliers"]))
+    return Examination(**numbers, findings=(*found_in_words, *_of_friction(system, q, qdot, params, t)))
+
+
+def _of_friction(system, q, qdot, params, t):
+    """Dry friction that is written in a way that is not read as such."""
+    q = coordinates(q, "q")
+    v = jax.flatten_util.ravel_pytree(coordinates(qdot, "qdot"))[0]
+    return unread_friction(bind(system, q, params), jnp.asarray(t, v.dtype), jax.flatten_util.ravel_pytree(q)[0], v)
 
 
 def _pulling(system, multipliers):

@@ -115,6 +115,13 @@ def regress(
     return Regression(named.insert(theta), named.by_name(theta), named.by_name(jnp.asarray(errors)), named.entries, linear)
 
 
+@eqx.filter_jit  # so that what is looked for is unknown, and a friction of 0 is one, too
+def _slips(system, like, params, ts, q, v):
+    """Slip velocities of dry friction along a record, where there is any."""
+    kinks = kinks_of(bind(system, like, params), ts[0], q[0], v[0])
+    return None if kinks is None else jax.vmap(kinks.slip)(ts, q, v)
+
+
 class _Equations(eqx.Module):
     """The equations of motion along a smoothed record; `used` of samples × rows is zero where a sample is left out."""
 
@@ -133,9 +140,10 @@ class _Equations(eqx.Module):
         flat = bind(system, e.q0, every)
         used = np.abs(np.linspace(-1, 1, ts.size)) <= 1 - 2 * ENDS
         point = tuple(jnp.asarray(x) for x in (motion.q[0], motion.v[0]))
-        kinks = kinks_of(flat, e.ts[0], *point)
-        if kinks is not None:
-            slip = np.abs(np.asarray(jax.vmap(kinks.slip)(ts, jnp.asarray(motion.q), jnp.asarray(motion.v))))
+        unknown = jax.tree.map(lambda x: jnp.asarray(x) if isinstance(x, float) else x, every)
+        slip = _slips(system, e.q0, unknown, ts, jnp.asarray(motion.q), jnp.asarray(motion.v))
+        if slip is not None:
+            slip = np.abs(np.asarray(slip))
             slides = np.all(slip > SLOW * np.max(slip[used], axis=0), axis=1)
             used &= np.convolve(~slides, np.ones(2 * ASIDE + 1), mode="same") < 0.5
         rows = motion.q.shape[1] + _extra(flat, e.ts[0], *point).size

@@ -14,6 +14,7 @@ from jaxtyping import Array, Bool
 from ._compiled import is_concrete
 from ._friction import Regularised, StickSlip
 from ._kernel import in_one_kernel
+from ._kinks import unread_friction
 from ._manifold import Baumgarte, NoStabilisation, Projection, nearest_state
 from ._motion import Equations
 from ._numbers import count, number
@@ -197,5 +198,13 @@ def raise_failure(trajectory: Trajectory) -> None:
     raise RuntimeError(
         f"the motion must reach t = {np.ravel(trajectory.ts)[-1]:g}, but stopped after {reached} of {samples} samples: {reason} "
         "Allow more `max_steps`, look at what was computed with `throw=False`, or take a solver for stiff systems, "
-        "`solver=diffrax.Kvaerno5()`."
+        f"`solver=diffrax.Kvaerno5()`.{_of_friction(trajectory)}"
     )
+
+
+def _of_friction(trajectory: Trajectory) -> str:
+    """What the system has of dry friction that was not read as such; of a batch, in its first motion."""
+    for _ in trajectory.ts.shape[1:]:
+        trajectory = jax.tree.map(lambda x: x[0], trajectory)
+    flat, (q, v) = trajectory._flat(), trajectory._vectors()
+    return "".join(f" And {finding}." for finding in unread_friction(flat, trajectory.ts[0], q[0], v[0], trajectory.friction))

@@ -115,14 +115,7 @@ class Trajectory(eqx.Module):
 
     def slip(self) -> dict[str, Float[Array, "..."]]:
         """The slip velocities of each dissipation term with dry friction, shaped like `friction[name].force`."""
-        if isinstance(self.stated, Recorded):
-            return self.stated.slip
-        flat, (q, v) = self._flat(), self._vectors()
-        kinks = kinks_of(flat, self.ts[0], q[0], v[0]) if self.friction else None
-        if kinks is None:
-            return {}
-        slip = jax.vmap(kinks.slip)(self.ts, q, v)
-        return {name: slip[:, rows].reshape(self.friction[name].force.shape) for name, rows in kinks.rows_of_term.items()}
+        return self.stated.slip if isinstance(self.stated, Recorded) else _slips(self)
 
     def pulling(self) -> dict[str, PyTree]:
         """By the name of each constraint that is `one_sided`, at which samples λ < 0: there it would have to pull, and the contact would
@@ -272,6 +265,16 @@ class Trajectory(eqx.Module):
         of = f"{' × '.join(map(str, batch))} motions of " if batch else ""
         head = f"Trajectory: {of}{self.ts.shape[-1]} samples, t = {np.min(self.ts):g} … {np.max(self.ts):g}"
         return "\n".join([head, *(f"  {name:<15}{value}" for name, value in rows)])
+
+
+@compiled  # so that parameters are unknown, as they were in the motion: a friction of 0 is one, too
+def _slips(motion: Trajectory) -> dict[str, Float[Array, "..."]]:
+    flat, (q, v) = motion._flat(), motion._vectors()
+    kinks = kinks_of(flat, motion.ts[0], q[0], v[0]) if motion.friction else None
+    if kinks is None:
+        return {}
+    slip = jax.vmap(kinks.slip)(motion.ts, q, v)
+    return {name: slip[:, rows].reshape(motion.friction[name].force.shape) for name, rows in kinks.rows_of_term.items()}
 
 
 def energies(motion: Trajectory) -> tuple[Float[Array, " T"], Float[Array, " T"]]:

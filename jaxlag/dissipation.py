@@ -145,7 +145,7 @@ def power_law(v: Velocity, c: Number, n: Number) -> Float[Array, ""]:
     - `v`: relative velocity, scalar or (n,).
     - `c`: force at unit speed; its unit depends on n: force per velocity to the n.
     - `n`: exponent of the force, real, not negative; may be a parameter, and D is differentiable in it. For dry friction write
-      `sliding`, or 0 into the call: no kink is looked for in a parameter that happens to be 0.
+      `sliding`, or 0 into the call: no kink is looked for in a parameter that happens to be 0, which the failure of a motion says.
 
     Any consistent units. **Returns:** a scalar, the power divided by n + 1. **Raises:** as `speed`.
 
