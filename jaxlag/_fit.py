@@ -12,6 +12,7 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import PyTree
 
+from ._autocorrelation import COLOURED
 from ._compiled import compiled
 from ._experiment import Experiment, entry_names, is_within
 from ._least_squares import levenberg_marquardt
@@ -88,6 +89,8 @@ class Fit:
     unknown_count: int
     x: np.ndarray  # the unknowns at the minimum, as the problem takes them
     x_covariance: np.ndarray  # over σ̂²
+    inflation: np.ndarray  # of each standard error by the residuals' correlation in time
+    correlated: int  # over how many samples they are; 0 where they are white
 
     @property
     def freedom(self) -> int:
@@ -184,6 +187,7 @@ class Fit:
 
         free, kept = self.problem.free, np.delete(np.arange(self.x.size), i)
         others, least = self.x[kept], float(jnp.sum(linearise(self.problem, jnp.asarray(self.x)).residuals ** 2) / 2)
+        unit, bounds = self.sigma_scale * float(self.inflation[i]), tuple(bound[kept] for bound in self.problem.bounds)
 
         def excess(away):
             nonlocal others
@@ -193,13 +197,20 @@ class Fit:
                 rows = linearise(self.problem, held.at[kept].set(rest))
                 return rows.residuals, rows.jacobian[:, kept], rows
 
-            best = levenberg_marquardt(seen, jnp.asarray(others), freedom=self.freedom, max_steps=50, tolerance=1e-4).best
+            limits = {"freedom": self.freedom, "max_steps": 50, "tolerance": 1e-4, "bounds": bounds}
+            best = levenberg_marquardt(seen, jnp.asarray(others), **limits).best
             rise = float(jnp.sum(best.residuals**2) / 2) - least
             others = np.asarray(best.y) if np.isfinite(rise) else others
-            return np.sqrt(max(2 * rise, 0)) / self.sigma_scale - t
+            return min(np.sqrt(max(2 * rise, 0)) / unit, FAR * t) - t
 
         first = side * t * self.sigma_scale * float(np.sqrt(self.x_covariance[i, i]))
-        found = optimize.root_scalar(excess, x0=0.0, x1=first, method="secant", rtol=1e-4, maxiter=20)
+        limit = float(self.problem.bounds[side > 0][i]) - self.x[i]
+        if np.isfinite(limit):
+            if limit == 0 or excess(limit) <= 0:
+                return float((free.lower if side < 0 else free.upper)[i])
+            found = optimize.root_scalar(excess, bracket=(0.0, limit), method="brentq", rtol=1e-4)
+        else:
+            found = optimize.root_scalar(excess, x0=0.0, x1=first, method="secant", rtol=1e-4, maxiter=20)
         if not (found.converged and 0 < found.root * side < FAR * abs(first)):  # no rise that says no, as far as one can see
             return float((free.lower if side < 0 else free.upper)[i])
         return float(free.theta(jnp.asarray(self.x).at[i].add(found.root)[: free.size])[i])
@@ -208,7 +219,7 @@ class Fit:
         count = len(self.names)
         outcome = f"converged after {self.steps} steps" if self.converged else f"not converged after {self.steps} steps: {self.reason}"
         rows = [f"Fit: {count} parameter{'s' if count != 1 else ''}, {self.measurements} measurements, {outcome}"]
-        rows += [*self._parameter_rows(), *self._correlation_rows(), *(f"  ! {remark}" for remark in self.remarks)]
+        rows += [*self._parameter_rows(), *self._correlation_rows(), *self._inflation_rows(), *(f"  ! {remark}" for remark in self.remarks)]
         rows += channel_rows(self.channels)
         return "\n".join([*rows, f"  residual sigma  {self.sigma:.4g}{'  (1 where the noise is as said)' if self.absolute else ''}"])
 
@@ -243,6 +254,14 @@ class Fit:
         return [f"  correlation  {'; '.join([*shown, *more])}"] if strong else []
 
 
+    def _inflation_rows(self):
+        if not self.correlated:
+            return []
+        times = dict.fromkeys(f"{x:.2g}" for x in (np.min(self.inflation, initial=np.inf), np.max(self.inflation, initial=0)))
+        larger = f": {' to '.join(times)} times those of white ones" if self.names else ""
+        return [f"  standard errors allow for the residuals' correlation over {self.correlated} samples{larger}"]
+
+
 @compiled
 def _motion(model, params, e):
     return model.predicted(params, e, jnp.zeros(e.unknowns))[1]
@@ -263,7 +282,7 @@ def _counted(group):
 def _colour(p):
     if np.isnan(p):
         return ""
-    return "white" if p >= 0.01 else f"not white (p = {p:.1g})"
+    return "white" if p >= COLOURED else f"not white (p = {p:.1g})"
 
 
 def channel_rows(channels: Sequence[Channel]) -> list[str]:
@@ -273,10 +292,15 @@ def channel_rows(channels: Sequence[Channel]) -> list[str]:
     shown = channels[:SHOWN]
     width = max((len(label(c)) for c in shown), default=0)
     rows = [
-        f"  {label(c):<{width}}  fit {c.fit_percent:6.2f} %   R² {c.r_squared:.5f}   rms {c.rms:.3g}   " + _colour(c.whiteness)
+        f"  {label(c):<{width}}  fit {_short(c.fit_percent, '6.2f')} %   R² {_short(c.r_squared, '.5f')}   rms {c.rms:.3g}   "
+        + _colour(c.whiteness)
         for c in shown
     ]
     return rows + ([f"  … and {len(channels) - SHOWN} more channels"] if len(channels) > SHOWN else [])
+
+
+def _short(x, digits):
+    return f"{x:{digits}}" if abs(x) < 1e4 else f"{x:.1e}"
 
 
 def plus_minus(value: float, error: float) -> str:

@@ -149,7 +149,9 @@ def fit_each(
 
     line = Steps(max_steps) if progress else None
     freedom = max(min(map(_measurements, experiments)) - xs.shape[1], 1)
-    outcome = levenberg_marquardt(seen, xs, freedom=freedom, max_steps=max_steps, tolerance=tolerance, progress=line)
+    own = jnp.full(xs.shape[1] - problem.free.size, jnp.inf)
+    bounds = tuple(jnp.concatenate([bound, sign * own]) for bound, sign in zip(problem.free.bounds, (-1, 1), strict=True))
+    outcome = levenberg_marquardt(seen, xs, bounds=bounds, freedom=freedom, max_steps=max_steps, tolerance=tolerance, progress=line)
     if line:
         line.end()
     best, stack = jax.tree.map(np.asarray, (outcome.best, problem.stacks[0]))  # slices of NumPy arrays cost nothing
@@ -220,7 +222,7 @@ def _from_one(problem, x, more):
         rows = linearise(problem, x)
         return rows.residuals, rows.jacobian, rows
 
-    outcome = levenberg_marquardt(seen, x, **more)
+    outcome = levenberg_marquardt(seen, x, bounds=problem.bounds, **more)
     reason = failure_of(outcome.best.rest)
     if reason:
         raise ValueError(f"{AT_THE_START}, but ended with: {reason} Start from other parameters.")
@@ -239,12 +241,15 @@ def _from_many(problem, starts, more):
         rows = linearise_starts(problem, xs)
         return rows.residuals, rows.jacobian, rows
 
-    outcome = levenberg_marquardt(seen, xs, **more)
+    outcome = levenberg_marquardt(seen, xs, bounds=problem.bounds, **more)
     cost = np.nan_to_num(outcome.costs[-1], nan=np.inf)
     if not np.isfinite(cost).any():
         raise ValueError("`starts` must have one whose motion can be computed, but none has. Narrow the bounds.")
     best = int(np.argmin(cost))
-    return outcome._replace(best=jax.tree.map(lambda leaf: leaf[best], outcome.best), costs=outcome.costs[:, best])
+    chosen = jax.tree.map(lambda leaf: leaf[best], outcome.best)
+    if np.any(outcome.best.status == INTERRUPTED):  # another start might have come to a better end
+        chosen = chosen._replace(status=np.asarray(INTERRUPTED))
+    return outcome._replace(best=chosen, costs=outcome.costs[:, best])
 
 
 def _by_optax(problem, method, x, more):
@@ -279,4 +284,4 @@ def _optax_step(problem, method, x, state):
     cost, slope = jax.value_and_grad(problem.cost)(x)
     slope = jnp.where(jnp.isfinite(slope), slope, 0)
     updates, state = method.update(slope, state, x, value=cost, grad=slope, value_fn=problem.cost)
-    return cost, optax.apply_updates(x, updates), state
+    return cost, jnp.clip(optax.apply_updates(x, updates), *problem.bounds), state

@@ -54,6 +54,7 @@ ORDER = [
     "_prediction",
     "_problem",
     "_least_squares",
+    "_autocorrelation",
     "_quality",
     "_smoothing",
     "_shooting",
