@@ -48,7 +48,10 @@ class Fit:
 
     $$ \mathrm{cov}\,\hat\theta = \hat\sigma^2 (J^T J)^{-1}, \qquad \hat\sigma^2 = \frac{\sum r_i^2}{N - p} $$
 
-    σ̂ is 1 where every experiment came with its sigma.
+    σ̂ is 1 where every experiment came with its sigma. Where residuals are correlated in time, which `whiteness` of a channel says, all
+    errors, intervals and bands are those of the sandwich, with R the correlation that an autoregression finds in the residuals:
+
+    $$ \mathrm{cov}\,\hat\theta = \hat\sigma^2 (J^T J)^{-1} J^T R J (J^T J)^{-1} $$
 
     - `params`: all parameters, the free ones at their estimate; `estimates`: the free ones alone, by name.
     - `standard_errors`: like `estimates`; infinite where the measurements do not determine a parameter; `remarks` then say in words
@@ -58,9 +61,12 @@ class Fit:
     - `predictions`, `residuals` (measured minus predicted): per experiment, structured like its values. `prediction_errors`: standard
       errors of the predictions, NaN where nothing was measured. `channels`: how well each is predicted. `sigma`: σ̂, in units of the
       sigma given, which is 1 where none was.
+    - `correlated`: over how many samples residuals are, 0 where they are white; `inflation`: how many times larger the standard errors
+      of `names` are for that.
     - `converged`, `reason`, `steps`, `costs` (after each step), `cost` (half the sum of squares).
 
-    **Source:** Ljung, System Identification, 2nd ed., sections 7.2, 9.4 and 16; Seber & Wild, Nonlinear Regression (1989), chapter 5.
+    **Source:** Ljung, System Identification, 2nd ed., sections 7.2, 9.2 to 9.4 and 16; Seber & Wild, Nonlinear Regression (1989),
+    chapter 5; Newey & West, Econometrica 55 (1987) 703.
     """
 
     experiments: tuple[Experiment, ...]
@@ -105,19 +111,19 @@ class Fit:
 
     @property
     def aic(self) -> float:
-        """Akaike's criterion; of two models of the same data the smaller is the better one."""
+        """Akaike's criterion; of two models of the same data the smaller is the better one. It takes residuals as independent."""
         return self.misfit + 2 * (self.unknown_count + (not self.absolute))
 
     @property
     def bic(self) -> float:
-        """Schwarz's criterion, stricter with parameters than Akaike's."""
+        """Schwarz's criterion, stricter with parameters than Akaike's; it takes residuals as independent, too."""
         return self.misfit + float(np.log(self.measurements)) * (self.unknown_count + (not self.absolute))
 
     def interval(self, name: str, level: float = 0.95, *, profile: bool = False) -> Interval:
         """The confidence interval of one parameter, an entry of `names`.
 
         Linearised: θ̂ ± t · standard error, with Student's t. With `profile=True` by the likelihood: the other parameters are fitted
-        anew along the way, to where the cost says no; it need not be symmetric.
+        anew along the way, to where the cost says no; it need not be symmetric. Correlated residuals make both wider by the same factor.
 
         **Source:** Bates & Watts, Nonlinear Regression Analysis and Its Applications (1988), section 6.1.
         """
@@ -252,7 +258,6 @@ class Fit:
         shown = [f"{self.names[i]}, {self.names[j]}: {self.correlation[i, j]:+.2f}" for i, j in strong[:STRONGEST]]
         more = [f"{len(strong) - STRONGEST} more above 0.5"] if len(strong) > STRONGEST else []
         return [f"  correlation  {'; '.join([*shown, *more])}"] if strong else []
-
 
     def _inflation_rows(self):
         if not self.correlated:

@@ -54,16 +54,20 @@ def fit(
     - `experiments`: one `Experiment` or several, of any lengths.
     - `params`: a mapping with all parameters; those in `free` are starting values. `jaxlag.regress` finds such.
     - `free`: names of the entries of `params` to be identified, or paths to parts of them, `"arm.length"`, `"joints[0]"`.
-    - `bounds`: (lower, upper) by name, None for none: `{"b": (0, None)}` keeps b positive. Kept by a change of variables.
+    - `bounds`: (lower, upper) by name, None for none: `{"b": (0, None)}` keeps b from being negative. An estimate
+      may lie at its bound, and so may a start; a remark then says whether the measurements would have it cross.
     - `priors`: (mean, standard deviation) by name, of what is known beforehand; the experiments need their sigma then.
     - `loss`: `Huber()` where there are outliers.
-    - `method`: an optimiser of optax in place of Levenberg–Marquardt, for thousands of parameters; it takes `max_steps` steps.
+    - `method`: an optimiser of optax in place of Levenberg–Marquardt, for thousands of parameters; it takes `max_steps` steps, each
+      brought back within the bounds.
     - `starts`: how many starts are tried in one batch, the others at random within bounds, or within a factor of some two.
     - `pieces`: into how many pieces each record is cut, each with a start of its own (multiple shooting): for long or chaotic records.
     - `max_steps`: default 100, with `method` 1000. `tolerance`: the iteration ends when the next step would change no parameter by more
       than this part of its standard error.
     - `progress`: shows step, cost and time left while it runs, on standard error, in one line; in a log a line now and then.
     - `**numerics`: handed on to `simulate`: `solver`, `rtol`, `atol`, `stabilisation`, `friction`.
+
+    Where residuals are correlated in time, the standard errors allow for it, and the card says so (`Fit`).
 
     Stopped by the keyboard, it returns the best so far and says so. Experiments run side by side, over several devices where there are.
 
@@ -150,8 +154,9 @@ def fit_each(
     line = Steps(max_steps) if progress else None
     freedom = max(min(map(_measurements, experiments)) - xs.shape[1], 1)
     own = jnp.full(xs.shape[1] - problem.free.size, jnp.inf)
-    bounds = tuple(jnp.concatenate([bound, sign * own]) for bound, sign in zip(problem.free.bounds, (-1, 1), strict=True))
-    outcome = levenberg_marquardt(seen, xs, bounds=bounds, freedom=freedom, max_steps=max_steps, tolerance=tolerance, progress=line)
+    lower, upper = problem.free.bounds
+    limits = jnp.concatenate([lower, -own]), jnp.concatenate([upper, own])
+    outcome = levenberg_marquardt(seen, xs, bounds=limits, freedom=freedom, max_steps=max_steps, tolerance=tolerance, progress=line)
     if line:
         line.end()
     best, stack = jax.tree.map(np.asarray, (outcome.best, problem.stacks[0]))  # slices of NumPy arrays cost nothing

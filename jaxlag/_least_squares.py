@@ -73,13 +73,13 @@ def levenberg_marquardt(
     Methods for Non-Linear Least Squares Problems (2004), section 3.2; for the bounds Bertsekas, SIAM J. Control Optim. 20 (1982) 221.
     """
     begin, advance = ONE if y.ndim == 1 else MANY
-    bounds = tuple(jnp.broadcast_to(b, y.shape) for b in bounds or (jnp.array(-jnp.inf, y.dtype), jnp.array(jnp.inf, y.dtype)))
-    now, trial = begin(y, linearise(y), bounds)
+    box = [jnp.broadcast_to(jnp.asarray(bound, y.dtype), y.shape) for bound in bounds or (-jnp.inf, jnp.inf)]
+    now, trial = begin(y, linearise(y), box)
     costs = [now.cost]
     step, limits = 0, (jnp.full(y.shape[:-1], tolerance, y.dtype), jnp.full(y.shape[:-1], freedom, y.dtype))
     try:
         for step in range(1, max_steps + 1):
-            now, trial = advance(now, trial, linearise(trial.y), bounds, *limits)
+            now, trial = advance(now, trial, linearise(trial.y), box, *limits)
             costs.append(now.cost)
             if progress:
                 progress(step, float(np.min(now.cost)))

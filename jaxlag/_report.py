@@ -54,10 +54,11 @@ def report(problem: Problem, experiments: Sequence[Experiment], outcome: Outcome
         known = determined_by(J, gaps_J)
         remarks = _not_determined(problem, x, known, theta, slope, J) if np.any(known.null[:p]) else []
         allowing, correlated = _allowing_for_colour(problem, of_stacks, experiments, whole, J, known.covariance, absolute)
-        variances = (np.diag(c)[:p] for c in (allowing, known.covariance))
-        inflation = np.sqrt(np.divide(*variances, out=inflation, where=np.diag(known.covariance)[:p] > 0))
+        then, before = (np.diag(c)[:p] for c in (allowing, known.covariance))
+        inflation = np.sqrt(np.where(before > 0, then / np.where(before > 0, before, 1), 1))
         known = known._replace(covariance=allowing)
-        held = list(_at_bounds(free, theta, np.asarray(rows.residuals) @ np.asarray(rows.jacobian)[:, :p]))
+        r = np.nan_to_num(np.asarray(rows.residuals), posinf=0.0)  # of a motion that could not be computed
+        held = list(_at_bounds(free, theta, r @ np.asarray(rows.jacobian)[:, :p]))
     unknown_count = x.size - known.null.shape[1] - len(gaps_J)
     sigma = _noise(weighted[there], problem, max(count - unknown_count, 0))
     scale = 1.0 if absolute and problem.model.loss is None else sigma
@@ -161,7 +162,8 @@ def _by_time(stack, flat, samples):
     """Rows of one experiment, one channel after the other, as (samples, channels, ...)."""
     shapes = [leaf.shape[1:] for leaf in jax.tree.leaves(stack.values)]
     parts = np.split(flat, np.cumsum([int(np.prod(shape)) for shape in shapes])[:-1])
-    return np.concatenate([part.reshape(shape[0], -1, *flat.shape[1:]) for part, shape in zip(parts, shapes, strict=True)], axis=1)[:samples]
+    by_time = [part.reshape(shape[0], -1, *flat.shape[1:]) for part, shape in zip(parts, shapes, strict=True)]
+    return np.concatenate(by_time, axis=1)[:samples]
 
 
 def _at_bounds(free, theta, slope):

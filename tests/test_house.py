@@ -84,7 +84,7 @@ HOMES = [
     ("matplotlib", {"_canvas", "_animate"}),
     ("optimistix", {"_least_squares"}),
     ("optax", {"_identify"}),
-    ("scipy", {"_quality", "_smoothing", "_fit"}),
+    ("scipy", {"_autocorrelation", "_smoothing", "_fit"}),
     ("sympy", PAPER),
 ]
 
