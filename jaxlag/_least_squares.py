@@ -19,7 +19,7 @@ REASONS = (
     "`max_steps` was reached",
     "interrupted by the keyboard; these are the best parameters so far",
     "the motion at the start could not be computed",
-    "no step lowers the cost any more, but the predictions have nothing to do with the measurements; start from other parameters",
+    "no step lowers the cost any more, but the predictions have nothing to do with the measurements",
     "the pieces' ends do not meet, however much it weighs; take more pieces, or start from other parameters",
 )
 

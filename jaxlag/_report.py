@@ -186,7 +186,7 @@ def _off(problem, weighted):
 def _misfit(away, times_noise, channels, known_why):
     """Remarks on measurements that the model does not explain; what is known to be wrong already explains correlated residuals."""
     if away > AWAY:
-        yield f"the residuals are {away:.2g} times as large as the measurements: start from other parameters"
+        yield f"the residuals are {away:.2g} times as large as the measurements: look at the units, and start from other parameters"
     elif times_noise > UNEXPLAINED:
         yield (
             f"the model does not explain the measurements, off by {times_noise:.2g} times their noise: look for another start, "

@@ -2,10 +2,13 @@
 
 import jax.numpy as jnp
 import numpy as np
+import oscillator as osc
 import pytest
 from scipy.integrate import solve_ivp
 
 import jaxlag as jl
+from jaxlag import _shooting
+from jaxlag._least_squares import STALLED, Iterate, Outcome
 
 TRUE = {"m2": 0.6, "l1": 0.5, "l2": 0.4, "b1": 0.02, "b2": 0.01}  # SI; the upper mass is 1
 START = {"m2": 1.0, "l1": 0.6, "l2": 0.3, "b1": 0.05, "b2": 0.03}
@@ -98,6 +101,30 @@ def test_everything_free_leaves_the_common_factor_of_masses_and_damping():
     assert all(np.isinf(plan.standard_errors[name]) for name in ("m1", "m2", "b1", "b2"))
     known = jl.information(weighed, e, TRUE | {"m1": 1.0}, ("m2", "b1", "b2"), **LOOSE)
     assert all(np.isfinite(known.standard_errors[name]) for name in ("m2", "b1", "b2"))
+
+
+def test_gaps_that_the_integration_leaves_end_the_rounds():
+    """With loose tolerances no weight closes the gaps to 1e-9; the estimates are those of one shot, and the cost does not grow."""
+    ts = np.linspace(0, 100, 500)
+    e = jl.Experiment(ts, osc.noisy(0, ts, b=0.02), 1.0, 0.0)
+    loose = {"free": ("c", "b"), "rtol": 1e-4, "atol": 1e-6}
+    found = jl.fit(osc.SYSTEM, e, osc.START, pieces=10, **loose)
+    assert found.converged and found.steps < 40 and np.max(found.costs[2:]) < 10 * found.cost
+    whole = jl.fit(osc.SYSTEM, e, found.params, **loose)
+    np.testing.assert_allclose([found.estimates[n] for n in ("c", "b")], [whole.estimates[n] for n in ("c", "b")], rtol=1e-4)
+
+
+def test_ends_that_do_not_meet_are_said(monkeypatch):
+    """An iteration that goes nowhere."""
+
+    def stuck(seen, x, **_):
+        r, J, rows = seen(x)
+        nothing = jnp.zeros(0)
+        return Outcome(Iterate(x, r, J, rows, float(r @ r) / 2, nothing, nothing, np.asarray(STALLED)), 1, np.ones(1))
+
+    monkeypatch.setattr(_shooting, "levenberg_marquardt", stuck)
+    found = jl.fit(osc.SYSTEM, osc.record(0), osc.START, free=("c", "b"), pieces=3)
+    assert not found.converged and "the pieces' ends do not meet" in found.reason and found.steps < 10
 
 
 @pytest.mark.slow
