@@ -171,7 +171,7 @@ class Comparison:
         strength = next(word for limit, word in EVIDENCE if self.bic[second] >= limit)
         said = [f"  evidence for {best!r} against {second!r}: {strength}"]
         if self.correlated:
-            said.append(f"  ! overstated: the residuals of {best!r} are correlated, over {self.correlated} samples")
+            said.append(f"  ! overstated: residuals of {best!r} are correlated over {self.correlated} samples")
         return "\n".join(["Comparison: the smaller the better", *rows, *said])
 
 

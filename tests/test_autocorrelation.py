@@ -1,10 +1,18 @@
 """Residuals that hang together in time, against matrices written down from the noise itself."""
 
-import numpy as np
-import pytest
-from scipy import linalg, signal
+import sys
+from pathlib import Path
 
+import numpy as np
+import oscillator as osc
+import pytest
+from scipy import linalg, signal, stats
+
+import jaxlag as jl
 from jaxlag._autocorrelation import autoregression, coloured_information, reach, whiteness
+
+sys.path.insert(0, str(Path(__file__).parent / "benchmarks"))
+import bench_coverage
 
 T = 3000
 SLOPES = np.stack([np.exp(-0.001 * np.arange(T)) * np.cos(0.02 * np.arange(T)), np.linspace(0, 1, T) * np.sin(0.05 * np.arange(T))], axis=1)
@@ -83,3 +91,105 @@ def test_two_different_channels_against_their_covariance():
         r = np.stack([signal.lfilter([np.sqrt(1 - rho**2)], [1, -rho], e)[500:] for rho, e in zip(rhos, shocks.T, strict=True)], axis=1)
         found.append(coloured_information(J, r, sizes))
     np.testing.assert_allclose(np.diag(np.mean(found, axis=0)), np.diag(expected), rtol=0.2)
+
+
+FREE = ("c", "b")
+
+
+def coloured(seed, rho=0.8, **more):
+    """The oscillator's record with noise that is correlated."""
+    return jl.Experiment(osc.TIMES, osc.position(osc.TIMES) + 0.01 * noise(rho, seed, 60), 1.0, 0.0, **more)
+
+
+def fit(experiments, **more):
+    return jl.fit(osc.SYSTEM, experiments, osc.START, free=FREE, **more)
+
+
+def slopes(found, ts=osc.TIMES, **start):
+    """∂x/∂(c, b) at the estimates, by differences of the closed form."""
+    theta = np.array([float(found.estimates[name]) for name in FREE])
+    at = lambda d: osc.position(ts, *(theta + d), **start)
+    return np.stack([(at(d) - at(-d)) / 2e-5 for d in 1e-5 * np.eye(2)], axis=1)
+
+
+@pytest.fixture(scope="module")
+def one():
+    return fit(coloured(1))
+
+
+def test_the_covariance_is_the_sandwich_and_all_that_is_made_of_it(one):
+    """Where one coefficient does, R_ij = a^|i − j| with that of Yule and Walker, written down in full."""
+    r, J = one.residuals[0], slopes(one)
+    a = r[1:] @ r[:-1] / (r @ r)
+    np.testing.assert_allclose(autoregression(r), [a], rtol=1e-12)
+    P = np.linalg.inv(J.T @ J)
+    white = P * (r @ r) / 58
+    covariance = P @ exact(a, J) @ P * (r @ r) / 58
+    np.testing.assert_allclose(one.covariance, covariance, rtol=1e-3)
+    np.testing.assert_allclose(one.inflation, np.sqrt(np.diag(covariance) / np.diag(white)), rtol=1e-3)
+    t = stats.t.ppf(0.975, 58)
+    for i, name in enumerate(FREE):
+        error, value = np.sqrt(covariance[i, i]), float(one.estimates[name])
+        np.testing.assert_allclose(one.interval(name), [value - t * error, value + t * error], rtol=1e-3)
+        np.testing.assert_allclose(one.interval(name, profile=True), one.interval(name), rtol=2e-2)
+    spread = lambda J: np.sqrt(np.einsum("ti,ij,tj->t", J, covariance, J))
+    np.testing.assert_allclose(one.band()[1] - one.predictions[0], t * spread(J), rtol=2e-3, atol=1e-8)
+    other = one.predict(jl.Experiment(osc.TIMES, None, 0.0, 1.0))
+    np.testing.assert_allclose(other.standard_errors, spread(slopes(one, x0=0.0, v0=1.0)), rtol=2e-3, atol=1e-8)
+
+
+def test_the_card_and_a_comparison_say_so(one):
+    times = " to ".join(f"{x:.2g}" for x in sorted(one.inflation))
+    assert one.correlated == one.channels[0].correlated > 2 and one.remarks == []
+    said = f"standard errors allow for the residuals' correlation over {one.correlated} samples: {times} times those of white ones"
+    assert said in repr(one)
+    white = fit(osc.record(0))
+    assert white.correlated == 0 and np.all(white.inflation == 1) and "correlation over" not in repr(white)
+    assert f"overstated: residuals of 'a' are correlated over {one.correlated} samples" in repr(jl.compare({"a": one, "b": one}))
+    assert "overstated" not in repr(jl.compare({"a": white, "b": white}))
+
+
+def test_two_recordings_missing_samples_sigma_and_pieces(one):
+    per_variance = one.covariance / one.sigma**2
+    given = fit(coloured(1, sigma=0.02))
+    np.testing.assert_allclose(given.covariance, 0.02**2 * per_variance, rtol=1e-4)
+    twice = fit([coloured(1), coloured(1)])  # as far as one knows, two independent ones
+    np.testing.assert_allclose(twice.covariance / twice.sigma**2, per_variance / 2, rtol=1e-4)
+    in_pieces = fit(coloured(1), pieces=3)
+    np.testing.assert_allclose(in_pieces.covariance, one.covariance, rtol=1e-3)
+    np.testing.assert_allclose(in_pieces.inflation, one.inflation, rtol=1e-3)
+    at = np.r_[3:7, 31]
+    z = osc.with_nan(coloured(1).values, *at)
+    gaps = fit(jl.Experiment(osc.TIMES, z, 1.0, 0.0))
+    J, r = (np.delete(x, at, axis=0) for x in (slopes(gaps), gaps.residuals[0]))
+    (a,) = autoregression(r)
+    P = np.linalg.inv(J.T @ J)
+    np.testing.assert_allclose(gaps.covariance, P @ exact(a, J) @ P * (r @ r) / 53, rtol=1e-3)
+
+
+def test_a_prior_is_independent_of_the_noise(one):
+    """JᵀRJ of the measurements and the precision of the prior add up in the middle of the sandwich."""
+    prior = fit(coloured(1, sigma=0.01), priors={"b": (0.3, 1e-3)})
+    J, r = slopes(prior) / 0.01, prior.residuals[0]
+    (a,), precision = autoregression(r), np.diag([0, 1e6])
+    P = np.linalg.inv(J.T @ J + precision)
+    np.testing.assert_allclose(prior.covariance, P @ (exact(a, J) + precision) @ P, rtol=1e-3)
+
+
+def test_a_robust_fit_allows_for_it(one):
+    """Hardly any residual lies beyond five standard deviations: nothing is robust about it."""
+    robust = fit(coloured(1), loss=jl.Huber(5.0))
+    np.testing.assert_allclose(robust.inflation, one.inflation, rtol=1e-2)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("rho", bench_coverage.RHOS)
+def test_the_95_percent_intervals_hold_the_truth(rho):
+    """60 recordings of 1000 samples; `bench_coverage` has 200. Errors are those that the true covariance of the noise gives."""
+    fits = bench_coverage.fits_of(rho, 60)
+    for name, (white, true), held in zip(
+        FREE, np.transpose(bench_coverage.deviations(rho)), bench_coverage.coverage(fits).values(), strict=True
+    ):
+        assert all(f.converged for f in fits) and 0.88 <= held <= 1.0
+        np.testing.assert_allclose(np.median([f.standard_errors[name] for f in fits]), true, rtol=0.12)
+        assert rho == 0 or true > 2.5 * white
