@@ -22,7 +22,7 @@ ROUGH = 0.1  # of a standard error, the tolerance until the gaps are closed
 LOST = 0.5  # of its misfit that a piece has to gain to begin where the one before ends
 CLOSED = 1e-9  # gaps that are left, in units of the motion,
 ROUNDINGS = 300  # or so many units in the last place, in single precision,
-CLOSE = 1e-5  # or these, where more weight does not make them smaller: they are the integration's error
+CLOSE = 1e-5  # or these, or rtol, where more weight does not make them smaller: they are the integration's error
 FALLING = 0.5  # of the gaps before, or less, are gaps that fall
 PATIENCE = 3  # rounds in which they do not, until it is given up
 
@@ -104,7 +104,8 @@ def join(problem: Problem, x: Any, *, max_steps: int, tolerance: float, freedom:
     links = problem.links
     assert links is not None
     steps, costs, weight, bounds = 0, np.zeros(0), 0.0, problem.bounds
-    closed, gap, rounds = False, np.inf, 0
+    closed, gap, rounds, last = False, np.inf, 0, None
+    close = max(CLOSE, float(dict(problem.model.numerics).get("rtol") or 0))
     while True:
         problem = dataclasses.replace(problem, links=links)
 
@@ -129,7 +130,11 @@ def join(problem: Problem, x: Any, *, max_steps: int, tolerance: float, freedom:
                 continue
         before, left = gap, float(jnp.max(jnp.abs(rows.gaps)))
         gap, rounds = min(left, before), rounds + 1 if left > FALLING * before else 0
-        closed = left < max(CLOSED, ROUNDINGS * float(jnp.finfo(x.dtype).eps)) or (left < CLOSE and rounds > 0)
+        if rounds and left < close and last is not None:  # the integration cannot do better: back to the last weight that helped
+            (x, links), closed = last, True
+            continue
+        last = (x, links) if weight else None
+        closed = left < max(CLOSED, ROUNDINGS * float(jnp.finfo(x.dtype).eps))
         before, weight = weight, weight * TIGHTER or FIRST * float(jnp.linalg.norm(rows.residuals) / jnp.linalg.norm(rows.gaps))
         weight = before if closed and before else weight
         dual = (links.dual + rows.gaps) * (before / weight) ** 2  # weight² dual are the multipliers of the gaps, which go on

@@ -104,14 +104,16 @@ def test_everything_free_leaves_the_common_factor_of_masses_and_damping():
 
 
 def test_gaps_that_the_integration_leaves_end_the_rounds():
-    """With loose tolerances no weight closes the gaps to 1e-9; the estimates are those of one shot, and the cost does not grow."""
-    ts = np.linspace(0, 100, 500)
-    e = jl.Experiment(ts, osc.noisy(0, ts, b=0.02), 1.0, 0.0)
-    loose = {"free": ("c", "b"), "rtol": 1e-4, "atol": 1e-6}
-    found = jl.fit(osc.SYSTEM, e, osc.START, pieces=10, **loose)
-    assert found.converged and found.steps < 40 and np.max(found.costs[-6:]) < 1.01 * found.cost
-    whole = jl.fit(osc.SYSTEM, e, found.params, **loose)
-    np.testing.assert_allclose([found.estimates[n] for n in ("c", "b")], [whole.estimates[n] for n in ("c", "b")], rtol=1e-4)
+    """With loose tolerances no weight closes the gaps: the last that helped is kept, and the estimates are those of SciPy's motion."""
+    ts = np.linspace(0, 50, 500)
+    swing = lambda t, s: [s[1], -9.81 * np.sin(s[0]) - 0.05 * s[1]]
+    angle = solve_ivp(swing, (0, 50), [2.5, 0], t_eval=ts, rtol=1e-11, atol=1e-12).y[0]
+    e = jl.Experiment(ts, angle + 0.01 * np.random.default_rng(0).standard_normal(500), 2.5, 0.0)
+    pendulum = jl.System(lambda q, qdot, g: 0.5 * qdot**2 + g * jnp.cos(q), dissipation=lambda qdot, b: 0.5 * b * qdot**2)
+    found = jl.fit(pendulum, e, {"g": 8.0, "b": 0.1}, free=("g", "b"), pieces=20, rtol=1e-3, atol=1e-4)
+    assert found.converged and abs(found.costs[-1] / found.cost - 1) < 0.02  # what the gaps weigh is nothing beside it
+    for name, value in {"g": 9.81, "b": 0.05}.items():
+        assert abs(found.estimates[name] - value) < 3 * found.standard_errors[name], name
 
 
 def test_ends_that_do_not_meet_are_said(monkeypatch):
