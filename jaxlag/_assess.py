@@ -151,12 +151,16 @@ def _settle(system, experiment, params, numerics):
 
 @dataclasses.dataclass(frozen=True, eq=False, repr=False)
 class Comparison:
-    """Models of the same data, the best first by Schwarz's criterion: `names`, and differences of `aic` and `bic` to the best one."""
+    """Models of the same data, the best first by Schwarz's criterion: `names`, and differences of `aic` and `bic` to the best one.
+
+    Both criteria take residuals as independent; `correlated`: over how many samples those of the best model are, 0 where they are white.
+    """
 
     names: tuple[str, ...]
     aic: dict[str, float]
     bic: dict[str, float]
     parameters: dict[str, int]
+    correlated: int
 
     def __repr__(self) -> str:
         width = max(map(len, self.names))
@@ -166,7 +170,10 @@ class Comparison:
         ]
         best, second = self.names[:2]
         strength = next(word for limit, word in EVIDENCE if self.bic[second] >= limit)
-        return "\n".join(["Comparison: the smaller the better", *rows, f"  evidence for {best!r} against {second!r}: {strength}"])
+        said = [f"  evidence for {best!r} against {second!r}: {strength}"]
+        if self.correlated:
+            said.append(f"  ! overstated: residuals of {best!r} are correlated over {self.correlated} samples")
+        return "\n".join(["Comparison: the smaller the better", *rows, *said])
 
 
 EVIDENCE = ((10, "very strong"), (6, "strong"), (2, "positive"), (0, "none worth a mention"))
@@ -203,7 +210,7 @@ def compare(fits: Mapping[str, Fit]) -> Comparison:
     names = tuple(sorted(fits, key=lambda name: fits[name].bic))
     least = {which: min(getattr(f, which) for f in fits.values()) for which in ("aic", "bic")}
     off = lambda which: {name: getattr(fits[name], which) - least[which] for name in names}
-    return Comparison(names, off("aic"), off("bic"), {name: fits[name].unknown_count for name in names})
+    return Comparison(names, off("aic"), off("bic"), {name: fits[name].unknown_count for name in names}, fits[names[0]].correlated)
 
 
 def _fingerprint(f):

@@ -13,6 +13,7 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import PyTree
 
+from ._autocorrelation import COLOURED
 from ._compiled import compiled
 from ._experiment import Experiment, entry_names, is_within
 from ._least_squares import levenberg_marquardt
@@ -49,7 +50,10 @@ class Fit:
 
     $$ \mathrm{cov}\,\hat\theta = \hat\sigma^2 (J^T J)^{-1}, \qquad \hat\sigma^2 = \frac{\sum r_i^2}{N - p} $$
 
-    σ̂ is 1 where every experiment came with its sigma.
+    σ̂ is 1 where every experiment came with its sigma. Where residuals are correlated in time, which `whiteness` of a channel says, all
+    errors, intervals and bands are those of the sandwich, with R the correlation that an autoregression finds in the residuals:
+
+    $$ \mathrm{cov}\,\hat\theta = \hat\sigma^2 (J^T J)^{-1} J^T R J (J^T J)^{-1} $$
 
     - `params`: all parameters, the free ones at their estimate; `estimates`: the free ones alone, by name.
     - `standard_errors`: like `estimates`; infinite where the measurements do not determine a parameter; `remarks` then say in words
@@ -59,9 +63,12 @@ class Fit:
     - `predictions`, `residuals` (measured minus predicted): per experiment, structured like its values. `prediction_errors`: standard
       errors of the predictions, NaN where nothing was measured. `channels`: how well each is predicted. `sigma`: σ̂, in units of the
       sigma given, which is 1 where none was.
+    - `correlated`: over how many samples residuals are, 0 where they are white; `inflation`: how many times larger the standard errors
+      of `names` are for that.
     - `converged`, `reason`, `steps`, `costs` (after each step), `cost` (half the sum of squares).
 
-    **Source:** Ljung, System Identification, 2nd ed., sections 7.2, 9.4 and 16; Seber & Wild, Nonlinear Regression (1989), chapter 5.
+    **Source:** Ljung, System Identification, 2nd ed., sections 7.2, 9.2 to 9.4 and 16; Seber & Wild, Nonlinear Regression (1989),
+    chapter 5; Newey & West, Econometrica 55 (1987) 703.
     """
 
     experiments: tuple[Experiment, ...]
@@ -90,6 +97,8 @@ class Fit:
     unknown_count: int
     x: np.ndarray  # the unknowns at the minimum, as the problem takes them
     x_covariance: np.ndarray  # over σ̂²
+    inflation: np.ndarray  # of each standard error by the residuals' correlation in time
+    correlated: int  # over how many samples they are; 0 where they are white
 
     @property
     def freedom(self) -> int:
@@ -104,19 +113,19 @@ class Fit:
 
     @property
     def aic(self) -> float:
-        """Akaike's criterion; of two models of the same data the smaller is the better one."""
+        """Akaike's criterion; of two models of the same data the smaller is the better one. It takes residuals as independent."""
         return self.misfit + 2 * (self.unknown_count + (not self.absolute))
 
     @property
     def bic(self) -> float:
-        """Schwarz's criterion, stricter with parameters than Akaike's."""
+        """Schwarz's criterion, stricter with parameters than Akaike's; it takes residuals as independent, too."""
         return self.misfit + float(np.log(self.measurements)) * (self.unknown_count + (not self.absolute))
 
     def interval(self, name: str, level: float = 0.95, *, profile: bool = False) -> Interval:
         """The confidence interval of one parameter, an entry of `names`.
 
         Linearised: θ̂ ± t · standard error, with Student's t. With `profile=True` by the likelihood: the other parameters are fitted
-        anew along the way, to where the cost says no; it need not be symmetric.
+        anew along the way, to where the cost says no; it need not be symmetric. Correlated residuals make both wider by the same factor.
 
         **Source:** Bates & Watts, Nonlinear Regression Analysis and Its Applications (1988), section 6.1.
         """
@@ -213,6 +222,7 @@ class Fit:
 
         free, kept = self.problem.free, np.delete(np.arange(self.x.size), i)
         others, least = self.x[kept], float(jnp.sum(linearise(self.problem, jnp.asarray(self.x)).residuals ** 2) / 2)
+        unit, bounds = self.sigma_scale * float(self.inflation[i]), tuple(bound[kept] for bound in self.problem.bounds)
 
         def excess(away):
             nonlocal others
@@ -222,13 +232,20 @@ class Fit:
                 rows = linearise(self.problem, held.at[kept].set(rest))
                 return rows.residuals, rows.jacobian[:, kept], rows
 
-            best = levenberg_marquardt(seen, jnp.asarray(others), freedom=self.freedom, max_steps=50, tolerance=1e-4).best
+            limits = {"freedom": self.freedom, "max_steps": 50, "tolerance": 1e-4, "bounds": bounds}
+            best = levenberg_marquardt(seen, jnp.asarray(others), **limits).best
             rise = float(jnp.sum(best.residuals**2) / 2) - least
             others = np.asarray(best.y) if np.isfinite(rise) else others
-            return np.sqrt(max(2 * rise, 0)) / self.sigma_scale - t
+            return min(np.sqrt(max(2 * rise, 0)) / unit, FAR * t) - t
 
         first = side * t * self.sigma_scale * float(np.sqrt(self.x_covariance[i, i]))
-        found = optimize.root_scalar(excess, x0=0.0, x1=first, method="secant", rtol=1e-4, maxiter=20)
+        limit = float(self.problem.bounds[side > 0][i]) - self.x[i]
+        if np.isfinite(limit):
+            if limit == 0 or excess(limit) <= 0:
+                return float((free.lower if side < 0 else free.upper)[i])
+            found = optimize.root_scalar(excess, bracket=(0.0, limit), method="brentq", rtol=1e-4)
+        else:
+            found = optimize.root_scalar(excess, x0=0.0, x1=first, method="secant", rtol=1e-4, maxiter=20)
         if not (found.converged and 0 < found.root * side < FAR * abs(first)):  # no rise that says no, as far as one can see
             return float((free.lower if side < 0 else free.upper)[i])
         return float(free.theta(jnp.asarray(self.x).at[i].add(found.root)[: free.size])[i])
@@ -237,7 +254,7 @@ class Fit:
         count = len(self.names)
         outcome = f"converged after {self.steps} steps" if self.converged else f"not converged after {self.steps} steps: {self.reason}"
         rows = [f"Fit: {count} parameter{'s' if count != 1 else ''}, {self.measurements} measurements, {outcome}"]
-        rows += [*self._parameter_rows(), *self._correlation_rows(), *(f"  ! {remark}" for remark in self.remarks)]
+        rows += [*self._parameter_rows(), *self._correlation_rows(), *self._inflation_rows(), *(f"  ! {remark}" for remark in self.remarks)]
         rows += channel_rows(self.channels)
         return "\n".join([*rows, f"  residual sigma  {self.sigma:.4g}{'  (1 where the noise is as said)' if self.absolute else ''}"])
 
@@ -275,6 +292,13 @@ class Fit:
         more = [f"{len(strong) - STRONGEST} more above 0.5"] if len(strong) > STRONGEST else []
         return [f"  correlation  {'; '.join([*shown, *more])}"] if strong else []
 
+    def _inflation_rows(self):
+        if not self.correlated:
+            return []
+        times = dict.fromkeys(f"{x:.2g}" for x in (np.min(self.inflation, initial=np.inf), np.max(self.inflation, initial=0)))
+        larger = f": {' to '.join(times)} times those of white ones" if self.names else ""
+        return [f"  standard errors allow for the residuals' correlation over {self.correlated} samples{larger}"]
+
 
 @compiled
 def _motion(model, params, e):
@@ -296,7 +320,7 @@ def _counted(group):
 def _colour(p):
     if np.isnan(p):
         return ""
-    return "white" if p >= 0.01 else f"not white (p = {p:.1g})"
+    return "white" if p >= COLOURED else f"not white (p = {p:.1g})"
 
 
 def channel_rows(channels: Sequence[Channel]) -> list[str]:
@@ -306,10 +330,15 @@ def channel_rows(channels: Sequence[Channel]) -> list[str]:
     shown = channels[:SHOWN]
     width = max((len(label(c)) for c in shown), default=0)
     rows = [
-        f"  {label(c):<{width}}  fit {c.fit_percent:6.2f} %   R² {c.r_squared:.5f}   rms {c.rms:.3g}   " + _colour(c.whiteness)
+        f"  {label(c):<{width}}  fit {_short(c.fit_percent, '6.2f')} %   R² {_short(c.r_squared, '.5f')}   rms {c.rms:.3g}   "
+        + _colour(c.whiteness)
         for c in shown
     ]
     return rows + ([f"  … and {len(channels) - SHOWN} more channels"] if len(channels) > SHOWN else [])
+
+
+def _short(x, digits):
+    return f"{x:{digits}}" if abs(x) < 1e4 else f"{x:.1e}"
 
 
 def plus_minus(value: float, error: float) -> str:

@@ -1,4 +1,4 @@
-"""Free parameters: named in a pytree, kept within bounds by bijections, drawn to what is known of them."""
+"""Free parameters: named in a pytree, kept within bounds, drawn to what is known of them."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -14,10 +14,11 @@ from ._system import leaf_names
 
 
 class Free(eqx.Module):
-    r"""The free parameters θ as a function of unbounded variables y, which are zero at the start θ₀.
+    r"""The free parameters θ as a function of variables y of size one, which are zero at the start θ₀.
 
-    $$ \theta = \theta_0 + |\theta_0| y, \qquad \theta = a + (\theta_0 - a) e^y \ (\theta > a), \qquad
-       \theta = a + \frac{b - a}{1 + e^{-y - y_0}} \ (a < \theta < b) $$
+    $$ \theta = \theta_0 + |\theta_0| y, \qquad a \le \theta \le b $$
+
+    The bounds are for those who look for a minimum: a change of variables that keeps them has no slope where a start is near one.
     """
 
     params: PyTree  # all of them, the free ones at their start
@@ -60,21 +61,27 @@ class Free(eqx.Module):
 
     def theta(self, y: Array) -> Array:
         """θ(y)."""
-        a, b = jnp.where(jnp.isfinite(self.lower), self.lower, 0), jnp.where(jnp.isfinite(self.upper), self.upper, 0)
-        bounded = jnp.isfinite(self.lower), jnp.isfinite(self.upper)
-        inside = jnp.where(bounded[0] & bounded[1], (self.start - a) / jnp.where(bounded[0] & bounded[1], b - a, 1), 0.5)
-        between = a + (b - a) * jax.nn.sigmoid(y + jnp.log(inside) - jnp.log1p(-inside))
-        above, below = a + (self.start - a) * jnp.exp(y), b - (b - self.start) * jnp.exp(-y)
-        one_sided = jnp.where(bounded[0], above, jnp.where(bounded[1], below, self.start + self.scale * y))
-        return jnp.where(bounded[0] & bounded[1], between, one_sided)
+        theta = self.start + self.scale * y
+        return theta + jax.lax.stop_gradient(jnp.clip(theta, self.lower, self.upper) - theta)  # at a bound exactly, with its slope
+
+    @property
+    def bounds(self) -> tuple[Array, Array]:
+        """Of y."""
+        return (self.lower - self.start) / self.scale, (self.upper - self.start) / self.scale
 
     def anywhere(self, key: Array, count: int) -> Array:
         """y of random starts: anywhere between two bounds, else a factor or a share of two off."""
-        between = jnp.isfinite(self.lower) & jnp.isfinite(self.upper)
-        at = jax.random.uniform(key, (count, self.size), self.start.dtype, 0.02, 0.98)
-        start = jnp.where(between, (self.start - self.lower) / jnp.where(between, self.upper - self.lower, 1), 0.5)
-        logit = lambda share: jnp.log(share) - jnp.log1p(-share)
-        return jnp.where(between[None], logit(at) - logit(start)[None], jnp.log(2.0) * jax.scipy.special.ndtri(at))
+        share = jax.random.uniform(key, (count, self.size), self.start.dtype, 0.02, 0.98)
+        factor = 2 ** jax.scipy.special.ndtri(share)
+
+        def start(share, factor):
+            lower, upper = jnp.isfinite(self.lower), jnp.isfinite(self.upper)
+            bound = jnp.where(lower, self.lower, self.upper)
+            away = jnp.where(self.start == bound, jnp.where(lower, self.scale, -self.scale), self.start - bound)
+            one_sided = jnp.where(lower | upper, bound + away * factor, self.start + self.scale * jnp.log(factor))
+            return jnp.where(lower & upper, self.lower + (self.upper - self.lower) * share, one_sided)
+
+        return (jax.vmap(start)(share, factor) - self.start[None]) / self.scale[None]
 
     def started(self) -> PyTree:
         """All parameters, with some start within the bounds for those that have none."""
@@ -84,7 +91,7 @@ class Free(eqx.Module):
 
     def slope(self, y: Array) -> Array:
         """dθ/dy, entry by entry."""
-        return jax.jvp(self.theta, (y,), (jnp.ones_like(y),))[1]
+        return jnp.broadcast_to(self.scale, y.shape)
 
     def surprise(self, y: Array) -> Array:
         """(θ − mean) / spread, of what is known beforehand."""
@@ -154,7 +161,7 @@ def _check(start, lower, upper, spread, entries):
             f"`priors` of {entries[i]!r} must have a positive standard deviation, but it is {spread[i]:g}. Give how well it is known."
         )
     theta = np.asarray(start)
-    for i in np.flatnonzero(~((lower < theta) & (theta < upper)) & ~np.isnan(theta)):
+    for i in np.flatnonzero(~((lower <= theta) & (theta <= upper)) & ~np.isnan(theta)):
         raise ValueError(
             f"`params` must start {entries[i]!r} within its bounds, but {theta[i]:g} is not inside ({lower[i]:g}, {upper[i]:g}). "
             "Start inside, or widen the bounds."

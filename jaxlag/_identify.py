@@ -54,16 +54,20 @@ def fit(
     - `experiments`: one `Experiment` or several, of any lengths.
     - `params`: all parameters, a mapping or any pytree with named parts; those in `free` are starting values. `jaxlag.regress` finds such.
     - `free`: names of the entries of `params` to be identified, or paths to parts of them, `"arm.length"`, `"joints[0]"`.
-    - `bounds`: (lower, upper) by name, None for none: `{"b": (0, None)}` keeps b positive. Kept by a change of variables.
+    - `bounds`: (lower, upper) by name, None for none: `{"b": (0, None)}` keeps b from being negative. An estimate
+      may lie at its bound, and so may a start; a remark then says whether the measurements would have it cross.
     - `priors`: (mean, standard deviation) by name, of what is known beforehand; the experiments need their sigma then.
     - `loss`: `Huber()` where there are outliers.
-    - `method`: an optimiser of optax in place of Levenberg–Marquardt, for thousands of parameters; it takes `max_steps` steps.
+    - `method`: an optimiser of optax in place of Levenberg–Marquardt, for thousands of parameters; it takes `max_steps` steps, each
+      brought back within the bounds.
     - `starts`: how many starts are tried in one batch, the others at random within bounds, or within a factor of some two.
     - `pieces`: into how many pieces each record is cut, each with a start of its own (multiple shooting): for long or chaotic records.
     - `max_steps`: default 100, with `method` 1000. `tolerance`: the iteration ends when the next step would change no parameter by more
       than this part of its standard error.
     - `progress`: shows step, cost and time left while it runs, on standard error, in one line; in a log a line now and then.
     - `**numerics`: handed on to `simulate`: `solver`, `rtol`, `atol`, `stabilisation`, `friction`.
+
+    Where residuals are correlated in time, the standard errors allow for it, and the card says so (`Fit`).
 
     Stopped by the keyboard, it returns the best so far and says so. Experiments run side by side, over several devices where there are.
 
@@ -149,7 +153,10 @@ def fit_each(
 
     line = Steps(max_steps) if progress else None
     freedom = max(min(map(_measurements, experiments)) - xs.shape[1], 1)
-    outcome = levenberg_marquardt(seen, xs, freedom=freedom, max_steps=max_steps, tolerance=tolerance, progress=line)
+    own = jnp.full(xs.shape[1] - problem.free.size, jnp.inf)
+    lower, upper = problem.free.bounds
+    limits = jnp.concatenate([lower, -own]), jnp.concatenate([upper, own])
+    outcome = levenberg_marquardt(seen, xs, bounds=limits, freedom=freedom, max_steps=max_steps, tolerance=tolerance, progress=line)
     if line:
         line.end()
     best, stack = jax.tree.map(np.asarray, (outcome.best, problem.stacks[0]))  # slices of NumPy arrays cost nothing
@@ -220,7 +227,7 @@ def _from_one(problem, x, more):
         rows = linearise(problem, x)
         return rows.residuals, rows.jacobian, rows
 
-    outcome = levenberg_marquardt(seen, x, **more)
+    outcome = levenberg_marquardt(seen, x, bounds=problem.bounds, **more)
     reason = failure_of(outcome.best.rest)
     if reason:
         raise ValueError(f"{AT_THE_START}, but ended with: {reason} Start from other parameters.")
@@ -239,12 +246,15 @@ def _from_many(problem, starts, more):
         rows = linearise_starts(problem, xs)
         return rows.residuals, rows.jacobian, rows
 
-    outcome = levenberg_marquardt(seen, xs, **more)
+    outcome = levenberg_marquardt(seen, xs, bounds=problem.bounds, **more)
     cost = np.nan_to_num(outcome.costs[-1], nan=np.inf)
     if not np.isfinite(cost).any():
         raise ValueError("`starts` must have one whose motion can be computed, but none has. Narrow the bounds.")
     best = int(np.argmin(cost))
-    return outcome._replace(best=jax.tree.map(lambda leaf: leaf[best], outcome.best), costs=outcome.costs[:, best])
+    chosen = jax.tree.map(lambda leaf: leaf[best], outcome.best)
+    if np.any(outcome.best.status == INTERRUPTED):  # another start might have come to a better end
+        chosen = chosen._replace(status=np.asarray(INTERRUPTED))
+    return outcome._replace(best=chosen, costs=outcome.costs[:, best])
 
 
 def _by_optax(problem, method, x, more):
@@ -279,4 +289,4 @@ def _optax_step(problem, method, x, state):
     cost, slope = jax.value_and_grad(problem.cost)(x)
     slope = jnp.where(jnp.isfinite(slope), slope, 0)
     updates, state = method.update(slope, state, x, value=cost, grad=slope, value_fn=problem.cost)
-    return cost, optax.apply_updates(x, updates), state
+    return cost, jnp.clip(optax.apply_updates(x, updates), *problem.bounds), state

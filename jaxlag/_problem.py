@@ -60,6 +60,13 @@ class Problem(eqx.Module):
         """The number of unknowns."""
         return self.free.size + sum(len(stack.members) * stack.unknowns for stack in self.stacks)
 
+    @property
+    def bounds(self) -> tuple[Array, Array]:
+        """Of all unknowns."""
+        lower, upper = self.free.bounds
+        others = jnp.full(self.size - self.free.size, jnp.inf, lower.dtype)
+        return jnp.concatenate([lower, -others]), jnp.concatenate([upper, others])
+
     def split(self, x: Array) -> tuple[Array, list[Array]]:
         """y, and for each stack z of its experiments."""
         sizes = [self.free.size, *(len(stack.members) * stack.unknowns for stack in self.stacks)]

@@ -9,9 +9,9 @@ import jax
 import numpy as np
 from jaxtyping import PyTree
 
+from ._autocorrelation import autoregression, reach, whiteness
 from ._experiment import entry_names
 
-LAGS = 20
 MANY = 12  # parameters that are looked at for what they determine together
 NOTHING = 1e-9  # singular values below this part of the largest are zero: columns have norm one, and are as exact as the integration
 ROUNDINGS = 300  # or so many units in the last place, in single precision
@@ -22,6 +22,7 @@ class Channel(NamedTuple):
 
     - `fit_percent`: 100 (1 − |z − ẑ| / |z − z̄|); `r_squared`: 1 − |z − ẑ|² / |z − z̄|²; `rms` of the residuals.
     - `whiteness`: the p-value of Ljung & Box's test that residuals are independent; small where the model misses something.
+    - `correlated`: over how many samples the residuals are; 0 where they are white.
 
     **Source:** Ljung, System Identification, 2nd ed., sections 16.4 and 16.6; Ljung & Box, Biometrika 65 (1978) 297.
     """
@@ -33,6 +34,7 @@ class Channel(NamedTuple):
     r_squared: float
     rms: float
     whiteness: float
+    correlated: int
 
 
 def channels_of(number: int, values: PyTree, residuals: PyTree) -> list[Channel]:
@@ -47,21 +49,8 @@ def _channel(number, name, z, r):
     z, r = z[there], r[there]
     around, off = np.linalg.norm(z - np.mean(z)) if z.size else np.nan, np.linalg.norm(r)
     part = off / around if around > 0 else np.nan
-    return Channel(number, name, z.size, 100 * (1 - part), 1 - part**2, off / np.sqrt(max(z.size, 1)), whiteness(r))
-
-
-def whiteness(residuals: np.ndarray) -> float:
-    """The probability of autocorrelations this large in white noise."""
-    from scipy import special  # comes with JAX; imported where it is needed, for that takes a while
-
-    n = residuals.size
-    lags = min(LAGS, n // 5)
-    r = residuals - np.mean(residuals) if n else residuals
-    power = r @ r
-    if lags == 0 or power == 0:
-        return np.nan
-    rho = np.array([r[k:] @ r[:-k] for k in range(1, lags + 1)]) / power
-    return float(special.chdtrc(lags, n * (n + 2) * np.sum(rho**2 / (n - np.arange(1, lags + 1)))))
+    rms, correlated = off / np.sqrt(max(z.size, 1)), reach(autoregression(r), z.size)
+    return Channel(number, name, z.size, 100 * (1 - part), 1 - part**2, rms, whiteness(r), correlated)
 
 
 class Determined(NamedTuple):

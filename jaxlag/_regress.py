@@ -208,7 +208,7 @@ def _is_linear(equations, named):
 def _iterated(equations, named, y, weights):
     seen = lambda y: (*_weighted(equations, named, y, weights), ())
     freedom = int(sum(np.count_nonzero(w) for w in weights))
-    return levenberg_marquardt(seen, y, freedom=freedom, max_steps=100, tolerance=1e-3).best.y
+    return levenberg_marquardt(seen, y, freedom=freedom, max_steps=100, tolerance=1e-3, bounds=named.bounds).best.y
 
 
 def _refuse_homogeneous(equations, named, weights):

@@ -8,12 +8,13 @@ import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
 
+from ._autocorrelation import autoregression, coloured_information, reach
 from ._compiled import compiled
 from ._experiment import Experiment, is_within
 from ._fit import Fit
-from ._least_squares import CONVERGED, REASONS, Outcome
+from ._least_squares import ASTRAY, CONVERGED, REASONS, Outcome
 from ._problem import Problem, failure_of, linearise
-from ._quality import Determined, channels_of, correlation_of, determined_by, in_words
+from ._quality import MANY, Determined, channels_of, correlation_of, determined_by, in_words
 from ._shooting import Pieces
 
 
@@ -37,11 +38,13 @@ def report(problem: Problem, experiments: Sequence[Experiment], outcome: Outcome
     x, rows, free = np.asarray(outcome.best.y), outcome.best.rest, problem.free
     p, y = free.size, jnp.asarray(outcome.best.y[: free.size])
     theta, slope = map(np.asarray, _theta_and_slope(free, y))
-    weighted = np.concatenate([np.ravel(r) for r in _weighted(problem, rows)])
+    of_stacks = list(_weighted(problem, rows))
+    weighted = np.concatenate([np.ravel(r) for r in of_stacks])
     there = np.isfinite(weighted)
     count, absolute = int(there.sum()), all(e.sigma is not None for e in experiments)
 
     gaps_J = np.asarray(rows.gaps_jacobian)
+    inflation, correlated, held = np.ones(p), 0, []
     if rows.jacobian is None:
         known, remarks = Determined(np.full((x.size, x.size), np.nan), np.ones(x.size, bool), np.zeros((x.size, 0))), [NO_ERRORS]
     else:
@@ -50,6 +53,12 @@ def report(problem: Problem, experiments: Sequence[Experiment], outcome: Outcome
             J[p:] /= problem.model.loss.slope(np.where(there, weighted, 0) / problem.scale)[:, None]
         known = determined_by(J, gaps_J)
         remarks = _not_determined(problem, x, known, theta, slope, J) if np.any(known.null[:p]) else []
+        allowing, correlated = _allowing_for_colour(problem, of_stacks, experiments, whole, J, known.covariance, absolute)
+        then, before = (np.diag(c)[:p] for c in (allowing, known.covariance))
+        inflation = np.sqrt(np.where(before > 0, then / np.where(before > 0, before, 1), 1))
+        known = known._replace(covariance=allowing)
+        r = np.nan_to_num(np.asarray(rows.residuals), posinf=0.0)  # of a motion that could not be computed
+        held = list(_at_bounds(free, theta, r @ np.asarray(rows.jacobian)[:, :p]))
     unknown_count = x.size - known.null.shape[1] - len(gaps_J)
     sigma = _noise(weighted[there], problem, max(count - unknown_count, 0))
     scale = 1.0 if absolute and problem.model.loss is None else sigma
@@ -57,17 +66,15 @@ def report(problem: Problem, experiments: Sequence[Experiment], outcome: Outcome
     covariance = known.covariance[:p, :p] * np.outer(slope, slope) * scale**2
     covariance[np.diag_indices(p)] = np.where(known.determined[:p], np.diag(covariance), np.inf)
     errors = np.sqrt(np.diag(covariance))
-    if outcome.best.jacobian is not None:
-        remarks += _at_bounds(free, theta, errors)
-    if absolute and sigma > UNEXPLAINED:
-        remarks.append(
-            f"the model does not explain the measurements, off by {sigma:.2g} times their noise: look for another start, "
-            "`pieces=`, or what the model lacks; the errors above mean little"
-        )
     first = [whole.of.index(i) for i in range(len(experiments))]
     own = [_own_of(problem, x, rows, k, e, known, scale) for k, e in zip(first, experiments, strict=True)]
     residuals, predictions, spreads = _whole(problem, rows, experiments, whole, known.covariance)
-    status = int(outcome.best.status)
+    channels = [c for k, (e, r) in enumerate(zip(experiments, residuals, strict=True)) for c in channels_of(k, e.values, r)]
+    status, away = int(outcome.best.status), _off(problem, weighted[there])
+    remarks += held
+    remarks += _misfit(away, sigma if absolute else 1.0, channels, known_why=bool(held))
+    if status == CONVERGED and away > AWAY:
+        status = ASTRAY
     return Fit(
         experiments=tuple(_as_found(e, found) for e, (found, _) in zip(experiments, own, strict=True)),
         params=free.insert(jnp.asarray(theta)),
@@ -80,7 +87,7 @@ def report(problem: Problem, experiments: Sequence[Experiment], outcome: Outcome
         residuals=residuals,
         predictions=predictions,
         prediction_errors=[jax.tree.map(lambda spread: scale * spread, tree) for tree in spreads],
-        channels=[c for k, (e, r) in enumerate(zip(experiments, residuals, strict=True)) for c in channels_of(k, e.values, r)],
+        channels=channels,
         sigma=sigma,
         cost=float(np.sum(np.asarray(rows.residuals)[: p + weighted.size] ** 2) / 2),
         names=free.entries,
@@ -95,6 +102,8 @@ def report(problem: Problem, experiments: Sequence[Experiment], outcome: Outcome
         unknown_count=unknown_count,
         x=x,
         x_covariance=known.covariance,
+        inflation=inflation,
+        correlated=correlated,
     )
 
 
@@ -104,6 +113,8 @@ def _theta_and_slope(free, y):
 
 
 UNEXPLAINED = 3.0  # residuals of so many times the noise are none
+AWAY = 10.0  # and so many times as large as the measurements, they come from a motion that has nothing to do with them
+WELL = 0.99  # R² of a channel from which on correlated residuals are told by the table alone
 NO_ERRORS = "standard errors are not computed for so many parameters"
 
 
@@ -119,12 +130,74 @@ def _noise(r, problem, freedom):
     return float(s * np.sqrt(influence @ influence / freedom) / np.mean(np.abs(r / s) <= loss.delta))
 
 
-def _at_bounds(free, theta, errors):
+def _allowing_for_colour(problem, of_stacks, experiments, whole, J, covariance, absolute):
+    """The covariance over σ² of all unknowns, or the sandwich about it where residuals are correlated; and over how many samples."""
+    p, loss = problem.free.size, problem.model.loss
+    if loss is not None:
+        of_stacks = [np.asarray(loss.influence(r / problem.scale)) for r in of_stacks]
+    begins = p + np.cumsum([0, *(r.size for r in of_stacks)])
+
+    def of_experiment(members, rows_of):
+        """Rows of its pieces, (samples, channels, ...)."""
+        places = [(*_place(problem, j), n) for j, n in members]
+        return np.concatenate([_by_time(problem.stacks[k], rows_of(k, row), n) for k, row, n in places])
+
+    def slopes_of(k, row):
+        begin = begins[k] + row * of_stacks[k].shape[1]
+        return J[begin : begin + of_stacks[k].shape[1]].astype(float)
+
+    series = [of_experiment(members, lambda k, row: of_stacks[k][row].astype(float)) for members in _members(whole, experiments)]
+    reaches = [reach(autoregression(r[np.isfinite(r)]), len(r)) for rs in series for r in rs.T]
+    if not any(reaches):
+        return covariance, 0
+    power = np.nanmean(np.concatenate([r.ravel() for r in series]) ** 2)
+    middle = J[:p].T @ J[:p]
+    for members, r in zip(_members(whole, experiments), series, strict=True):
+        sizes = np.ones(r.shape[1]) if absolute else np.sqrt(np.nanmean(r**2, axis=0) / power)
+        middle = middle + coloured_information(of_experiment(members, slopes_of), r, sizes)
+    return covariance @ middle @ covariance, max(reaches)
+
+
+def _by_time(stack, flat, samples):
+    """Rows of one experiment, one channel after the other, as (samples, channels, ...)."""
+    shapes = [leaf.shape[1:] for leaf in jax.tree.leaves(stack.values)]
+    parts = np.split(flat, np.cumsum([int(np.prod(shape)) for shape in shapes])[:-1])
+    by_time = [part.reshape(shape[0], -1, *flat.shape[1:]) for part, shape in zip(parts, shapes, strict=True)]
+    return np.concatenate(by_time, axis=1)[:samples]
+
+
+def _at_bounds(free, theta, slope):
     """Remarks on estimates that a bound holds back."""
-    for name, value, error, *bounds in zip(free.entries, theta, errors, np.asarray(free.lower), np.asarray(free.upper), strict=True):
-        for bound in bounds:
-            if abs(value - bound) < 1e-3 * error < np.inf:
+    for name, value, downhill, *bounds in zip(free.entries, theta, -slope, np.asarray(free.lower), np.asarray(free.upper), strict=True):
+        for bound, outwards in zip(bounds, (-downhill, downhill), strict=True):
+            if value == bound and outwards > 0:
                 yield f"{name} is at its bound {bound:g}, which the measurements would have it cross"
+
+
+def _off(problem, weighted):
+    """How many times as large as the measurements the residuals are."""
+    squares = 0.0
+    for stack in problem.stacks:
+        for z, s in zip(jax.tree.leaves(stack.values), jax.tree.leaves(stack.sigma), strict=True):
+            squares += float(np.nansum((np.asarray(z) / np.asarray(s))[: len(stack.members)] ** 2))
+    return float(np.linalg.norm(weighted) / np.sqrt(squares)) if squares > 0 else 0.0
+
+
+def _misfit(away, times_noise, channels, known_why):
+    """Remarks on measurements that the model does not explain; what is known to be wrong already explains correlated residuals."""
+    if away > AWAY:
+        yield f"the residuals are {away:.2g} times as large as the measurements: look at the units, and start from other parameters"
+    elif times_noise > UNEXPLAINED:
+        yield (
+            f"the model does not explain the measurements, off by {times_noise:.2g} times their noise: look for another start, "
+            "`pieces=`, or what the model lacks; the errors above mean little"
+        )
+    elif not known_why:
+        missed = [c for c in channels if c.correlated and c.r_squared < WELL]
+        if missed:
+            names = ", ".join(dict.fromkeys(c.name for c in missed[:MANY])) + (", …" if len(missed) > MANY else "")
+            over = max(c.correlated for c in missed)
+            yield f"the model misses something, or the sensors' noise is not white: residuals of {names} are correlated over {over} samples"
 
 
 def _not_determined(problem, x, known, theta, slope, J):
@@ -182,14 +255,20 @@ def _as_found(e, own):
     return eqx.tree_at(lambda e: (e.q0, e.qdot0, e.params), e, (own.get("q0", e.q0), own.get("qdot0", e.qdot0), params))
 
 
+def _members(whole, experiments):
+    """For each experiment its pieces, and how many samples are each one's own."""
+    samples = whole.samples or [e.ts.size for e in experiments]
+    of_each = list(enumerate(zip(whole.of, samples, strict=True)))
+    return [[(j, n) for j, (of, n) in of_each if of == i] for i in range(len(experiments))]
+
+
 def _whole(problem, rows, experiments, whole, covariance):
     """Residuals, predictions and their standard errors over σ̂ of each experiment, its pieces put together."""
     residuals, predictions, spreads = [], [], []
-    samples = whole.samples or [e.ts.size for e in experiments]
     together = lambda parts: jax.tree.map(lambda *pieces: np.concatenate(pieces), *parts)
-    for i, e in enumerate(experiments):
+    for e, of_one in zip(experiments, _members(whole, experiments), strict=True):
         seen, spread = [], []
-        for j, n in [(j, n) for j, (of, n) in enumerate(zip(whole.of, samples, strict=True)) if of == i]:
+        for j, n in of_one:
             k, row = _place(problem, j)
             cut = lambda tree, n=n: jax.tree.map(lambda x: x[:n], tree)
             seen.append(cut(jax.tree.map(lambda x, row=row: np.asarray(x)[row], rows.of_stacks[k].channels)))

@@ -11,7 +11,7 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 
 from ._experiment import Experiment, with_own
-from ._least_squares import INTERRUPTED, MAX_STEPS, Outcome, levenberg_marquardt
+from ._least_squares import APART, INTERRUPTED, MAX_STEPS, Outcome, levenberg_marquardt
 from ._manifold import consistent_state
 from ._problem import Links, Problem, linearise
 from ._smoothing import smooth
@@ -21,7 +21,10 @@ TIGHTER = 10.0  # the weight of the gaps from one round to the next
 ROUGH = 0.1  # of a standard error, the tolerance until the gaps are closed
 LOST = 0.5  # of its misfit that a piece has to gain to begin where the one before ends
 CLOSED = 1e-9  # gaps that are left, in units of the motion,
-ROUNDINGS = 300  # or so many units in the last place, in single precision
+ROUNDINGS = 300  # or so many units in the last place, in single precision,
+CLOSE = 1e-5  # or these, or rtol, where more weight does not make them smaller: they are the integration's error
+FALLING = 0.5  # of the gaps before, or less, are gaps that fall
+PATIENCE = 3  # rounds in which they do not, until it is given up
 
 
 class Pieces(NamedTuple):
@@ -100,7 +103,9 @@ def join(problem: Problem, x: Any, *, max_steps: int, tolerance: float, freedom:
         )
     links = problem.links
     assert links is not None
-    steps, costs, weight, closed = 0, np.zeros(0), 0.0, False
+    steps, costs, weight, bounds = 0, np.zeros(0), 0.0, problem.bounds
+    closed, gap, rounds, last = False, np.inf, 0, None
+    close = max(CLOSE, float(dict(problem.model.numerics).get("rtol") or 0))
     while True:
         problem = dataclasses.replace(problem, links=links)
 
@@ -110,18 +115,28 @@ def join(problem: Problem, x: Any, *, max_steps: int, tolerance: float, freedom:
 
         more = None if progress is None else lambda step, cost, done=steps: progress(done + step, cost)
         exactness = tolerance if closed else ROUGH
-        outcome = levenberg_marquardt(seen, x, freedom=freedom, max_steps=max_steps - steps, tolerance=exactness, progress=more)
+        outcome = levenberg_marquardt(
+            seen, x, bounds=bounds, freedom=freedom, max_steps=max_steps - steps, tolerance=exactness, progress=more
+        )
         x, steps, costs = outcome.best.y, steps + outcome.steps, np.append(costs, outcome.costs)
         rows, status = outcome.best.rest, int(outcome.best.status)
-        if status == INTERRUPTED or steps >= max_steps or closed:
-            ended = status if closed else max(status, MAX_STEPS)
+        apart = rounds >= PATIENCE
+        if status == INTERRUPTED or steps >= max_steps or closed or apart:
+            ended = status if closed or status == INTERRUPTED else MAX_STEPS if steps >= max_steps else APART
             return Outcome(outcome.best._replace(status=jnp.asarray(ended)), steps, costs), problem
         if weight == 0.0:
             x, lost = _begun_anew(problem, x, rows)
             if lost:
                 continue
-        closed = float(jnp.max(jnp.abs(rows.gaps))) < max(CLOSED, ROUNDINGS * float(jnp.finfo(x.dtype).eps))
+        before, left = gap, float(jnp.max(jnp.abs(rows.gaps)))
+        gap, rounds = min(left, before), rounds + 1 if left > FALLING * before else 0
+        if rounds and left < close and last is not None:  # the integration cannot do better: back to the last weight that helped
+            (x, links), closed = last, True
+            continue
+        last = (x, links) if weight else None
+        closed = left < max(CLOSED, ROUNDINGS * float(jnp.finfo(x.dtype).eps))
         before, weight = weight, weight * TIGHTER or FIRST * float(jnp.linalg.norm(rows.residuals) / jnp.linalg.norm(rows.gaps))
+        weight = before if closed and before else weight
         dual = (links.dual + rows.gaps) * (before / weight) ** 2  # weight² dual are the multipliers of the gaps, which go on
         links = dataclasses.replace(links, weight=jnp.asarray(weight), dual=dual)
 

@@ -68,6 +68,7 @@ ORDER = [
     "_prediction",
     "_problem",
     "_least_squares",
+    "_autocorrelation",
     "_quality",
     "_smoothing",
     "_shooting",
@@ -99,7 +100,7 @@ HOMES = [
     ("optax", {"_identify"}),
     ("pandas", {"_plain"}),
     ("polars", {"_plain"}),
-    ("scipy", {"_quality", "_smoothing", "_fit"}),
+    ("scipy", {"_autocorrelation", "_smoothing", "_fit"}),
     ("sympy", PAPER),
 ]
 

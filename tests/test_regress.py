@@ -103,6 +103,15 @@ def test_a_nonlinear_parameter_with_bounds():
     np.testing.assert_allclose([found.estimates["k"], found.estimates["n"]], [0.8, 1.6], rtol=5e-3)
 
 
+def test_an_estimate_at_its_bound_is_a_start():
+    """A record without a damper, whose noise would have its constant negative."""
+    e = jl.Experiment(osc.TIMES, osc.position(osc.TIMES, b=-0.05), 1.0, 0.0)
+    found = jl.regress(osc.SYSTEM, e, osc.START, free=("c", "b"), bounds={"b": (0, None)})
+    assert found.estimates["b"] == 0
+    fitted = jl.fit(osc.SYSTEM, e, found.params, free=("c", "b"), bounds={"b": (0, None)})
+    assert fitted.converged and fitted.estimates["b"] == 0 and "b is at its bound 0" in fitted.remarks[0]
+
+
 def test_what_no_sensor_sees_is_refused():
     e = jl.Experiment(osc.TIMES, osc.position(osc.TIMES), 1.0, 0.0, observe=lambda multipliers: multipliers["rod"])
     with pytest.raises(ValueError, match="must see positions, velocities or accelerations, but sees none"):

@@ -2,10 +2,13 @@
 
 import jax.numpy as jnp
 import numpy as np
+import oscillator as osc
 import pytest
 from scipy.integrate import solve_ivp
 
 import jaxlag as jl
+from jaxlag import _shooting
+from jaxlag._least_squares import STALLED, Iterate, Outcome
 
 TRUE = {"m2": 0.6, "l1": 0.5, "l2": 0.4, "b1": 0.02, "b2": 0.01}  # SI; the upper mass is 1
 START = {"m2": 1.0, "l1": 0.6, "l2": 0.3, "b1": 0.05, "b2": 0.03}
@@ -98,6 +101,32 @@ def test_everything_free_leaves_the_common_factor_of_masses_and_damping():
     assert all(np.isinf(plan.standard_errors[name]) for name in ("m1", "m2", "b1", "b2"))
     known = jl.information(weighed, e, TRUE | {"m1": 1.0}, ("m2", "b1", "b2"), **LOOSE)
     assert all(np.isfinite(known.standard_errors[name]) for name in ("m2", "b1", "b2"))
+
+
+def test_gaps_that_the_integration_leaves_end_the_rounds():
+    """With loose tolerances no weight closes the gaps: the last that helped is kept, and the estimates are those of SciPy's motion."""
+    ts = np.linspace(0, 50, 500)
+    swing = lambda t, s: [s[1], -9.81 * np.sin(s[0]) - 0.05 * s[1]]
+    angle = solve_ivp(swing, (0, 50), [2.5, 0], t_eval=ts, rtol=1e-11, atol=1e-12).y[0]
+    e = jl.Experiment(ts, angle + 0.01 * np.random.default_rng(0).standard_normal(500), 2.5, 0.0)
+    pendulum = jl.System(lambda q, qdot, g: 0.5 * qdot**2 + g * jnp.cos(q), dissipation=lambda qdot, b: 0.5 * b * qdot**2)
+    found = jl.fit(pendulum, e, {"g": 8.0, "b": 0.1}, free=("g", "b"), pieces=20, rtol=1e-3, atol=1e-4)
+    assert found.converged and abs(found.costs[-1] / found.cost - 1) < 0.02  # what the gaps weigh is nothing beside it
+    for name, value in {"g": 9.81, "b": 0.05}.items():
+        assert abs(found.estimates[name] - value) < 3 * found.standard_errors[name], name
+
+
+def test_ends_that_do_not_meet_are_said(monkeypatch):
+    """An iteration that goes nowhere."""
+
+    def stuck(seen, x, **_):
+        r, J, rows = seen(x)
+        nothing = jnp.zeros(0)
+        return Outcome(Iterate(x, r, J, rows, float(r @ r) / 2, nothing, nothing, np.asarray(STALLED)), 1, np.ones(1))
+
+    monkeypatch.setattr(_shooting, "levenberg_marquardt", stuck)
+    found = jl.fit(osc.SYSTEM, osc.record(0), osc.START, free=("c", "b"), pieces=3)
+    assert not found.converged and "the pieces' ends do not meet" in found.reason and found.steps < 10
 
 
 @pytest.mark.slow

@@ -1,0 +1,109 @@
+"""Residuals that hang together in time: whether they do, over how many samples, and what that makes of a covariance."""
+
+import numpy as np
+
+LAGS = 20
+COLOURED = 0.01  # the probability below which residuals are not taken as white
+NEGLIGIBLE = 0.1  # a correlation that no longer counts
+ALIKE = 10  # samples in common, from which on two channels are looked at for what they share
+
+
+def whiteness(residuals: np.ndarray) -> float:
+    """The probability of autocorrelations this large in white noise.
+
+    **Source:** Ljung & Box, Biometrika 65 (1978) 297.
+    """
+    from scipy import special  # comes with JAX; imported where it is needed, for that takes a while
+
+    n = residuals.size
+    lags = min(LAGS, n // 5)
+    r = residuals - np.mean(residuals) if n else residuals
+    power = r @ r
+    if lags == 0 or power == 0:
+        return np.nan
+    rho = np.array([r[k:] @ r[:-k] for k in range(1, lags + 1)]) / power
+    return float(special.chdtrc(lags, n * (n + 2) * np.sum(rho**2 / (n - np.arange(1, lags + 1)))))
+
+
+def autoregression(r: np.ndarray) -> np.ndarray:
+    r"""The coefficients a of $r_t = \sum_k a_k r_{t-k} + e_t$, as many as Schwarz's criterion likes best; none where r is white.
+
+    By the equations of Yule and Walker, whose model is stable.
+
+    **Source:** Brockwell & Davis, Time Series: Theory and Methods, 2nd ed. (1991), sections 5.2 and 8.1.
+    """
+    n = r.size
+    if not whiteness(r) < COLOURED:
+        return np.zeros(0)
+    most = min(n // 5, int(10 * np.log10(n)))
+    gamma = np.array([r[k:] @ r[: n - k] for k in range(most + 1)]) / n
+    a, power = np.zeros(0), gamma[0]
+    best, least = a, n * np.log(power)
+    for k in range(1, most + 1):
+        reflection = (gamma[k] - a @ gamma[k - 1 : 0 : -1]) / power
+        a, power = np.append(a - reflection * a[::-1], reflection), power * (1 - reflection**2)
+        if not power > 0:
+            break
+        criterion = n * np.log(power) + k * np.log(n)
+        if criterion < least:
+            best, least = a, criterion
+    return best
+
+
+def response(a: np.ndarray, count: int) -> np.ndarray:
+    """What one shock e at the beginning makes of r."""
+    from scipy import signal  # comes with JAX, too
+
+    return signal.lfilter([1.0], np.append(1.0, -a), np.eye(1, count)[0])
+
+
+def reach(a: np.ndarray, count: int) -> int:
+    """Over how many samples noise with these coefficients is correlated; 0 where it is white."""
+    if a.size == 0:
+        return 0
+    spectrum = np.abs(np.fft.rfft(response(a, count), 2 * count)) ** 2
+    gamma = np.fft.irfft(spectrum)[:count]
+    return int(np.flatnonzero(np.abs(gamma) >= NEGLIGIBLE * gamma[0])[-1]) + 1
+
+
+def coloured_information(J: np.ndarray, r: np.ndarray, sizes: np.ndarray) -> np.ndarray:
+    r"""What correlated residuals make of the information $J^T J$: the middle of the sandwich $(J^T J)^{-1} J^T R J (J^T J)^{-1}$.
+
+    R is that of noise which began long ago, $r = A^{-1} e$ with the autoregression A of each channel, whose shocks e in several
+    channels at one time may be correlated. So $J^T R J = K^T \Sigma K$ with $K = A^{-T} J$, a filter that runs backwards.
+
+    **Arguments:** `J` (T, C, x) and `r` (T, C), NaN where nothing was measured: such samples are passed over, and the times are taken as
+    evenly spaced. `sizes`: the standard deviations that the channels have in R.
+
+    **Source:** Newey & West, Econometrica 55 (1987) 703, with their weighted autocovariances replaced by those of an autoregression whose
+    order Schwarz's criterion chooses: den Haan & Levin, NBER Technical Working Paper 195 (1996). Missing samples passed over: Datta & Du,
+    International Finance Discussion Papers 1060 (2012). Correlated channels: Parks, J. Am. Stat. Assoc. 62 (1967) 500.
+    """
+    from scipy import signal
+
+    T, C, _ = J.shape
+    K, shocks, deviations = np.zeros((2 * T, *J.shape[1:])), np.full((T, C), np.nan), np.zeros(C)
+    for c in range(C):
+        there = np.flatnonzero(np.isfinite(r[:, c]))
+        a = autoregression(r[there, c])
+        at = np.append(np.arange(T), T + there)  # as many samples before the first
+        backwards = np.concatenate([np.zeros((T, J.shape[2])), J[there, c]])[::-1]
+        K[at, c] = signal.lfilter([1.0], np.append(1.0, -a), backwards, axis=0)[::-1]
+        shocks[there[a.size :], c] = signal.lfilter(np.append(1.0, -a), [1.0], r[there, c])[a.size :]
+        deviations[c] = sizes[c] / np.linalg.norm(response(a, 2 * T))
+    covariance = _correlations(shocks) * np.outer(deviations, deviations)
+    return np.einsum("tci,cd,tdj->ij", K, covariance, K, optimize=True)
+
+
+def _correlations(shocks):
+    """Of the channels, over the samples that two have in common; no direction less than none."""
+    C = shocks.shape[1]
+    found = np.eye(C)
+    for c in range(C):
+        for d in range(c):
+            both = shocks[np.all(np.isfinite(shocks[:, [c, d]]), axis=1)][:, [c, d]]
+            power = np.prod(np.sum(both**2, axis=0))
+            if len(both) >= ALIKE and power > 0:
+                found[c, d] = found[d, c] = both[:, 0] @ both[:, 1] / np.sqrt(power)
+    values, ways = np.linalg.eigh(found)
+    return ways * np.maximum(values, 0) @ ways.T
