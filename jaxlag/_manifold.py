@@ -12,8 +12,9 @@ from jaxtyping import Array, Bool, Float, PyTree
 
 from ._checks import at_state, coordinates
 from ._compiled import is_concrete
+from ._jacobian import jacobian
 from ._mechanics import constraint_rows, inertia, position_residual, velocity_residual
-from ._multipliers import NO_INERTIA, is_determined, saddle_point
+from ._multipliers import NO_INERTIA, augmented, is_determined, saddle_point
 from ._system import Flat, System
 
 
@@ -43,11 +44,26 @@ class Projection:
     def project(self, flat: Flat, t, q, v):
         """The state on the constraints that is nearest to this one, which is near already."""
         M = inertia(flat, t, q, v)[0]  # at the start serves throughout: what is put right is small
-        for _ in range(self.iterations):
-            g, G = position_residual(flat, t, q)
-            q = q + saddle_point(M, G, jnp.zeros_like(q), -g).x
+        if flat.holonomic_names:
+            metric = _metric_of_positions(flat, M, t, q, v)
+            for _ in range(self.iterations):
+                g, G = position_residual(flat, t, q)
+                q = q + saddle_point(metric, G, jnp.zeros_like(q), -g, _slack(q)).x
         psi, G, _ = constraint_rows(flat, t, q, v)
-        return q, v + saddle_point(M, G, jnp.zeros_like(v), -psi).x
+        return q, v + saddle_point(M, G, jnp.zeros_like(v), -psi, _slack(v)).x
+
+
+def _slack(x):
+    """How far it is put right in a direction that is barely held: a step leaves no more to do, but rounding asks for more."""
+    return jnp.finfo(x.dtype).eps ** 0.5 * (1 + jnp.abs(jax.lax.stop_gradient(x)))
+
+
+def _metric_of_positions(flat, M, t, q, v):
+    """M; and where velocities are constrained beyond it, what these forbid weighs too, for they may be all that holds a coordinate
+    without inertia.
+    """
+    psi, G = jacobian(lambda v: flat.nonholonomic(t, q, v), v)
+    return lx.MatrixLinearOperator(augmented(M.as_matrix(), G.as_matrix())[0]) if psi.size else M
 
 
 @dataclasses.dataclass(frozen=True)
@@ -111,7 +127,8 @@ def nearest_state(flat: Flat, t, q0, v0, free: Sequence[int] | None = None) -> C
     """
     moving = np.arange(q0.size) if free is None else np.asarray(free, int)
     both = np.ix_(moving, moving)
-    M = inertia(flat, t, q0, v0)[0].as_matrix()[both]
+    full = inertia(flat, t, q0, v0)[0]
+    M = full.as_matrix()[both]
     tolerance = jnp.finfo(q0.dtype).eps ** 0.5
     rows = velocity_residual(flat, t, q0, v0).size
     if rows == 0:  # nothing to satisfy: spares the compilation of the search
@@ -122,18 +139,24 @@ def nearest_state(flat: Flat, t, q0, v0, free: Sequence[int] | None = None) -> C
         g, G = position_residual(flat, t, q)
         bend = jax.hessian(lambda q: multipliers @ flat.holonomic(t, q))(q)[both]
         curved = jnp.where(is_determined(M - bend, G[:, moving]), M - bend, M)
-        step, multipliers, _ = saddle_point(lx.MatrixLinearOperator(curved), G[:, moving], M @ (q0 - q)[moving], -g)
+        asked = jnp.where(_off(g, G, q) < tolerance, _slack(q), (1 + jnp.abs(q)) / tolerance)[moving]
+        step, multipliers, _ = saddle_point(lx.MatrixLinearOperator(curved), G[:, moving], M @ (q0 - q)[moving], -g, asked)
         return (q.at[moving].add(step), multipliers), None
 
     start = q0, jnp.zeros(flat.holonomic(t, q0).size, q0.dtype)
-    (q, _), _ = jax.lax.scan(newton, start, length=NEWTON_STEPS)
+    if flat.holonomic_names:
+        M = jnp.where(is_determined(M, position_residual(flat, t, q0)[1][:, moving]), M, _metric_of_positions(flat, full, t, q0, v0).as_matrix()[both])
+        (q, _), _ = jax.lax.scan(newton, start, length=NEWTON_STEPS)
+    else:
+        q = q0
 
     psi, G, _ = constraint_rows(flat, t, q, v0)
     M = inertia(flat, t, q, v0)[0].as_matrix()[both]
-    nearest = saddle_point(lx.MatrixLinearOperator(M), G[:, moving], jnp.zeros_like(v0[moving]), -psi)
+    asked = jnp.where(_off(psi, G, v0) < tolerance, _slack(v0), (1 + jnp.abs(v0)) / tolerance)[moving]
+    nearest = saddle_point(lx.MatrixLinearOperator(M), G[:, moving], jnp.zeros_like(v0[moving]), -psi, asked)
     v = v0.at[moving].add(nearest.x)
     off = jnp.maximum(_off(*position_residual(flat, t, q), q), _off(velocity_residual(flat, t, q, v), G, v))
-    return Consistent(q, v, off < tolerance, nearest.determined)
+    return Consistent(q, v, off < tolerance, nearest.sound.determined)
 
 
 def _off(residual, rows, x):
