@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import lineax as lx
 import numpy as np
+from jax.interpreters import partial_eval as pe
 from jaxtyping import Array, Bool, Float, PyTree
 
 from ._checks import at_state, coordinates
@@ -112,12 +113,16 @@ NEWTON_STEPS = 16  # a fixed number is one loop to compile; near the constraints
 
 
 class Consistent(NamedTuple):
-    """A state on the constraints; `reached` is false where the iteration found none, `determined` where inertia is missing."""
+    """A state on the constraints; `reached` is false where the iteration found none, `determined` where inertia is missing, `affine`
+    where a nonholonomic constraint is not so in q̇, `defined` where M or a constraint gives no finite numbers at the state given.
+    """
 
     q: Float[Array, " n"]
     v: Float[Array, " n"]
     reached: Bool[Array, ""]
     determined: Bool[Array, ""]
+    affine: Bool[Array, ""]
+    defined: Bool[Array, ""]
 
 
 def nearest_state(flat: Flat, t, q0, v0, free: Sequence[int] | None = None) -> Consistent:
@@ -132,7 +137,8 @@ def nearest_state(flat: Flat, t, q0, v0, free: Sequence[int] | None = None) -> C
     tolerance = jnp.finfo(q0.dtype).eps ** 0.5
     rows = velocity_residual(flat, t, q0, v0).size
     if rows == 0:  # nothing to satisfy: spares the compilation of the search
-        return Consistent(q0, v0, jnp.array(True), is_determined(M, jnp.zeros((0, moving.size), M.dtype)))
+        yes = jnp.array(True)
+        return Consistent(q0, v0, yes, is_determined(M, jnp.zeros((0, moving.size), M.dtype)), yes, jnp.all(jnp.isfinite(M)))
 
     def newton(carry, _):
         q, multipliers = carry
@@ -155,8 +161,37 @@ def nearest_state(flat: Flat, t, q0, v0, free: Sequence[int] | None = None) -> C
     asked = jnp.where(_off(psi, G, v0) < tolerance, _slack(v0), (1 + jnp.abs(v0)) / tolerance)[moving]
     nearest = saddle_point(lx.MatrixLinearOperator(M), G[:, moving], jnp.zeros_like(v0[moving]), -psi, asked)
     v = v0.at[moving].add(nearest.x)
-    off = jnp.maximum(_off(*position_residual(flat, t, q), q), _off(velocity_residual(flat, t, q, v), G, v))
-    return Consistent(q, v, off < tolerance, nearest.sound.determined)
+    reached = (off_constraints(flat, t, q, v) < tolerance) & jnp.all(jnp.isfinite(q))
+    given = flat.holonomic(t, q0), velocity_residual(flat, t, q0, v0), M
+    defined = jnp.all(jnp.stack([jnp.all(jnp.isfinite(x)) for x in given]))
+    return Consistent(q, v, reached, nearest.sound.determined, ~jnp.any(bends(flat, t, q0, v0)), defined)
+
+
+def bends(flat: Flat, t, q, v) -> Bool[Array, " n"]:
+    """In which velocities a nonholonomic constraint is not affine: of two states, its ∂a/∂q̇ must be the same.
+
+    Costs nothing where the program of ∂a/∂q̇ does not ask for q̇, as it does not of what is written as sums and products.
+    """
+    slope = jax.jacfwd(flat.nonholonomic, argnums=2)
+    t, q, v = jax.lax.stop_gradient((t, q, v))
+    if not _asks_for_velocity(slope, t, q, v):
+        return jnp.zeros(v.size, bool)
+    here, there = slope(t, q, v), slope(t, q, v + (1 + jnp.abs(v)) * (1 + np.arange(v.size) / v.size))
+    return jnp.any(jnp.abs(here - there) > jnp.finfo(v.dtype).eps ** 0.5 * jnp.max(jnp.abs(here), initial=0.0), axis=0)
+
+
+def _asks_for_velocity(function, t, q, v) -> bool:
+    """Whether the program of a function of (t, q, v) has an operation that v has a part in."""
+    closed = jax.make_jaxpr(function)(t, q, v)
+    _, used = pe.dce_jaxpr(closed.jaxpr, [True] * len(closed.jaxpr.outvars))
+    return used[2]
+
+
+def off_constraints(flat: Flat, t, q, v) -> Float[Array, ""]:
+    """Largest residual of g and ψ, in the units of its row."""
+    _, G, _ = constraint_rows(flat, t, q, v)
+    of_position = _off(*position_residual(flat, t, q), q) if flat.holonomic_names else jnp.zeros((), q.dtype)
+    return jnp.maximum(of_position, _off(velocity_residual(flat, t, q, v), G, v))
 
 
 def _off(residual, rows, x):
@@ -191,15 +226,22 @@ def consistent_state(
     ```
     """
     core = _StateOn(_fixed_indices(coordinates(q, "q"), tuple(fixed)))
-    (q, qdot), reached, determined = at_state(core, system, q, qdot, params, t)
-    if is_concrete(reached, determined):
-        if not determined:
-            raise ValueError(NO_INERTIA)
-        if not reached:
-            raise ValueError(IMPOSSIBLE)
-    return q, qdot
+    (new_q, new_qdot), (reached, determined, affine, defined) = at_state(core, system, q, qdot, params, t)
+    if is_concrete(reached):
+        for passed, reason in ((defined, UNDEFINED), (determined, NO_INERTIA), (affine, NOT_AFFINE), (reached, IMPOSSIBLE)):
+            if not passed:
+                raise ValueError(reason)
+    return new_q, new_qdot
 
 
+UNDEFINED = (
+    "the functions of the system must give finite numbers, but one gives a NaN or an infinity there. Look for what is not defined, as the "
+    "root of a negative number or 0/0, for missing values, and for a motion that grows beyond all bounds."
+)
+NOT_AFFINE = (
+    "`nonholonomic` must be affine in qdot, but one is not. Write it as a sum of velocities with factors of t and q: its derivative "
+    "with respect to time, or a root of it."
+)
 IMPOSSIBLE = (
     "`holonomic` and `nonholonomic` must be satisfied by some state near the start, but none was found. "
     "Start nearer, fix fewer coordinates, or look for constraints that contradict each other."
@@ -214,9 +256,9 @@ class _StateOn:
 
     def __call__(self, flat: Flat, t, q, v):
         free = [i for i in range(q.size) if i not in self.held]
-        q, v, reached, determined = nearest_state(flat, t, q, v, free)
-        known = reached & determined
-        return (flat.unravel(jnp.where(known, q, jnp.nan)), flat.unravel(jnp.where(known, v, jnp.nan))), reached, determined
+        q, v, *flags = nearest_state(flat, t, q, v, free)
+        known = jnp.all(jnp.stack(flags))
+        return (flat.unravel(jnp.where(known, q, jnp.nan)), flat.unravel(jnp.where(known, v, jnp.nan))), flags
 
 
 def _fixed_indices(q: PyTree, fixed: tuple) -> tuple[int, ...]:

@@ -28,7 +28,7 @@ from ._friction import (
 )
 from ._kinks import Kinks, kinks_of
 from ._manifold import Baumgarte, NoStabilisation, Projection
-from ._multipliers import constrained_acceleration
+from ._multipliers import Sound, constrained_acceleration
 from ._power import energy_turnover, listed_powers
 from ._scalarised import scalarised
 from ._system import Flat, System, bind
@@ -65,6 +65,7 @@ class Sample(NamedTuple):
     works: dict[str, Array] | None
     friction: dict[str, tuple[Array, Array]]
     counts: dict[str, Array]
+    sound: Sound
 
 
 @dataclasses.dataclass(frozen=True)
@@ -169,15 +170,15 @@ class Equations:
         flat, _, kinks = self.mode(t, q, v, sigma, params)
         rubbing, counts = {}, {}
         if kinks is None:
-            qddot, multipliers, _ = _accelerated(self, t, y, params)
+            qddot, multipliers, sound = _accelerated(self, t, y, params)
         else:
             found = friction(flat, kinks, sigma, t, q, v, self.stabilisation.feedback())
-            qddot, multipliers = found.qddot, found.multipliers
+            qddot, multipliers, sound = found.qddot, found.multipliers, Sound(jnp.array(True), jnp.array(True))
             rubbing = friction_by_term(kinks, sigma, t, q, v, found)
             counts = {"transitions": transitions[0], "time_stuck": time_stuck}
         named = dict(zip(self.works, works, strict=True)) if self.audit else None
         unraveled = flat.unravel(q), flat.unravel(v), flat.unravel(qddot), flat.unravel_multipliers(multipliers)
-        return Sample(*unraveled, named, rubbing, counts)
+        return Sample(*unraveled, named, rubbing, counts, sound)
 
 
 @eqx.filter_jit  # so that diffrax's many calls trace it once

@@ -7,7 +7,7 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
-from ._manifold import IMPOSSIBLE
+from ._manifold import IMPOSSIBLE, NOT_AFFINE, UNDEFINED
 from ._multipliers import NO_INERTIA
 
 
@@ -17,6 +17,16 @@ class RESULTS(dfx.RESULTS):  # pyright: ignore
     not_finite = "`q0`, `qdot0`, `ts` and `params` must be finite, but there is a NaN or an infinity among them. Look for missing values."
     no_inertia = NO_INERTIA
     impossible_start = IMPOSSIBLE
+    not_affine = NOT_AFFINE
+    undefined = UNDEFINED
+    contradictory = (
+        "the constraints are not satisfied there: they contradict each other, nearly repeat each other, or ask for more than the mechanism "
+        "can reach. Look at them with `examine`, and at what drives them."
+    )
+    beyond_reach = (
+        "the constraints leave the motion no way on: they drive a mechanism beyond its reach, or into a position that locks it. "
+        "Let them ask for less, or leave out the one that does."
+    )
     negative_bound = "`dissipation` must have bounds of friction that are not negative, but one is. Take `jnp.abs` of a normal force."
     no_friction = (
         "no sliding and no sticking agrees with the friction forces it brings about, or more than one does (Painlevé's paradox). "
@@ -28,7 +38,8 @@ class RESULTS(dfx.RESULTS):  # pyright: ignore
     )
 
 
-OF_THE_INPUT = (RESULTS.not_finite, RESULTS.no_inertia, RESULTS.impossible_start, RESULTS.negative_bound)
+OF_THE_INPUT = (RESULTS.not_finite, RESULTS.no_inertia, RESULTS.impossible_start, RESULTS.not_affine, RESULTS.negative_bound)
+OF_THE_STEPS = (dfx.RESULTS.max_steps_reached, dfx.RESULTS.dt_min_reached)  # which other numerics may mend
 
 
 def reason_of(result: Any) -> str:

@@ -36,6 +36,7 @@ ORDER = [
     "_manifold",
     "_motion",
     "_results",
+    "_promises",
     "_progress",
     "_trajectory",
     "_canvas",
