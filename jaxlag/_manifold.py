@@ -15,7 +15,7 @@ from ._checks import at_state, coordinates
 from ._compiled import is_concrete
 from ._jacobian import jacobian
 from ._mechanics import constraint_rows, inertia, position_residual, velocity_residual
-from ._multipliers import NO_INERTIA, augmented, is_determined, saddle_point
+from ._multipliers import NO_INERTIA, Near, augmented, is_determined, saddle_point
 from ._system import Flat, System
 
 
@@ -49,14 +49,9 @@ class Projection:
             metric = _metric_of_positions(flat, M, t, q, v)
             for _ in range(self.iterations):
                 g, G = position_residual(flat, t, q)
-                q = q + saddle_point(metric, G, jnp.zeros_like(q), -g, _slack(q)).x
+                q = q + saddle_point(metric, G, jnp.zeros_like(q), -g, Near(q)).x
         psi, G, _ = constraint_rows(flat, t, q, v)
-        return q, v + saddle_point(M, G, jnp.zeros_like(v), -psi, _slack(v)).x
-
-
-def _slack(x):
-    """How far it is put right in a direction that is barely held: a step leaves no more to do, but rounding asks for more."""
-    return jnp.finfo(x.dtype).eps ** 0.5 * (1 + jnp.abs(jax.lax.stop_gradient(x)))
+        return q, v + saddle_point(M, G, jnp.zeros_like(v), -psi, Near(v)).x
 
 
 def _metric_of_positions(flat, M, t, q, v):
@@ -135,8 +130,9 @@ def nearest_state(flat: Flat, t, q0, v0, free: Sequence[int] | None = None) -> C
     full = inertia(flat, t, q0, v0)[0]
     M = full.as_matrix()[both]
     tolerance = jnp.finfo(q0.dtype).eps ** 0.5
-    rows = velocity_residual(flat, t, q0, v0).size
-    if rows == 0:  # nothing to satisfy: spares the compilation of the search
+    given = jnp.concatenate([flat.holonomic(t, q0), velocity_residual(flat, t, q0, v0)])
+    positions = flat.holonomic(t, q0).size
+    if given.size == 0:  # nothing to satisfy: spares the compilation of the search
         yes = jnp.array(True)
         return Consistent(q0, v0, yes, is_determined(M, jnp.zeros((0, moving.size), M.dtype)), yes, jnp.all(jnp.isfinite(M)))
 
@@ -145,25 +141,25 @@ def nearest_state(flat: Flat, t, q0, v0, free: Sequence[int] | None = None) -> C
         g, G = position_residual(flat, t, q)
         bend = jax.hessian(lambda q: multipliers @ flat.holonomic(t, q))(q)[both]
         curved = jnp.where(is_determined(M - bend, G[:, moving]), M - bend, M)
-        asked = jnp.where(_off(g, G, q) < tolerance, _slack(q), (1 + jnp.abs(q)) / tolerance)[moving]
-        step, multipliers, _ = saddle_point(lx.MatrixLinearOperator(curved), G[:, moving], M @ (q0 - q)[moving], -g, asked)
+        near = Near(q[moving], _off(g, G, q) > tolerance)
+        step, multipliers, _ = saddle_point(lx.MatrixLinearOperator(curved), G[:, moving], M @ (q0 - q)[moving], -g, near)
         return (q.at[moving].add(step), multipliers), None
 
-    start = q0, jnp.zeros(flat.holonomic(t, q0).size, q0.dtype)
-    if flat.holonomic_names:
-        M = jnp.where(is_determined(M, position_residual(flat, t, q0)[1][:, moving]), M, _metric_of_positions(flat, full, t, q0, v0).as_matrix()[both])
-        (q, _), _ = jax.lax.scan(newton, start, length=NEWTON_STEPS)
-    else:
-        q = q0
+    q = q0
+    if positions:
+        if given.size > 2 * positions:  # velocities beside may be all that holds a coordinate
+            held = is_determined(M, position_residual(flat, t, q0)[1][:, moving])
+            M = jnp.where(held, M, _metric_of_positions(flat, full, t, q0, v0).as_matrix()[both])
+        (q, _), _ = jax.lax.scan(newton, (q0, jnp.zeros(positions, q0.dtype)), length=NEWTON_STEPS)
 
     psi, G, _ = constraint_rows(flat, t, q, v0)
     M = inertia(flat, t, q, v0)[0].as_matrix()[both]
-    asked = jnp.where(_off(psi, G, v0) < tolerance, _slack(v0), (1 + jnp.abs(v0)) / tolerance)[moving]
-    nearest = saddle_point(lx.MatrixLinearOperator(M), G[:, moving], jnp.zeros_like(v0[moving]), -psi, asked)
+    near = Near(v0[moving], _off(psi, G, v0) > tolerance)
+    nearest = saddle_point(lx.MatrixLinearOperator(M), G[:, moving], jnp.zeros_like(v0[moving]), -psi, near)
     v = v0.at[moving].add(nearest.x)
-    reached = (off_constraints(flat, t, q, v) < tolerance) & jnp.all(jnp.isfinite(q))
-    given = flat.holonomic(t, q0), velocity_residual(flat, t, q0, v0), M
-    defined = jnp.all(jnp.stack([jnp.all(jnp.isfinite(x)) for x in given]))
+    off = jnp.maximum(_off(*position_residual(flat, t, q), q), _off(velocity_residual(flat, t, q, v), G, v))
+    reached = (off < tolerance) & jnp.all(jnp.isfinite(q))
+    defined = jnp.all(jnp.isfinite(given)) & jnp.all(jnp.isfinite(M))
     return Consistent(q, v, reached, nearest.sound.determined, ~jnp.any(bends(flat, t, q0, v0)), defined)
 
 
@@ -174,7 +170,7 @@ def bends(flat: Flat, t, q, v) -> Bool[Array, " n"]:
     """
     slope = jax.jacfwd(flat.nonholonomic, argnums=2)
     t, q, v = jax.lax.stop_gradient((t, q, v))
-    if not _asks_for_velocity(slope, t, q, v):
+    if flat.nonholonomic(t, q, v).size == 0 or not _asks_for_velocity(slope, t, q, v):
         return jnp.zeros(v.size, bool)
     here, there = slope(t, q, v), slope(t, q, v + (1 + jnp.abs(v)) * (1 + np.arange(v.size) / v.size))
     return jnp.any(jnp.abs(here - there) > jnp.finfo(v.dtype).eps ** 0.5 * jnp.max(jnp.abs(here), initial=0.0), axis=0)
@@ -189,9 +185,8 @@ def _asks_for_velocity(function, t, q, v) -> bool:
 
 def off_constraints(flat: Flat, t, q, v) -> Float[Array, ""]:
     """Largest residual of g and ψ, in the units of its row."""
-    _, G, _ = constraint_rows(flat, t, q, v)
-    of_position = _off(*position_residual(flat, t, q), q) if flat.holonomic_names else jnp.zeros((), q.dtype)
-    return jnp.maximum(of_position, _off(velocity_residual(flat, t, q, v), G, v))
+    G, beside = jax.jacfwd(flat.holonomic, argnums=1)(t, q), jax.jacfwd(flat.nonholonomic, argnums=2)(t, q, v)
+    return jnp.maximum(_off(flat.holonomic(t, q), G, q), _off(velocity_residual(flat, t, q, v), jnp.concatenate([G, beside]), v))
 
 
 def _off(residual, rows, x):

@@ -22,6 +22,18 @@ class Sound(NamedTuple):
     satisfied: Bool[Array, ""]
 
 
+class Near(NamedTuple):
+    """The state that a solve puts right: by rounding alone, or, where it is clearly `off`, as far as need be."""
+
+    state: Float[Array, " n"]
+    off: Bool[Array, ""] | None = None
+
+    def slack(self) -> Float[Array, " n"]:
+        """How far each of its numbers may go in a direction that is barely held."""
+        near = jnp.finfo(self.state.dtype).eps ** 0.5
+        return (1 + jnp.abs(jax.lax.stop_gradient(self.state))) * (near if self.off is None else jnp.where(self.off, 1 / near, near))
+
+
 class SaddlePoint(NamedTuple):
     """Solution of the constrained solve, and whether it is one."""
 
@@ -30,30 +42,30 @@ class SaddlePoint(NamedTuple):
     sound: Sound
 
 
-def saddle_point(M: lx.AbstractLinearOperator, G: Float[Array, "m n"], f, c, slack: Float[Array, " n"] | None = None) -> SaddlePoint:
+def saddle_point(M: lx.AbstractLinearOperator, G: Float[Array, "m n"], f, c, near: Near | None = None) -> SaddlePoint:
     """The unique x and the λ of least norm with M x = f + Gᵀλ and G x = c.
 
     f and c are vectors, or as many columns each. M need be positive definite on the null space of G only, and rows of G may
     depend on each other. Where M is seen to be diagonal, as of points in Cartesian coordinates, it is divided by, unless a mass is
     (next to) nothing beside another.
 
-    A direction that G barely holds is held where that takes x about as far as all else does, or no farther than `slack`. What is asked
-    beyond that, the error of a state asks for, as of a mechanism that passes a singular position.
+    A direction that G barely holds is held where that takes x about as far as all else does, or, where x puts a state right, no farther
+    than `near` says. What is asked beyond that, the error of a state asks for, as of a mechanism that passes a singular position.
     """
     if f.ndim == 1:
-        found = saddle_point(M, G, f[:, None], c[:, None], slack)
+        found = saddle_point(M, G, f[:, None], c[:, None], near)
         return found._replace(x=found.x[:, 0], multipliers=found.multipliers[:, 0])
     if not isinstance(M, lx.DiagonalLinearOperator):
-        return _saddle_point(M, G, f, c, slack)
+        return _saddle_point(M, G, f, c, near)
     heavy = M.diagonal > jnp.finfo(f.dtype).eps ** 0.25 * jnp.max(jnp.abs(M.diagonal))
-    divided = _saddle_point(lx.DiagonalLinearOperator(jnp.where(heavy, M.diagonal, 1)), G, f, c, slack)
-    full = lambda: _saddle_point(lx.MatrixLinearOperator(M.as_matrix()), G, f, c, slack)
+    divided = _saddle_point(lx.DiagonalLinearOperator(jnp.where(heavy, M.diagonal, 1)), G, f, c, near)
+    full = lambda: _saddle_point(lx.MatrixLinearOperator(M.as_matrix()), G, f, c, near)
     return jax.lax.cond(everywhere(jnp.all(heavy)), lambda: divided, full)
 
 
 @jax.custom_jvp
-def _saddle_point(M, G, f, c, slack) -> SaddlePoint:
-    solve, _, determined, satisfied = _solver(M, G, f, c, slack)
+def _saddle_point(M, G, f, c, near) -> SaddlePoint:
+    solve, _, determined, satisfied = _solver(M, G, f, c, near)
     return SaddlePoint(*solve(f, c), Sound(determined, satisfied))
 
 
@@ -63,15 +75,15 @@ def _saddle_point_jvp(primals, tangents):
 
     Through the formula, the derivative of the pseudo-inverse would cancel where a mechanism passes a singular position.
     """
-    (M, G, f, c, slack), (dM, dG, df, dc, _) = primals, tangents
-    found = _saddle_point(M, G, f, c, slack)
-    solve, turned, *_ = _solver(M, G, f, c, slack)
+    (M, G, f, c, near), (dM, dG, df, dc, _) = primals, tangents
+    found = _saddle_point(M, G, f, c, near)
+    solve, turned, *_ = _solver(M, G, f, c, near)
     dx, d_multipliers = solve(df + dG.T @ found.multipliers - jax.vmap(dM.mv, 1, 1)(found.x), dc - dG @ found.x)
     still = jax.tree.map(lambda flag: np.zeros(jnp.shape(flag), jax.dtypes.float0), found.sound)
     return found, SaddlePoint(dx, d_multipliers + turned(dG, found.multipliers), still)
 
 
-def _solver(M, G, f, c, slack):
+def _solver(M, G, f, c, near):
     """(f, c) ↦ (x, λ); (dG, λ) ↦ how λ turns with the null space of Gᵀ to stay of least norm; whether M is positive there; whether
     rows that follow from others do so for this c too.
 
@@ -94,7 +106,8 @@ def _solver(M, G, f, c, slack):
     load = lambda f, c: f + G.T @ (W[:, None] * c)
 
     def asked():
-        length = None if slack is None else jnp.sqrt(fixed(slack @ M.mv(slack)))
+        slack = None if near is None else near.slack()
+        length = None if slack is None else jnp.sqrt(slack @ fixed(M.as_matrix()) @ slack)
         return Asked(by_root(fixed(G.T)).T, fixed(c), by_root(fixed(load(f, c))), length)
 
     inverse, satisfied = _inverse(fixed(S), fixed(c), lambda D: _by_rows(asked(), D))
@@ -159,7 +172,7 @@ class Asked(NamedTuple):
 
 
 class Inverse(NamedTuple):
-    """S⁺, of an S with rows of length 1/D: by the Cholesky factor of D S D where S is `regular`, else as root rootᵀ."""
+    """S⁺, of an S with rows of length 1/D: by the Cholesky factor of D S D where S is `regular`, else as root rootᵀ. Of one row, D itself."""
 
     regular: Bool[Array, ""]
     D: Float[Array, " m"]
@@ -175,14 +188,15 @@ def _inverse(S: Float[Array, "m m"], c: Float[Array, "m k"], singular: Callable)
     S − m √eps 1 has a Cholesky factorisation, that of S serves: no eigenvalue is below √eps of the largest, which is at most m.
     """
     m, eps, size = S.shape[0], jnp.finfo(S.dtype).eps, jnp.diagonal(S)
-    there = size > (4 * eps) ** 2 * jnp.max(size, initial=0.0)  # a row of nothing but rounding has no part in it
+    if m < 2:
+        D = jnp.where(size > 0, 1 / jnp.where(size > 0, size, 1), 0)
+        return Inverse(jnp.array(True), D, S, S), jnp.all((size > 0)[:, None] | (c == 0))
+    there = size > (4 * eps) ** 2 * jnp.max(size)  # a row of nothing but rounding has no part in it
     D = jnp.where(there, jax.lax.rsqrt(jnp.where(there, size, 1)), 0)
-    nearly_zero = jnp.abs(c) <= eps**FOLLOWS * jnp.max(jnp.abs(c), axis=0, keepdims=True, initial=0.0)
+    nearly_zero = jnp.abs(c) <= eps**FOLLOWS * jnp.max(jnp.abs(c), axis=0, keepdims=True)
     follows = jnp.all(there[:, None] | nearly_zero)
     one, nothing = jnp.eye(m, dtype=S.dtype), jnp.zeros_like(S)
     scaled = S * jnp.outer(D, D) + jnp.diag(~there).astype(S.dtype)
-    if m < 2:
-        return Inverse(jnp.array(True), D, one, nothing), follows
     regular = everywhere(jnp.all(jnp.diagonal(jnp.linalg.cholesky(scaled - m * eps**0.5 * one)) > 0))
     root, others_follow = jax.lax.cond(regular, lambda: (nothing, jnp.array(True)), lambda: singular(D))
     return Inverse(regular, D, jnp.linalg.cholesky(jnp.where(regular, scaled, one)), root), follows & others_follow
@@ -223,7 +237,7 @@ def _applied(S: Float[Array, "m m"], inverse: Inverse, R: Float[Array, "m k"]) -
     """S⁺R; differentiated at constant rank."""
     regular, D, factor, root = inverse
     if len(D) < 2:
-        return D[:, None] ** 2 * R
+        return D[:, None] * R
     by_factor = D[:, None] * jax.scipy.linalg.cho_solve((factor, True), D[:, None] * R)
     return jnp.where(regular, by_factor, root @ (root.T @ R))  # by parts: the product has lost the smaller values
 
