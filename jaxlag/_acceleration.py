@@ -9,6 +9,7 @@ import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
 from jaxtyping import PyTree
 
+from ._causes import because
 from ._checks import at_state
 from ._compiled import is_concrete
 from ._friction import settled
@@ -54,14 +55,14 @@ def acceleration(system: System, q: PyTree, qdot: PyTree, params: PyTree = None,
     ```
     """
     result, sound = at_state(_acceleration, system, q, qdot, params, t)
-    _refuse(sound)
+    _refuse(sound, system, q, qdot, params, t)
     return result
 
 
-def _refuse(sound: Sound) -> None:
+def _refuse(sound: Sound, *given) -> None:
     """Raises what a solve lacks; under `jit` its result is NaN."""
     if is_concrete(sound) and not sound.determined:
-        raise ValueError(NO_INERTIA)
+        raise ValueError(because(NO_INERTIA, *given))
     if is_concrete(sound) and not sound.satisfied:
         raise ValueError(CONTRADICTION)
 
@@ -105,7 +106,7 @@ def constraint_force(
     ```
     """
     force, sound = at_state(_ConstraintForce(at), system, q, qdot, params, t)
-    _refuse(sound)
+    _refuse(sound, system, q, qdot, params, t)
     return force
 
 

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import PyTree
 
+from ._causes import UNDEFINED, allowed, bends, entry_names, is_defined, weightless
 from ._checks import at_state, coordinates
 from ._friction import settled
 from ._mechanics import constraint_rows, inertia, position_residual
@@ -60,7 +61,8 @@ def examine(system: System, q: PyTree, qdot: PyTree, params: PyTree = None, *, t
 
     **Arguments:** as `acceleration`. Any consistent units. **Returns:** an `Examination`; print it.
 
-    **Raises:** `TypeError` or `ValueError` where an argument or a function of the system is of the wrong kind.
+    **Raises:** `TypeError` or `ValueError` where an argument or a function of the system is of the wrong kind, or gives no finite
+    numbers at this state.
 
     **Source:** Hairer & Wanner, Solving Ordinary Differential Equations II, sections IV.1 (stiffness) and VII.1.
 
@@ -71,11 +73,14 @@ def examine(system: System, q: PyTree, qdot: PyTree, params: PyTree = None, *, t
     ```
     """
     found = jax.tree.map(np.asarray, at_state(_measure, system, q, qdot, params, t))
+    if not is_defined(found):
+        raise ValueError(UNDEFINED)
     q = coordinates(q, "q")
     eps = float(jnp.finfo(found["M"].dtype).eps)
     G, M = found["G"], found["M"]
     rows = {name: found["rows"][name] for name in system.constraints}  # in the order of the rows of G
-    N, rank = _null_space(G, eps)
+    N = allowed(G, eps)
+    rank = G.shape[1] - N.shape[1]
     inertia_on_N = np.linalg.eigvalsh(N.T @ M @ N) if N.shape[1] else np.zeros(0)
     smallest = float(inertia_on_N[0]) if inertia_on_N.size else float("inf")
     redundant = _redundant_rows(G, rows, eps)
@@ -93,13 +98,44 @@ def examine(system: System, q: PyTree, qdot: PyTree, params: PyTree = None, *, t
         "dissipated": {name: float(np.min(value)) for name, value in found["dissipated"].items()},
         "time_constants": constants,
     }
-    no_inertia = inertia_on_N.size > 0 and smallest <= 100 * M.shape[0] * eps * np.max(np.abs(M), initial=0.0)
-    return Examination(**numbers, findings=tuple(_findings(numbers, no_inertia, found["M"].dtype)))
+    names = entry_names(q)
+    found_of_rows = [*_without_inertia(names, M, G), *_not_affine(names, found["bends"]), *_pushes(names, M, G, rows, system)]
+    return Examination(**numbers, findings=(*found_of_rows, *_findings(numbers, found["M"].dtype)))
 
 
-def _findings(numbers, no_inertia, dtype):
-    if no_inertia:
-        yield "a direction that no constraint holds has no inertia: add the missing mass, or a constraint"
+def _without_inertia(names, M, G):
+    free = [names[i] for i in weightless(M, G)]
+    if free:
+        yield (
+            f"a direction that no constraint holds has no inertia: {', '.join(map(repr, free))}; add the missing mass (a small one with "
+            "`solver=diffrax.Kvaerno5()`), a constraint that holds it, or leave the coordinate out"
+        )
+
+
+def _not_affine(names, bends):
+    bent = [names[i] for i in np.flatnonzero(bends)]
+    if bent:
+        listed = ", ".join(map(repr, bent))
+        yield f"a nonholonomic constraint is not affine in the velocity of {listed}: write its derivative, or a root of it"
+
+
+def _pushes(names, M, G, rows, system):
+    """Rows of velocities that tie a coordinate without inertia to others: their λ acts on these too, as a law of first order would not."""
+    size = np.max(np.abs(M), axis=1)
+    massless = size <= 100 * len(M) * np.finfo(M.dtype).eps * np.max(size, initial=0.0)
+    for name in (name for name, _ in system.nonholonomic):
+        for row in G[rows[name]]:
+            part = np.abs(row) > 1e-12 * np.max(np.abs(row), initial=0.0)
+            driven, pushed = ([names[i] for i in np.flatnonzero(part & of)] for of in (massless, ~massless))
+            if driven and pushed:
+                yield (
+                    f"constraint {name!r} ties {', '.join(map(repr, driven))}, without inertia, to {', '.join(map(repr, pushed))}, and its "
+                    "λ pushes these too: right for a rod or a gear, wrong for a law such as that of a spring and damper in series, "
+                    "which is to push by a force or an energy alone"
+                )
+
+
+def _findings(numbers, dtype):
     if numbers["degrees_of_freedom"] == 0:
         yield "no degree of freedom is left: the constraints hold every coordinate"
     for name, count in numbers["redundant"].items():
@@ -141,6 +177,7 @@ def _measure(flat: Flat, t, q, v):
         "M": inertia(flat, t, q, v)[0].as_matrix(),
         "G": G,
         "A": jax.jacfwd(rates)(jnp.concatenate([q, v])),
+        "bends": bends(flat, t, q, v),
         "rows": {name: jnp.asarray(rows) for name, rows in split.items()},
         "position": {name: g[split[name]] for name in flat.holonomic_names},
         "velocity": {name: psi[rows] for name, rows in split.items()},
@@ -148,22 +185,12 @@ def _measure(flat: Flat, t, q, v):
     }
 
 
-def _null_space(G, eps):
-    """Columns that span the motions the constraints allow, and the rank of G, with rows scaled to unit length."""
-    size = np.linalg.norm(G, axis=1, keepdims=True)
-    if not G.shape[0]:
-        return np.eye(G.shape[1]), 0
-    _, s, Vt = np.linalg.svd(G / np.where(size > 0, size, 1))
-    rank = int(np.sum(s > eps**0.3125 * max(s[0], eps)))
-    return Vt[rank:].T, rank
-
-
 def _redundant_rows(G, rows, eps):
     """How many rows of each constraint depend on rows before them."""
     redundant, before = {}, np.zeros((0, G.shape[1]))
     for name, indices in rows.items():
         of_name = np.concatenate([before, G[indices]])
-        dependent = len(indices) - (_null_space(of_name, eps)[1] - _null_space(before, eps)[1])
+        dependent = len(indices) - (allowed(before, eps).shape[1] - allowed(of_name, eps).shape[1])
         if dependent:
             redundant[name] = dependent
         before = of_name

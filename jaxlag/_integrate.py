@@ -84,7 +84,7 @@ def simulate(
     ts, tolerances = sample_times(ts, dtype), tolerances_of(rtol, atol, dtype)
     trajectory = _simulate(system, how, q0, qdot0, ts, parameters(params, q0), tolerances)
     if throw:
-        raise_failure(trajectory)
+        raise_failure(trajectory, (q0, qdot0))
     return trajectory
 
 

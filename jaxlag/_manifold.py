@@ -8,9 +8,9 @@ import jax
 import jax.numpy as jnp
 import lineax as lx
 import numpy as np
-from jax.interpreters import partial_eval as pe
 from jaxtyping import Array, Bool, Float, PyTree
 
+from ._causes import NOT_AFFINE, UNDEFINED, because, bends
 from ._checks import at_state, coordinates
 from ._compiled import is_concrete
 from ._jacobian import jacobian
@@ -163,26 +163,6 @@ def nearest_state(flat: Flat, t, q0, v0, free: Sequence[int] | None = None) -> C
     return Consistent(q, v, reached, nearest.sound.determined, ~jnp.any(bends(flat, t, q0, v0)), defined)
 
 
-def bends(flat: Flat, t, q, v) -> Bool[Array, " n"]:
-    """In which velocities a nonholonomic constraint is not affine: of two states, its ∂a/∂q̇ must be the same.
-
-    Costs nothing where the program of ∂a/∂q̇ does not ask for q̇, as it does not of what is written as sums and products.
-    """
-    slope = jax.jacfwd(flat.nonholonomic, argnums=2)
-    t, q, v = jax.lax.stop_gradient((t, q, v))
-    if flat.nonholonomic(t, q, v).size == 0 or not _asks_for_velocity(slope, t, q, v):
-        return jnp.zeros(v.size, bool)
-    here, there = slope(t, q, v), slope(t, q, v + (1 + jnp.abs(v)) * (1 + np.arange(v.size) / v.size))
-    return jnp.any(jnp.abs(here - there) > jnp.finfo(v.dtype).eps ** 0.5 * jnp.max(jnp.abs(here), initial=0.0), axis=0)
-
-
-def _asks_for_velocity(function, t, q, v) -> bool:
-    """Whether the program of a function of (t, q, v) has an operation that v has a part in."""
-    closed = jax.make_jaxpr(function)(t, q, v)
-    _, used = pe.dce_jaxpr(closed.jaxpr, [True] * len(closed.jaxpr.outvars))
-    return used[2]
-
-
 def off_constraints(flat: Flat, t, q, v) -> Float[Array, ""]:
     """Largest residual of g and ψ, in the units of its row."""
     G, beside = jax.jacfwd(flat.holonomic, argnums=1)(t, q), jax.jacfwd(flat.nonholonomic, argnums=2)(t, q, v)
@@ -225,18 +205,10 @@ def consistent_state(
     if is_concrete(reached):
         for passed, reason in ((defined, UNDEFINED), (determined, NO_INERTIA), (affine, NOT_AFFINE), (reached, IMPOSSIBLE)):
             if not passed:
-                raise ValueError(reason)
+                raise ValueError(because(reason, system, q, qdot, params, t))
     return new_q, new_qdot
 
 
-UNDEFINED = (
-    "the functions of the system must give finite numbers, but one gives a NaN or an infinity there. Look for what is not defined, as the "
-    "root of a negative number or 0/0, for missing values, and for a motion that grows beyond all bounds."
-)
-NOT_AFFINE = (
-    "`nonholonomic` must be affine in qdot, but one is not. Write it as a sum of velocities with factors of t and q: its derivative "
-    "with respect to time, or a root of it."
-)
 IMPOSSIBLE = (
     "`holonomic` and `nonholonomic` must be satisfied by some state near the start, but none was found. "
     "Start nearer, fix fewer coordinates, or look for constraints that contradict each other."

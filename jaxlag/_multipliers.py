@@ -172,7 +172,7 @@ class Asked(NamedTuple):
 
 
 class Inverse(NamedTuple):
-    """S⁺, of an S with rows of length 1/D: by the Cholesky factor of D S D where S is `regular`, else as root rootᵀ. Of one row, D itself."""
+    """S⁺, of an S with rows of length 1/D: by the Cholesky factor of D S D where S is `regular`, else as root rootᵀ; of one row, D."""
 
     regular: Bool[Array, ""]
     D: Float[Array, " m"]
@@ -303,5 +303,6 @@ CONTRADICTION = (
 )
 NO_INERTIA = (
     "`lagrangian` must give every direction inertia that no constraint holds, but the mass matrix is singular "
-    "(or not positive) on the null space of the constraints. Add the missing mass, or a constraint."
+    "(or not positive) on the null space of the constraints. Add the missing mass (a small one with a solver for stiff systems, "
+    "`solver=diffrax.Kvaerno5()`), add a constraint that holds it, or leave the coordinate out."
 )

@@ -7,7 +7,8 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
-from ._manifold import IMPOSSIBLE, NOT_AFFINE, UNDEFINED
+from ._causes import NOT_AFFINE, UNDEFINED
+from ._manifold import IMPOSSIBLE
 from ._multipliers import NO_INERTIA
 
 
@@ -39,7 +40,7 @@ class RESULTS(dfx.RESULTS):  # pyright: ignore
 
 
 OF_THE_INPUT = (RESULTS.not_finite, RESULTS.no_inertia, RESULTS.impossible_start, RESULTS.not_affine, RESULTS.negative_bound)
-OF_THE_STEPS = (dfx.RESULTS.max_steps_reached, dfx.RESULTS.dt_min_reached)  # which other numerics may mend
+OF_THE_STEPS = (RESULTS.max_steps_reached, RESULTS.dt_min_reached)  # which other numerics may mend
 
 
 def reason_of(result: Any) -> str:

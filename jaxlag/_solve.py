@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool
 
+from ._causes import because
 from ._compiled import is_concrete
 from ._kernel import in_one_kernel
 from ._manifold import nearest_state
@@ -176,16 +177,23 @@ class Meter(dfx.TextProgressMeter):
         bar.end()
 
 
-def raise_failure(trajectory: Trajectory) -> None:
-    """Raises the reason of a failed motion, outside what is compiled; under `jit` the reason stays in the result."""
+def raise_failure(trajectory: Trajectory, start: tuple | None = None) -> None:
+    """Raises the reason of a failed motion, outside what is compiled; under `jit` the reason stays in the result.
+
+    Of a `start` (q0, qdot0), it names the coordinates that the reason is about.
+    """
     if not is_concrete(trajectory.result) or np.all(trajectory.succeeded):
         return
     reason = reason_of(trajectory.result)
     if reason in map(reason_of, OF_THE_INPUT):
-        raise ValueError(reason)
+        stated = trajectory.stated
+        raise ValueError(reason if start is None else because(reason, stated.system, *start, stated.params, trajectory.ts[0]))
     samples, coordinate = trajectory.ts.shape[-1], np.asarray(jax.tree.leaves(trajectory.q)[0])
     reached = np.isfinite(coordinate.reshape(-1, samples, coordinate.size // trajectory.ts.size)[..., 0]).sum(1).min()
-    numerics = "Allow more `max_steps`, look at what was computed with `throw=False`, or take a solver for stiff systems, `solver=diffrax.Kvaerno5()`."
+    numerics = (
+        "Allow more `max_steps`, look at what was computed with `throw=False`, or take a solver for stiff systems, "
+        "`solver=diffrax.Kvaerno5()`."
+    )
     raise RuntimeError(
         f"the motion must reach t = {np.ravel(trajectory.ts)[-1]:g}, but stopped at t = {np.min(trajectory.stats['reached']):g} "
         f"after {reached} of {samples} samples: {reason} {numerics if reason in map(reason_of, OF_THE_STEPS) else ''}".rstrip()

@@ -28,6 +28,7 @@ ORDER = [
     "_jacobian",
     "_mechanics",
     "_multipliers",
+    "_causes",
     "_kinks",
     "_friction",
     "_acceleration",
