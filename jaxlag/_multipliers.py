@@ -205,8 +205,8 @@ def _inverse(S: Float[Array, "m m"], c: Float[Array, "m k"], singular: Callable)
 def _by_rows(asked: Asked, D) -> tuple[Float[Array, "m m"], Bool[Array, ""]]:
     """A root of S⁺ by the singular values of the rows themselves, of which S holds the squares: rounding hides those below √eps there.
 
-    Values above `CLEAR` of the largest count, those below `SEEN` do not, as rows of dependent constraints have them by rounding. The
-    ones between count where what they ask for is no more than `FARTHER` times all the rest, or `slack`.
+    Values above `CLEAR` of the largest count. Those down to `SEEN` count where what they ask for is no more than `FARTHER` times all the
+    rest, or `slack`. Others are left out: below `NOISE`, where dependent rows have them by rounding, for good; above it, unsatisfied.
     """
     eps = jnp.finfo(D.dtype).eps
     U, values, _ = jnp.linalg.svd(D[:, None] * asked.rows)
@@ -218,7 +218,7 @@ def _by_rows(asked: Asked, D) -> tuple[Float[Array, "m m"], Bool[Array, ""]]:
     bound = FARTHER * (length(asked.free) + length(jnp.where(clear[:, None], way, 0))) if asked.slack is None else asked.slack
     held = clear | (seen & jnp.all(jnp.abs(way) <= bound, axis=1))
     contradicts = jnp.abs(rest) > eps**FOLLOWS * (length(wanted) + length(asked.free))
-    satisfied = ~jnp.any(~held & (seen | jnp.any(contradicts, axis=1)))
+    satisfied = ~jnp.any(~held & ((values > eps**NOISE * values[0]) | jnp.any(contradicts, axis=1)))
     return _by_values(values**2, U, held, D), satisfied
 
 
@@ -295,8 +295,8 @@ def _self_consistent(reaction, start):
 
 
 NEWTON_STEPS = 3
-# Exponents of eps (1.3e-5, 1.6e-10 and 1.3e-6 in double precision) and a factor, with which ranks are judged
-CLEAR, SEEN, FOLLOWS, FARTHER = 0.3125, 0.625, 0.375, 2
+# Exponents of eps (1.3e-5, 1.6e-10, 1.8e-12 and 1.3e-6 in double precision) and a factor, with which ranks are judged
+CLEAR, SEEN, NOISE, FOLLOWS, FARTHER = 0.3125, 0.625, 0.75, 0.375, 2
 CONTRADICTION = (
     "`holonomic` and `nonholonomic` must not contradict each other, but no acceleration satisfies them all here, or two rows are too "
     "nearly the same to tell. Look for constraints that say nearly the same; put a state by hand on them by `consistent_state`."
