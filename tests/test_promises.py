@@ -46,7 +46,11 @@ def exact(params, rank):
 
 
 accelerations = jax.jit(jax.vmap(lambda p: jl.acceleration(linear, jnp.zeros(N), jnp.zeros(N), p, t=1.0).qddot))
-KINDS = [("near", e) for e in (0.1, 1e-2, 1e-3, 1e-4, 1e-5, 1e-6, 1e-7, 1e-8, 1e-9)] + [("same", 0.0)] + [("against", e) for e in (1.0, 1e-2, 1e-3)]
+KINDS = (
+    [("near", e) for e in (0.1, 1e-2, 1e-3, 1e-4, 1e-5, 1e-6, 1e-7, 1e-8, 1e-9)]
+    + [("same", 0.0)]
+    + [("against", e) for e in (1.0, 1e-2, 1e-3)]
+)
 
 
 @pytest.mark.parametrize("kind, e", KINDS)
