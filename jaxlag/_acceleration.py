@@ -10,11 +10,12 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import PyTree
 
 from ._arguments import check_function
+from ._causes import because
 from ._checks import at_state
 from ._compiled import is_concrete
 from ._friction import settled
 from ._mechanics import constraint_rows
-from ._multipliers import NO_INERTIA, constrained_acceleration, pseudo_inverse
+from ._multipliers import CONTRADICTION, NO_INERTIA, Sound, constrained_acceleration, pseudo_inverse
 from ._scalarised import scalarised
 from ._system import Flat, System, rows_by_name
 
@@ -38,7 +39,8 @@ def acceleration(system: System, q: PyTree, qdot: PyTree, params: PyTree = None,
 
     **Returns:** `Acceleration(qddot, multipliers)`: q̈ structured like q; λ by the constraint's name, structured like what g or a returns.
 
-    **Raises:** `ValueError` where a direction has no inertia and no constraint holds it. Under `jit` the result is NaN there.
+    **Raises:** `ValueError` where a direction has no inertia and no constraint holds it, or where constraints contradict each other.
+    Under `jit` the result is NaN there.
 
     **Source:** Hairer & Wanner, Solving Ordinary Differential Equations II, eqs. VII.1.46.
 
@@ -53,21 +55,29 @@ def acceleration(system: System, q: PyTree, qdot: PyTree, params: PyTree = None,
     jl.acceleration(pendulum, *state, {"m": 3.0, "g": 9.81, "l": 2.0}).multipliers["rod"]  # −m l φ̇² − m g cos φ = −35.43
     ```
     """
-    result, determined = at_state(_acceleration, system, q, qdot, params, t)
-    if is_concrete(determined) and not determined:
-        raise ValueError(NO_INERTIA)
+    result, sound = at_state(_acceleration, system, q, qdot, params, t)
+    _refuse(sound, system, q, qdot, params, t)
     return result
+
+
+def _refuse(sound: Sound, *given) -> None:
+    """Raises what a solve lacks; under `jit` its result is NaN."""
+    if is_concrete(sound) and not sound.determined:
+        raise ValueError(because(NO_INERTIA, *given))
+    if is_concrete(sound) and not sound.satisfied:
+        raise ValueError(CONTRADICTION)
 
 
 def _acceleration(flat, t, q, v):
     mode = settled(flat, t, q, v)
 
     def known(t, q, v):
-        qddot, multipliers, determined = constrained_acceleration(mode, t, q, v)
-        return jnp.where(determined, qddot, jnp.nan), jnp.where(determined, multipliers, jnp.nan), determined
+        qddot, multipliers, sound = constrained_acceleration(mode, t, q, v)
+        known = sound.determined & sound.satisfied
+        return jnp.where(known, qddot, jnp.nan), jnp.where(known, multipliers, jnp.nan), sound
 
-    qddot, multipliers, determined = scalarised(known)(t, q, v)
-    return Acceleration(flat.unravel(qddot), flat.unravel_multipliers(multipliers)), determined
+    qddot, multipliers, sound = scalarised(known)(t, q, v)
+    return Acceleration(flat.unravel(qddot), flat.unravel_multipliers(multipliers)), sound
 
 
 def constraint_force(
@@ -98,9 +108,8 @@ def constraint_force(
     """
     if at is not None:
         check_function(at, "`at`")
-    force, determined = at_state(_ConstraintForce(at), system, q, qdot, params, t)
-    if is_concrete(determined) and not determined:
-        raise ValueError(NO_INERTIA)
+    force, sound = at_state(_ConstraintForce(at), system, q, qdot, params, t)
+    _refuse(sound, system, q, qdot, params, t)
     return force
 
 
@@ -111,11 +120,11 @@ class _ConstraintForce:
     at: Callable | None
 
     def __call__(self, flat: Flat, t, q, v):
-        _, multipliers, determined = constrained_acceleration(settled(flat, t, q, v), t, q, v)
+        _, multipliers, sound = constrained_acceleration(settled(flat, t, q, v), t, q, v)
         _, G, _ = constraint_rows(flat, t, q, v)
         forces = {name: multipliers[rows] @ G[rows] for name, rows in rows_by_name(flat).items()}
         shown = flat.unravel if self.at is None else _force_on_point(flat, self.at, t, q)
-        return {name: shown(jnp.where(determined, Q, jnp.nan)) for name, Q in forces.items()}, determined
+        return {name: shown(jnp.where(sound.determined & sound.satisfied, Q, jnp.nan)) for name, Q in forces.items()}, sound
 
 
 def _force_on_point(flat, at, t, q):

@@ -15,9 +15,9 @@ import numpy as np
 from jax.extend import core
 
 from . import _elimination as _elimination  # its rules
-from ._folding import Algebra, Arrays, Entry, Folding, TooLong, UnknownPrimitive, filled, is_number, objects
 from ._arithmetic import ELEMENTWISE, by_jax, folded, is_extended, is_known
 from ._arithmetic import on_arrays as on_arrays
+from ._folding import Algebra, Arrays, Entry, Folding, TooLong, UnknownPrimitive, filled, is_number, objects
 from ._primitives import LONG, RULES, each, primitives, turns
 
 SIGNED = {"atan2", "bitcast_convert_type"}  # to which the sign of a zero matters: an angle of π or −π

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import PyTree
 
+from ._causes import UNDEFINED, allowed, bends, coordinate_names, is_defined, weightless
 from ._checks import at_state, coordinates
 from ._friction import settled
 from ._kinks import unread_friction
@@ -62,7 +63,8 @@ def examine(system: System, q: PyTree, qdot: PyTree, params: PyTree = None, *, t
 
     **Arguments:** as `acceleration`. Any consistent units. **Returns:** an `Examination`; print it.
 
-    **Raises:** `TypeError` or `ValueError` where an argument or a function of the system is of the wrong kind.
+    **Raises:** `TypeError` or `ValueError` where an argument or a function of the system is of the wrong kind, or gives no finite
+    numbers at this state.
 
     **Source:** Hairer & Wanner, Solving Ordinary Differential Equations II, sections IV.1 (stiffness) and VII.1.
 
@@ -73,11 +75,14 @@ def examine(system: System, q: PyTree, qdot: PyTree, params: PyTree = None, *, t
     ```
     """
     found = jax.tree.map(np.asarray, at_state(_measure, system, q, qdot, params, t))
+    if not is_defined(found):
+        raise ValueError(UNDEFINED)
     q = coordinates(q, "q")
     eps = float(jnp.finfo(found["M"].dtype).eps)
     G, M = found["G"], found["M"]
     rows = {name: found["rows"][name] for name in system.constraints}  # in the order of the rows of G
-    N, rank = _null_space(G, eps)
+    N = allowed(G, eps)
+    rank = G.shape[1] - N.shape[1]
     inertia_on_N = np.linalg.eigvalsh(N.T @ M @ N) if N.shape[1] else np.zeros(0)
     smallest = float(inertia_on_N[0]) if inertia_on_N.size else float("inf")
     redundant = _redundant_rows(G, rows, eps)
@@ -97,9 +102,16 @@ def examine(system: System, q: PyTree, qdot: PyTree, params: PyTree = None, *, t
     }
     off, size, rows_off, rows_size = found["defects"].max(axis=0)
     defect = max(off / max(size, eps), rows_off / max(rows_size, eps) if rank == G.shape[0] else 0)  # rows may contradict each other
-    no_inertia = inertia_on_N.size > 0 and smallest <= 100 * M.shape[0] * eps * np.max(np.abs(M), initial=0.0)
-    found_in_words = (*_findings(numbers, no_inertia, defect, found["M"].dtype), *_pulling(system, found["multipliers"]))
-    return Examination(**numbers, findings=(*found_in_words, *_of_friction(system, q, qdot, params, t)))
+    names = coordinate_names(q)
+    findings = [
+        *_without_inertia(names, M, G),
+        *_not_affine(names, found["bends"]),
+        *_pushes(names, M, G, rows, system),
+        *_findings(numbers, defect, found["M"].dtype),
+        *_pulling(system, found["multipliers"]),
+        *_of_friction(system, q, qdot, params, t),
+    ]
+    return Examination(**numbers, findings=tuple(findings))
 
 
 def _of_friction(system, q, qdot, params, t):
@@ -120,14 +132,44 @@ def _pulling(system, multipliers):
             )
 
 
-def _findings(numbers, no_inertia, defect, dtype):
+def _without_inertia(names, M, G):
+    free = [names[i] for i in weightless(M, G)]
+    if free:
+        yield (
+            f"a direction that no constraint holds has no inertia: {', '.join(map(repr, free))}; add the missing mass (a small one with "
+            "`solver=diffrax.Kvaerno5()`), a constraint that holds it, or leave the coordinate out"
+        )
+
+
+def _not_affine(names, bends):
+    bent = [names[i] for i in np.flatnonzero(bends)]
+    if bent:
+        listed = ", ".join(map(repr, bent))
+        yield f"a nonholonomic constraint is not affine in the velocity of {listed}: write its derivative, or a root of it"
+
+
+def _pushes(names, M, G, rows, system):
+    """Rows of velocities that tie a coordinate without inertia to others: their λ acts on these too, as a law of first order would not."""
+    size = np.max(np.abs(M), axis=1)
+    massless = size <= 100 * len(M) * np.finfo(M.dtype).eps * np.max(size, initial=0.0)
+    for name in (name for name, _ in system.nonholonomic):
+        for row in G[rows[name]]:
+            part = np.abs(row) > 1e-12 * np.max(np.abs(row), initial=0.0)
+            driven, pushed = ([names[i] for i in np.flatnonzero(part & of)] for of in (massless, ~massless))
+            if driven and pushed:
+                yield (
+                    f"constraint {name!r} ties {', '.join(map(repr, driven))}, without inertia, to {', '.join(map(repr, pushed))}, and its "
+                    "λ pushes these too: right for a rod or a gear, wrong for a law such as that of a spring and damper in series, "
+                    "which is to push by a force or an energy alone"
+                )
+
+
+def _findings(numbers, defect, dtype):
     if defect > float(jnp.finfo(dtype).eps) ** 0.5:
         yield (
             f"the accelerations miss Lagrange's equations, as JAX alone differentiates them, by {defect:.2g} of the largest term: "
             "do not trust them, and report the functions of this system as an error of jaxlag"
         )
-    if no_inertia:
-        yield "a direction that no constraint holds has no inertia: add the missing mass, or a constraint"
     if numbers["degrees_of_freedom"] == 0:
         yield "no degree of freedom is left: the constraints hold every coordinate"
     for name, count in numbers["redundant"].items():
@@ -172,6 +214,7 @@ def _measure(flat: Flat, t, q, v):
         "M": inertia(flat, t, q, v)[0].as_matrix(),
         "G": G,
         "A": jax.jacfwd(rates)(jnp.concatenate([q, v])),
+        "bends": bends(flat, t, q, v),
         "rows": {name: jnp.asarray(rows) for name, rows in split.items()},
         "position": {name: g[split[name]] for name in flat.holonomic_names},
         "velocity": {name: psi[rows] for name, rows in split.items()},
@@ -186,7 +229,7 @@ def _defects(mode, t, q, v):
 
     Of M q̈ − f − Gᵀλ and of G q̈ + γ: what is left, and beside it the largest term; zeros where inertia is missing.
     """
-    qddot, multipliers, determined = scalarised(lambda t, q, v: constrained_acceleration(mode, t, q, v))(t, q, v)
+    qddot, multipliers, sound = scalarised(lambda t, q, v: constrained_acceleration(mode, t, q, v))(t, q, v)
     one, L, psi = jnp.ones_like(t), mode.lagrangian, lambda t, q, v: velocity_residual(mode, t, q, v)
     _, rate = jax.jvp(jax.grad(L, argnums=2), (t, q, v), (one, v, qddot))
     _, gamma = jax.jvp(lambda t, q: psi(t, q, v), (t, q), (one, v))
@@ -195,17 +238,7 @@ def _defects(mode, t, q, v):
     largest = lambda *terms: jnp.max(jnp.abs(jnp.concatenate(terms)), initial=0)
     in_equations = largest(sum(terms)), largest(*terms)
     in_rows = largest(G @ qddot + gamma), largest(jnp.abs(G) @ jnp.abs(qddot), gamma)
-    return multipliers, jnp.where(determined & jnp.all(jnp.isfinite(qddot)), jnp.stack([*in_equations, *in_rows]), 0)
-
-
-def _null_space(G, eps):
-    """Columns that span the motions the constraints allow, and the rank of G, with rows scaled to unit length."""
-    size = np.linalg.norm(G, axis=1, keepdims=True)
-    if not G.shape[0]:
-        return np.eye(G.shape[1]), 0
-    _, s, Vt = np.linalg.svd(G / np.where(size > 0, size, 1))
-    rank = int(np.sum(s > eps**0.3125 * max(s[0], eps)))
-    return Vt[rank:].T, rank
+    return multipliers, jnp.where(sound.determined & jnp.all(jnp.isfinite(qddot)), jnp.stack([*in_equations, *in_rows]), 0)
 
 
 def _redundant_rows(G, rows, eps):
@@ -213,7 +246,7 @@ def _redundant_rows(G, rows, eps):
     redundant, before = {}, np.zeros((0, G.shape[1]))
     for name, indices in rows.items():
         of_name = np.concatenate([before, G[indices]])
-        dependent = len(indices) - (_null_space(of_name, eps)[1] - _null_space(before, eps)[1])
+        dependent = len(indices) - (allowed(before, eps).shape[1] - allowed(of_name, eps).shape[1])
         if dependent:
             redundant[name] = dependent
         before = of_name

@@ -14,6 +14,7 @@ from ._compiled import compiled
 from ._friction import Regularised, StickSlip
 from ._manifold import Baumgarte, NoStabilisation, Projection
 from ._motion import Equations, Scales
+from ._promises import upheld
 from ._sensitivities import differentiable, pushed
 from ._signal import solved
 from ._solve import How, begun, can_be_varied, judged, raise_failure, states_at, states_varied, tolerances_of
@@ -83,7 +84,7 @@ def simulate(
     ts, tolerances = sample_times(ts, dtype), tolerances_of(rtol, atol, dtype)
     trajectory = _simulate(system, how, q0, qdot0, ts, parameters(params, q0), tolerances)
     if throw:
-        raise_failure(trajectory)
+        raise_failure(trajectory, (q0, qdot0))
     return trajectory
 
 
@@ -99,15 +100,19 @@ def _simulate(system, how, q0, qdot0, ts, params, tolerances):
     else:
         run = functools.partial(solve, how.adjoint)
     ys, (result, stats) = run((t0, q, v, params, tolerances), ts)
-    return trajectory_of(system, equations, ts, ys, params, result, stats)
+    return trajectory_of(system, equations, ts, ys, params, result, stats, tolerances)
 
 
-def trajectory_of(system: System, equations: Equations, ts, ys, params, result, stats) -> Trajectory:
-    """What there is to say of a motion, from its states."""
-    q, qdot, qddot, multipliers, works, rubbing, counts = jax.vmap(lambda t, y: equations.sample(t, y, params))(ts, ys)
+def trajectory_of(system: System, equations: Equations, ts, ys, params, result, stats, tolerances) -> Trajectory:
+    """What there is to say of a motion, from its states, and whether that is what it promises."""
+    last_t, last_y = stats.pop("last")
+    times, states = jnp.concatenate([ts, last_t[None]]), jnp.concatenate([ys, last_y[None]])
+    samples = jax.vmap(lambda t, y: equations.sample(t, y, params, tolerances))(times, states)
+    samples, result, reached = upheld(equations, times, states, samples, params, result, tolerances)
+    q, qdot, qddot, multipliers, works, rubbing, counts, *_ = samples
     rubbing = {name: Rubbing(*of_term) for name, of_term in rubbing.items()}
     stated = Stated.of(system, params, equations.friction)
-    return Trajectory(ts, q, qdot, qddot, multipliers, result, stats | counts, works, rubbing, stated)
+    return Trajectory(ts, q, qdot, qddot, multipliers, result, stats | counts | {"reached": reached}, works, rubbing, stated)
 
 
 def _motion(equations, how, adjoint, inputs, ts):

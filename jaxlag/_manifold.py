@@ -10,10 +10,12 @@ import lineax as lx
 import numpy as np
 from jaxtyping import Array, Bool, Float, PyTree
 
+from ._causes import NOT_AFFINE, UNDEFINED, because, bends
 from ._checks import at_state, coordinates
 from ._compiled import is_concrete
+from ._jacobian import jacobian
 from ._mechanics import constraint_rows, inertia, position_residual, velocity_residual
-from ._multipliers import NO_INERTIA, is_determined, saddle_point
+from ._multipliers import NO_INERTIA, Near, augmented, is_determined, saddle_point
 from ._numbers import count, number
 from ._system import Flat, System
 
@@ -47,11 +49,21 @@ class Projection:
     def project(self, flat: Flat, t, q, v):
         """The state on the constraints that is nearest to this one, which is near already."""
         M = inertia(flat, t, q, v)[0]  # at the start serves throughout: what is put right is small
-        for _ in range(self.iterations):
-            g, G = position_residual(flat, t, q)
-            q = q + saddle_point(M, G, jnp.zeros_like(q), -g).x
+        if flat.holonomic_names:
+            metric = _metric_of_positions(flat, M, t, q, v)
+            for _ in range(self.iterations):
+                g, G = position_residual(flat, t, q)
+                q = q + saddle_point(metric, G, jnp.zeros_like(q), -g, Near(q)).x
         psi, G, _ = constraint_rows(flat, t, q, v)
-        return q, v + saddle_point(M, G, jnp.zeros_like(v), -psi).x
+        return q, v + saddle_point(M, G, jnp.zeros_like(v), -psi, Near(v)).x
+
+
+def _metric_of_positions(flat, M, t, q, v):
+    """M; and where velocities are constrained beyond it, what these forbid weighs too, for they may be all that holds a coordinate
+    without inertia.
+    """
+    psi, G = jacobian(lambda v: flat.nonholonomic(t, q, v), v)
+    return lx.MatrixLinearOperator(augmented(M.as_matrix(), G.as_matrix())[0]) if psi.size else M
 
 
 @dataclasses.dataclass(frozen=True)
@@ -105,12 +117,16 @@ NEWTON_STEPS = 16  # a fixed number is one loop to compile; near the constraints
 
 
 class Consistent(NamedTuple):
-    """A state on the constraints; `reached` is false where the iteration found none, `determined` where inertia is missing."""
+    """A state on the constraints; `reached` is false where the iteration found none, `determined` where inertia is missing, `affine`
+    where a nonholonomic constraint is not so in q̇, `defined` where M or a constraint gives no finite numbers at the state given.
+    """
 
     q: Float[Array, " n"]
     v: Float[Array, " n"]
     reached: Bool[Array, ""]
     determined: Bool[Array, ""]
+    affine: Bool[Array, ""]
+    defined: Bool[Array, ""]
 
 
 def nearest_state(flat: Flat, t, q0, v0, free: Sequence[int] | None = None) -> Consistent:
@@ -120,29 +136,46 @@ def nearest_state(flat: Flat, t, q0, v0, free: Sequence[int] | None = None) -> C
     """
     moving = np.arange(q0.size) if free is None else np.asarray(free, int)
     both = np.ix_(moving, moving)
-    M = inertia(flat, t, q0, v0)[0].as_matrix()[both]
+    full = inertia(flat, t, q0, v0)[0]
+    M = full.as_matrix()[both]
     tolerance = jnp.finfo(q0.dtype).eps ** 0.5
-    rows = velocity_residual(flat, t, q0, v0).size
-    if rows == 0:  # nothing to satisfy: spares the compilation of the search
-        return Consistent(q0, v0, jnp.array(True), is_determined(M, jnp.zeros((0, moving.size), M.dtype)))
+    given = jnp.concatenate([flat.holonomic(t, q0), velocity_residual(flat, t, q0, v0)])
+    positions = flat.holonomic(t, q0).size
+    if given.size == 0:  # nothing to satisfy: spares the compilation of the search
+        yes = jnp.array(True)
+        return Consistent(q0, v0, yes, is_determined(M, jnp.zeros((0, moving.size), M.dtype)), yes, jnp.all(jnp.isfinite(M)))
 
     def newton(carry, _):
         q, multipliers = carry
         g, G = position_residual(flat, t, q)
         bend = jax.hessian(lambda q: multipliers @ flat.holonomic(t, q))(q)[both]
         curved = jnp.where(is_determined(M - bend, G[:, moving]), M - bend, M)
-        step, multipliers, _ = saddle_point(lx.MatrixLinearOperator(curved), G[:, moving], M @ (q0 - q)[moving], -g)
+        near = Near(q[moving], _off(g, G, q) > tolerance)
+        step, multipliers, _ = saddle_point(lx.MatrixLinearOperator(curved), G[:, moving], M @ (q0 - q)[moving], -g, near)
         return (q.at[moving].add(step), multipliers), None
 
-    start = q0, jnp.zeros(flat.holonomic(t, q0).size, q0.dtype)
-    (q, _), _ = jax.lax.scan(newton, start, length=NEWTON_STEPS)
+    q = q0
+    if positions:
+        if given.size > 2 * positions:  # velocities beside may be all that holds a coordinate
+            held = is_determined(M, position_residual(flat, t, q0)[1][:, moving])
+            M = jnp.where(held, M, _metric_of_positions(flat, full, t, q0, v0).as_matrix()[both])
+        (q, _), _ = jax.lax.scan(newton, (q0, jnp.zeros(positions, q0.dtype)), length=NEWTON_STEPS)
 
     psi, G, _ = constraint_rows(flat, t, q, v0)
     M = inertia(flat, t, q, v0)[0].as_matrix()[both]
-    nearest = saddle_point(lx.MatrixLinearOperator(M), G[:, moving], jnp.zeros_like(v0[moving]), -psi)
+    near = Near(v0[moving], _off(psi, G, v0) > tolerance)
+    nearest = saddle_point(lx.MatrixLinearOperator(M), G[:, moving], jnp.zeros_like(v0[moving]), -psi, near)
     v = v0.at[moving].add(nearest.x)
     off = jnp.maximum(_off(*position_residual(flat, t, q), q), _off(velocity_residual(flat, t, q, v), G, v))
-    return Consistent(q, v, off < tolerance, nearest.determined)
+    reached = (off < tolerance) & jnp.all(jnp.isfinite(q))
+    defined = jnp.all(jnp.isfinite(given)) & jnp.all(jnp.isfinite(M))
+    return Consistent(q, v, reached, nearest.sound.determined, ~jnp.any(bends(flat, t, q0, v0)), defined)
+
+
+def off_constraints(flat: Flat, t, q, v) -> Float[Array, ""]:
+    """Largest residual of g and ψ, in the units of its row."""
+    G, beside = jax.jacfwd(flat.holonomic, argnums=1)(t, q), jax.jacfwd(flat.nonholonomic, argnums=2)(t, q, v)
+    return jnp.maximum(_off(flat.holonomic(t, q), G, q), _off(velocity_residual(flat, t, q, v), jnp.concatenate([G, beside]), v))
 
 
 def _off(residual, rows, x):
@@ -177,13 +210,12 @@ def consistent_state(
     ```
     """
     core = _StateOn(_fixed_indices(coordinates(q, "q"), tuple(fixed)))
-    (q, qdot), reached, determined = at_state(core, system, q, qdot, params, t)
-    if is_concrete(reached, determined):
-        if not determined:
-            raise ValueError(NO_INERTIA)
-        if not reached:
-            raise ValueError(IMPOSSIBLE)
-    return q, qdot
+    (new_q, new_qdot), (reached, determined, affine, defined) = at_state(core, system, q, qdot, params, t)
+    if is_concrete(reached):
+        for passed, reason in ((defined, UNDEFINED), (determined, NO_INERTIA), (affine, NOT_AFFINE), (reached, IMPOSSIBLE)):
+            if not passed:
+                raise ValueError(because(reason, system, q, qdot, params, t))
+    return new_q, new_qdot
 
 
 IMPOSSIBLE = (
@@ -200,9 +232,9 @@ class _StateOn:
 
     def __call__(self, flat: Flat, t, q, v):
         free = [i for i in range(q.size) if i not in self.held]
-        q, v, reached, determined = nearest_state(flat, t, q, v, free)
-        known = reached & determined
-        return (flat.unravel(jnp.where(known, q, jnp.nan)), flat.unravel(jnp.where(known, v, jnp.nan))), reached, determined
+        q, v, *flags = nearest_state(flat, t, q, v, free)
+        known = jnp.all(jnp.stack(flags))
+        return (flat.unravel(jnp.where(known, q, jnp.nan)), flat.unravel(jnp.where(known, v, jnp.nan))), flags
 
 
 def _fixed_indices(q: PyTree, fixed: tuple) -> tuple[int, ...]:

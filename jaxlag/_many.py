@@ -179,11 +179,14 @@ def _group(system, equations, how, own, shared, ts, tolerances):
     last = jax.tree.map(lambda leaf: jnp.moveaxis(leaf, 0, -1), own)
     ys, (result, stats, moved) = run(((ts[0], tolerances, shared), last), ts)
 
-    def one(ys, result, moved, own):
-        params = eqx.combine(own, shared)["params"]
-        return trajectory_of(system, equations, ts, ys, params, result, stats | {"start_moved": moved})
+    last_t, last_ys = stats.pop("last")
 
-    return jax.vmap(one, in_axes=(-1, 0, 0, 0))(ys, result, moved, own)
+    def one(ys, last_y, result, moved, own):
+        params = eqx.combine(own, shared)["params"]
+        of_member = stats | {"start_moved": moved, "last": (last_t, last_y)}
+        return trajectory_of(system, equations, ts, ys, params, result, of_member, tolerances)
+
+    return jax.vmap(one, in_axes=(-1, -1, 0, 0, 0))(ys, last_ys, result, moved, own)
 
 
 def _motions(equations, how, inputs, ts):

@@ -30,13 +30,14 @@ from ._friction import (
 )
 from ._kinks import Kinks, kinks_of
 from ._manifold import Baumgarte, NoStabilisation, Projection
-from ._multipliers import constrained_acceleration
+from ._multipliers import Sound, constrained_acceleration
 from ._power import energy_turnover, listed_powers
 from ._scalarised import scalarised
 from ._signal import least_spacing
 from ._system import Flat, System, bind
 
 PROJECTION = "projection"  # how the work that projection does is named
+SLIGHT = 1e7  # times the tolerance, beside which a slip of a thousand tolerances is little
 
 
 class Parts(NamedTuple):
@@ -59,6 +60,13 @@ class Start(NamedTuple):
     has_bounds: Bool[Array, ""]
 
 
+class Beyond(NamedTuple):
+    """By how much a sample is beyond the end of its mode of friction, and beside that what is little; twice per element."""
+
+    excess: Float[Array, " 2e"]
+    scale: Float[Array, " 2e"]
+
+
 class Sample(NamedTuple):
     """One sample of a motion: what a `Trajectory` holds of it."""
 
@@ -69,6 +77,8 @@ class Sample(NamedTuple):
     works: dict[str, Array] | None
     friction: dict[str, tuple[Array, Array]]
     counts: dict[str, Array]
+    sound: Sound
+    beyond: Beyond
 
 
 @dataclasses.dataclass(frozen=True)
@@ -167,21 +177,26 @@ class Equations:
         """Whether there were more transitions than allowed."""
         return self.parts(y).transitions[0] > self.friction.max_transitions
 
-    def sample(self, t, y, params) -> Sample:
+    def sample(self, t, y, params, tolerances) -> Sample:
         """One sample, from y on the constraints."""
+        rtol, atol = tolerances
         q, v, works, sigma, held, transitions, time_stuck = self.parts(y)
         flat, _, kinks = self.mode(t, q, v, sigma, params)
-        rubbing, counts = {}, {}
+        rubbing, counts, beyond = {}, {}, Beyond(jnp.zeros(0), jnp.zeros(0))
         if kinks is None:
-            qddot, multipliers, _ = _accelerated(self, t, y, params)
+            qddot, multipliers, sound = _accelerated(self, t, y, params)
         else:
             found = friction(flat, kinks, sigma, t, q, v, self.stabilisation.feedback())
-            qddot, multipliers = found.qddot, found.multipliers
+            qddot, multipliers, sound = found.qddot, found.multipliers, Sound(jnp.array(True), jnp.array(True))
             rubbing = friction_by_term(kinks, sigma, held > 0, t, q, v, found)
+            stuck, load = sticking(kinks, sigma), norms(kinks, found.force)
+            scale = jnp.where(stuck, jnp.abs(found.bound) + load, slip_of(kinks, t, q, v, SLIGHT * (rtol * jnp.abs(v) + atol)))
+            excess = jnp.where(held > 0, 0, -found.margin)
+            beyond = Beyond(jnp.concatenate([excess, -found.bound]), jnp.concatenate([scale, jnp.abs(found.bound)]))
             counts = {"transitions": transitions[0], "time_stuck": time_stuck}
         named = dict(zip(self.works, works, strict=True)) if self.audit else None
         unraveled = flat.unravel(q), flat.unravel(v), flat.unravel(qddot), flat.unravel_multipliers(multipliers)
-        return Sample(*unraveled, named, rubbing, counts)
+        return Sample(*unraveled, named, rubbing, counts, sound, jax.lax.stop_gradient(beyond))
 
 
 @jitted  # so that diffrax's many calls trace it once

@@ -13,8 +13,8 @@ import numpy as np
 from jax import lax
 from jax.extend import core
 
-from ._folding import Arrays, Entry, objects
 from ._arithmetic import folded
+from ._folding import Arrays, Entry, objects
 
 RULES: dict[str, Callable] = {}
 

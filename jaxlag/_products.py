@@ -14,10 +14,10 @@ import numpy as np
 from jax.extend.core import Literal
 from jaxtyping import Array, Float
 
+from ._arithmetic import is_extended, is_known, on_arrays
 from ._entries import Reader, settled
 from ._folding import Algebra, UnknownPrimitive
 from ._kernel import length
-from ._arithmetic import is_extended, is_known, on_arrays
 from ._primitives import CALLS, body
 
 SHORT = 200  # equations; what is longer is scalar code, whose entries cost less one by one

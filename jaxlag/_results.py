@@ -7,6 +7,7 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
+from ._causes import NOT_AFFINE, UNDEFINED
 from ._manifold import IMPOSSIBLE
 from ._multipliers import NO_INERTIA
 
@@ -18,7 +19,21 @@ class RESULTS(dfx.RESULTS):  # pyright: ignore
     unordered = "`ts` must increase, but a time is smaller than the one before it. Sort the times, and what was measured along with them."
     no_inertia = NO_INERTIA
     impossible_start = IMPOSSIBLE
+    not_affine = NOT_AFFINE
+    undefined = UNDEFINED
+    contradictory = (
+        "the constraints are not satisfied there: they contradict each other, nearly repeat each other, or ask for more than the mechanism "
+        "can reach. Look at them with `examine`, and at what drives them."
+    )
+    beyond_reach = (
+        "the constraints leave the motion no way on: they drive a mechanism beyond its reach, or into a position that locks it. "
+        "Let them ask for less, or leave out the one that does."
+    )
     negative_bound = "`dissipation` must have bounds of friction that are not negative, but one is. Take `jnp.abs` of a normal force."
+    missed = (
+        "friction is beyond its bound there, or slips against its force: an end of sticking or slipping was missed. Take a smaller `rtol`, "
+        "and give loads that come and go as `Signal`s."
+    )
     no_friction = (
         "no sliding and no sticking agrees with the friction forces it brings about, or more than one does (Painlevé's paradox). "
         "Lower the coefficient of friction, or give the contact its compliance."
@@ -29,7 +44,15 @@ class RESULTS(dfx.RESULTS):  # pyright: ignore
     )
 
 
-OF_THE_INPUT = (RESULTS.not_finite, RESULTS.unordered, RESULTS.no_inertia, RESULTS.impossible_start, RESULTS.negative_bound)
+OF_THE_INPUT = (
+    RESULTS.not_finite,
+    RESULTS.unordered,
+    RESULTS.no_inertia,
+    RESULTS.impossible_start,
+    RESULTS.not_affine,
+    RESULTS.negative_bound,
+)
+OF_THE_STEPS = (RESULTS.max_steps_reached, RESULTS.dt_min_reached)  # which other numerics may mend
 
 
 def reason_of(result: Any) -> str:

@@ -12,9 +12,9 @@ import numpy as np
 from jax import lax
 from jax.extend import core
 
+from ._arithmetic import on_arrays
 from ._entries import Reader, evaluate, opened, shaped
 from ._folding import Algebra, Arrays, TooLong, UnknownPrimitive, filled, is_number, objects
-from ._arithmetic import on_arrays
 
 
 class _Jax(Algebra):

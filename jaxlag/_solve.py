@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool
 
+from ._causes import because
 from ._compiled import is_concrete
 from ._friction import Regularised, StickSlip
 from ._kernel import in_one_kernel
@@ -19,10 +20,10 @@ from ._manifold import Baumgarte, NoStabilisation, Projection, nearest_state
 from ._motion import Equations
 from ._numbers import count, number
 from ._progress import Bar
-from ._results import OF_THE_INPUT, RESULTS, reason_of
+from ._results import OF_THE_INPUT, OF_THE_STEPS, RESULTS, reason_of
 from ._runge_kutta import Dop853, is_explicit
 from ._signal import jump_times, moves_smoothly
-from ._steps import AtSamples, Kept, Resuming, StickSlipSolver, behind_a_jump
+from ._steps import AtSamples, Kept, Resuming, StickSlipSolver, Wary, behind_a_jump
 from ._trajectory import Trajectory
 from ._variations import Varied, along, beside
 
@@ -94,7 +95,9 @@ def begun(equations: Equations, t0, q, v, params) -> Begun:
         (start.has_mode, RESULTS.no_friction),
         (start.has_bounds, RESULTS.negative_bound),
         (nearest.reached, RESULTS.impossible_start),
+        (nearest.affine, RESULTS.not_affine),
         (nearest.determined, RESULTS.no_inertia),
+        (nearest.defined, RESULTS.undefined),
     )
     return Begun(start.y, moved, obstacles)
 
@@ -111,10 +114,10 @@ def judged(ys, result, obstacles, inputs) -> tuple[Array, RESULTS]:
 
 
 def states_at(equations: Any, how: How, adjoint: dfx.AbstractAdjoint, t0, y0, ts, args, tolerances) -> tuple[Array, RESULTS, dict]:
-    """States at the samples, by diffrax, and the reason it stopped."""
+    """States at the samples, by diffrax, the reason it stopped, and, among the counts, the `last` time and state that it came to."""
     rtol, atol = tolerances
     rounding = jnp.finfo(y0.dtype).eps * jnp.maximum(jnp.abs(ts[0]), jnp.abs(ts[-1]))
-    controller = dfx.PIDController(rtol, atol, dtmin=4 * rounding, force_dtmin=False, norm=equations.error_norm)
+    controller = Wary(rtol, atol, dtmin=4 * rounding, force_dtmin=False, norm=equations.error_norm)
     end, jumps, behind = ts[-1], jump_times(args[0], ts.dtype), None
     if jumps is not None:
         controller = dfx.ClipStepSizeController(Resuming(rtol, atol, smallest=4 * rounding, norm=equations.error_norm), jump_ts=jumps)
@@ -142,15 +145,21 @@ def states_at(equations: Any, how: How, adjoint: dfx.AbstractAdjoint, t0, y0, ts
         throw=False,
         progress_meter=Meter() if how.progress else dfx.NoProgressMeter(),
     )
-    ys = solution.ys if kept is None else jax.vmap(lambda t, y: kept(t, y, args))(ts, solution.ys)
+    (_, last_t), (ys, last_y) = solution.ts, solution.ys
+    ys = ys if kept is None else jax.vmap(lambda t, y: kept(t, y, args))(ts, ys)
     stats = {key: solution.stats[key] for key in ("num_steps", "num_accepted_steps", "num_rejected_steps")}
     result = RESULTS.promote(solution.result)
-    for said, reason in (
-        (RESULTS.internal_error, RESULTS.no_friction),
-        (RESULTS.stagnation, RESULTS.negative_bound),
-    ):  # as StickSlipSolver says it
-        result = RESULTS.where(result == said, reason, result)
-    return ys, RESULTS.where(result == RESULTS.max_steps_rejected, RESULTS.chattering, result), stats
+    for said, meant in SAID_BY_STEPS:
+        result = RESULTS.where(result == said, meant, result)
+    return ys, result, stats | {"last": jax.lax.stop_gradient((last_t[0], last_y[0]))}
+
+
+SAID_BY_STEPS = (  # what of diffrax's reasons stands for one of ours
+    (RESULTS.internal_error, RESULTS.no_friction),
+    (RESULTS.max_steps_rejected, RESULTS.chattering),
+    (RESULTS.stagnation, RESULTS.negative_bound),
+    (RESULTS.nonlinear_divergence, RESULTS.undefined),
+)
 
 
 def states_varied(equations: Any, how: How, started, moving, directions, t0, dt0, ts, args, tolerances):
@@ -162,7 +171,8 @@ def states_varied(equations: Any, how: How, started, moving, directions, t0, dt0
     if dt0 is not None:  # a start that is later lies further back at t0
         dy0 = dy0 - jnp.multiply.outer(equations.rates(t0, y0, (args[0], None)), dt0)
     ys, result, stats = states_at(Varied(equations), how, dfx.ForwardMode(), t0, beside(y0, dy0), ts, args, tolerances)
-    return ys[..., 0], ys[..., 1:], result, stats, aux
+    last_t, last_y = stats["last"]
+    return ys[..., 0], ys[..., 1:], result, stats | {"last": (last_t, last_y[..., 0])}, aux
 
 
 def can_be_varied(equations: Any, how: How, moving_params, params) -> bool:
@@ -186,19 +196,26 @@ class Meter(dfx.TextProgressMeter):
         bar.end()
 
 
-def raise_failure(trajectory: Trajectory) -> None:
-    """Raises the reason of a failed motion, outside what is compiled; under `jit` the reason stays in the result."""
+def raise_failure(trajectory: Trajectory, start: tuple | None = None) -> None:
+    """Raises the reason of a failed motion, outside what is compiled; under `jit` the reason stays in the result.
+
+    Of a `start` (q0, qdot0), it names the coordinates that the reason is about.
+    """
     if not is_concrete(trajectory.result) or np.all(trajectory.succeeded):
         return
     reason = reason_of(trajectory.result)
     if reason in map(reason_of, OF_THE_INPUT):
-        raise ValueError(reason)
+        stated = trajectory.stated
+        raise ValueError(reason if start is None else because(reason, stated.system, *start, stated.params, trajectory.ts[0]))
     samples, coordinate = trajectory.ts.shape[-1], np.asarray(jax.tree.leaves(trajectory.q)[0])
     reached = np.isfinite(coordinate.reshape(-1, samples, coordinate.size // trajectory.ts.size)[..., 0]).sum(1).min()
-    raise RuntimeError(
-        f"the motion must reach t = {np.ravel(trajectory.ts)[-1]:g}, but stopped after {reached} of {samples} samples: {reason} "
+    numerics = (
         "Allow more `max_steps`, look at what was computed with `throw=False`, or take a solver for stiff systems, "
         f"`solver=diffrax.Kvaerno5()`.{_of_friction(trajectory)}"
+    )
+    raise RuntimeError(
+        f"the motion must reach t = {np.ravel(trajectory.ts)[-1]:g}, but stopped at t = {np.min(trajectory.stats['reached']):g} "
+        f"after {reached} of {samples} samples: {reason} {numerics if reason in map(reason_of, OF_THE_STEPS) else ''}".rstrip()
     )
 
 

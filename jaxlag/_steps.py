@@ -28,7 +28,7 @@ NEGATIVE = dfx.RESULTS.stagnation  # how a step says so
 
 
 class AtSamples(dfx.AbstractAdjoint):
-    """Another adjoint, with samples at `ts` in place of what `SaveAt` asks for.
+    """Another adjoint, with samples at `ts` before what `SaveAt` asks for.
 
     `SaveAt(ts=ts)` has diffrax check `ts` while it runs, and a program with such a check is never taken from JAX's persistent cache.
     """
@@ -38,9 +38,10 @@ class AtSamples(dfx.AbstractAdjoint):
 
     def loop(self, *, saveat, init_state, **how):
         times, states = jnp.full(self.ts.shape, jnp.inf), jnp.full((self.ts.size, *init_state.y.shape), jnp.inf, init_state.y.dtype)
-        saved = lambda state: (state.save_state.ts, state.save_state.ys)
-        state = eqx.tree_at(saved, init_state, (times.astype(self.ts.dtype), states))
-        return self.adjoint.loop(saveat=dfx.SaveAt(ts=self.ts), init_state=state, **how)
+        last = init_state.save_state
+        samples = eqx.tree_at(lambda saved: (saved.ts, saved.ys), last, (times.astype(self.ts.dtype), states))
+        state = eqx.tree_at(lambda state: state.save_state, init_state, [samples, last])
+        return self.adjoint.loop(saveat=dfx.SaveAt(subs=[dfx.SubSaveAt(ts=self.ts), saveat.subs]), init_state=state, **how)
 
 
 class Kept(dfx.AbstractWrappedSolver, dfx.AbstractAdaptiveSolver):
@@ -285,7 +286,21 @@ def behind_a_jump(equations: Equations, t, y, args):
     return equations.kept(t, y, args), mode.consistent
 
 
-class Resuming(dfx.PIDController):
+class Wary(dfx.PIDController):
+    """Steps that shrink where they come to numbers that are not finite, and end there by `nonlinear_divergence`."""
+
+    def init(self, terms, t0, t1, *rest):
+        tnext, state = super().init(terms, t0, t1, *rest)
+        return jnp.where(jnp.isfinite(tnext), tnext, t1), state
+
+    def adapt_step_size(self, t0, t1, y0, y1, args, error, *rest):
+        finite = jnp.all(jnp.isfinite(y1)) & jnp.all(jnp.isfinite(error))
+        *step, result = super().adapt_step_size(t0, t1, y0, jnp.where(finite, y1, y0), args, jnp.where(finite, error, jnp.inf), *rest)
+        lost = (result == dfx.RESULTS.dt_min_reached) & ~finite
+        return *step, dfx.RESULTS.where(lost, dfx.RESULTS.nonlinear_divergence, result)
+
+
+class Resuming(Wary):
     """Steps that resume their length after one that was cut short at a jump of an input, however short that was.
 
     A step that is kept makes the next one no shorter than was planned, and one that is rejected must stay above `smallest`. (Without

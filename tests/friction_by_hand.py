@@ -69,7 +69,9 @@ class Blocks:
         """The times at which a bound vanishes or comes back."""
         p, turns = self.p, np.arange(end)
         first = np.arccos(-1 / np.maximum(p["wave"], 1))
-        return np.unique([(2 * np.pi * k + sign * a) / r for k in turns for a, r in zip(first, p["F_rate"], strict=True) for sign in (1, -1)])
+        return np.unique(
+            [(2 * np.pi * k + sign * a) / r for k in turns for a, r in zip(first, p["F_rate"], strict=True) for sign in (1, -1)]
+        )
 
     def step(self, t, h, y, sigma):
         rate = lambda t, y: np.concatenate([y[self.n :], self.accelerated(t, y, sigma)[0]])
@@ -108,7 +110,7 @@ class Blocks:
                     t, y = t + h, after
                     continue
                 part, which = beyond
-                value = lambda x, j, h=h, t=t, y=y: self.margins(t + x * h, self.step(t, x * h, y, sigma), sigma)[j] + 1e-13
+                value = lambda x, j, h=h, t=t, y=y, sigma=sigma: self.margins(t + x * h, self.step(t, x * h, y, sigma), sigma)[j] + 1e-13
                 first = min(0.0 if value(0.0, j) <= 0 else brentq(value, 0.0, part, args=(j,), xtol=1e-15) for j in which)
                 y, t = self.step(t, first * h, y, sigma), t + first * h
                 ended = np.abs(self.margins(t, y, sigma)) < 1e-9

@@ -17,9 +17,9 @@ import numpy as np
 from operations import OPERATIONS, SHAPES
 
 from jaxlag import _scalarised
+from jaxlag._arithmetic import KNOWN, folded
 from jaxlag._entries import Reader, opened
 from jaxlag._folding import TooLong, UnknownPrimitive, filled
-from jaxlag._arithmetic import KNOWN, folded
 from jaxlag._primitives import CALLS, RULED, body, primitives
 
 SIZE = 3  # of x and of v

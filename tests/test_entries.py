@@ -12,10 +12,10 @@ from jax import lax
 
 import jaxlag as jl
 from jaxlag import _arithmetic
+from jaxlag._arithmetic import folded
 from jaxlag._entries import evaluate
 from jaxlag._folding import Algebra, TooLong, UnknownPrimitive, filled
 from jaxlag._multipliers import constrained_acceleration
-from jaxlag._arithmetic import folded
 from jaxlag._scalarised import JAX_ALGEBRA, _apart, scalarised
 from jaxlag._system import bind
 from jaxlag.examples import pendulum, vehicle

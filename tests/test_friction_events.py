@@ -72,7 +72,7 @@ def compared(seed):
     return np.max(np.abs(found.q - expected)), int(found.stats["transitions"][-1]), transitions
 
 
-T = lambda qdot: 0.5 * jnp.sum(qdot**2)  # noqa: E731
+T = lambda qdot: 0.5 * jnp.sum(qdot**2)
 
 
 def block(load):

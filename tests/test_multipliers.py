@@ -31,7 +31,7 @@ def test_solution_and_least_norm_multipliers(n, m, rank):
         multipliers = np.linalg.lstsq(G.T, M @ x - f, rcond=1e-10)[0]
         np.testing.assert_allclose(found.x, x, rtol=1e-9, atol=1e-9)
         np.testing.assert_allclose(found.multipliers, multipliers, rtol=1e-8, atol=1e-8)
-        assert found.determined
+        assert found.sound.determined
 
 
 def test_pseudo_inverse_of_rows_in_different_units():
@@ -262,3 +262,39 @@ def test_a_reaction_and_the_friction_it_brings_about_push_each_other():
         0.4
     )
     np.testing.assert_allclose(slope, -10 / 2.4**2, rtol=1e-10)
+
+
+falling = jl.System(
+    lambda q, qdot, s: 0.5 * qdot @ qdot + s * qdot[0] * qdot[1] - 9.81 * q[1], holonomic=lambda q, e: jnp.stack([q[0], q[0] + e * q[1]])
+)
+
+
+@pytest.mark.parametrize("e", [1e-3, 1e-4, 1e-5, 1e-6, 1e-7, 1e-8, 1e-9])
+@pytest.mark.parametrize("s", [0.0, 0.3])
+def test_rows_that_are_nearly_the_same_hold_all_the_same(e, s):
+    """q₀ = 0 and q₀ + e q₁ = 0 hold both coordinates: λ₁ = g / e = −λ₀, whatever the inertia."""
+    found = jl.acceleration(falling, jnp.zeros(2), jnp.zeros(2), {"e": e, "s": s})
+    np.testing.assert_allclose(found.qddot, 0, rtol=0, atol=2e-14 / e + 1e-9)  # rounding of forces of the size of λ
+    np.testing.assert_allclose(found.multipliers["holonomic"], np.array([-9.81, 9.81]) / e, rtol=1e-6)
+
+
+def test_rows_that_are_the_same_to_rounding_count_once():
+    found = jl.acceleration(falling, jnp.zeros(2), jnp.zeros(2), {"e": 1e-14, "s": 0.0})
+    np.testing.assert_allclose(found.qddot, [0, -9.81], rtol=0, atol=1e-12)
+
+
+CONTRADICTORY = {
+    "apart": lambda t, q: jnp.stack([q[0], q[0] - t**2]),
+    "nearly the same": lambda t, q: jnp.stack([q[0] - t**2, q[0] - t**2 + 1e-6 * q[1] - t**3 - t**2]),
+    "of nothing": lambda t, q: jnp.stack([q[0], t**2]),
+}
+
+
+@pytest.mark.parametrize("case", CONTRADICTORY)
+@pytest.mark.parametrize("function", [jl.acceleration, jl.constraint_force])
+def test_constraints_that_contradict_each_other_have_no_acceleration(case, function):
+    system = jl.System(lambda qdot: 0.5 * qdot @ qdot, holonomic=CONTRADICTORY[case])
+    with pytest.raises(ValueError, match="`holonomic` and `nonholonomic` must not contradict each other"):
+        function(system, jnp.zeros(2), jnp.zeros(2))
+    inside = jax.jit(lambda q: function(system, q, jnp.zeros(2)))(jnp.zeros(2))
+    assert all(np.all(np.isnan(leaf)) for leaf in jax.tree.leaves(inside))
