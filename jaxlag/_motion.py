@@ -63,8 +63,8 @@ class Start(NamedTuple):
 class Beyond(NamedTuple):
     """By how much a sample is beyond the end of its mode of friction, and beside that what is little; twice per element."""
 
-    excess: Float[Array, " 2e"]
-    scale: Float[Array, " 2e"]
+    excess: Float[Array, " m"]
+    scale: Float[Array, " m"]
 
 
 class Sample(NamedTuple):

@@ -39,9 +39,9 @@ class Seen(NamedTuple):
 class Looks(NamedTuple):
     """Margins and bounds at some times: values and slopes, and by how much the time alone may have changed them in between."""
 
-    value: Float[Array, "k 2e"]
-    slope: Float[Array, "k 2e"]
-    change: Float[Array, "k-1 2e"]
+    value: Float[Array, "k m"]
+    slope: Float[Array, "k m"]
+    change: Float[Array, "k-1 m"]
 
 
 class _Search(NamedTuple):
@@ -52,10 +52,10 @@ class _Search(NamedTuple):
     found: Any
     rounds: Any
     sections: Any
-    before: Float[Array, " 2e"]
-    behind: Float[Array, " 2e"]
-    slope: Float[Array, " 2e"]
-    largest: Float[Array, " 2e"]
+    before: Float[Array, " m"]
+    behind: Float[Array, " m"]
+    slope: Float[Array, " m"]
+    largest: Float[Array, " m"]
 
 
 def first_end(margins: Callable, path: Callable, t0, t1, elements: int, scales: Any, exactly: Any = True) -> Seen:
@@ -75,7 +75,7 @@ def first_end(margins: Callable, path: Callable, t0, t1, elements: int, scales: 
         part = jnp.diff(ts)[:, None]
         value, slope, change = look(ts)
         largest = jnp.maximum(largest, jnp.max(jnp.abs(value), axis=0))
-        value = value.at[:, elements:].add(1e-9 * largest[elements:])  # a bound of zero is none that is negative
+        value = value.at[:, elements:].add(1e-9 * largest[None, elements:])  # a bound of zero is none that is negative
         beyond = jnp.any(value[1:] < 0, axis=1)
         doubtful = jnp.any(_dips(value, slope, part) & (part > near) | (value[:-1] + value[1:] < change) & (part > brief), axis=1)
         wanted = beyond | (doubtful & ~found)
@@ -143,7 +143,7 @@ def _looking(margins, path, t0, t1, parted: OfTime | None) -> Callable[..., Look
     return looks
 
 
-def _reach(parted: OfTime, t, y) -> Float[Array, "2e p"]:
+def _reach(parted: OfTime, t, y) -> Float[Array, "m p"]:
     """|∂f/∂φ|."""
     found = parted.phi(t)
     phi, unravel = ravel_pytree(eqx.filter(found, eqx.is_inexact_array))
@@ -156,5 +156,5 @@ def _change(parted: OfTime, reach, start, end):
     widths = [high - low for low, high in intervals if jnp.issubdtype(low.dtype, jnp.inexact)]
     switches = [jnp.any(low != high) for low, high in intervals if not jnp.issubdtype(low.dtype, jnp.inexact)]
     width = jnp.concatenate([jnp.ravel(width) for width in widths]) if widths else jnp.zeros(0, reach.dtype)
-    change = jnp.sum(jnp.where(reach == 0, 0, reach * width), axis=1)
+    change = jnp.sum(jnp.where(reach == 0, 0, reach * width[None]), axis=1)
     return jnp.where(jnp.any(jnp.stack(switches)), jnp.inf, change) if switches else change
