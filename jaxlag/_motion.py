@@ -63,8 +63,8 @@ class Start(NamedTuple):
 class Beyond(NamedTuple):
     """By how much a sample is beyond the end of its mode of friction, and beside that what is little; twice per element."""
 
-    excess: Float[Array, " 2e"]
-    scale: Float[Array, " 2e"]
+    excess: Float[Array, " m"]
+    scale: Float[Array, " m"]
 
 
 class Sample(NamedTuple):
@@ -281,7 +281,8 @@ class Scales(NamedTuple):
     def of(cls, tolerances, ts, params) -> "Scales":
         """Of a motion at the times `ts`."""
         end = jnp.maximum(jnp.abs(ts[0]), jnp.abs(ts[-1]))
-        found = cls(*tolerances, ts[-1] - ts[0], least_spacing(params, ts.dtype), jnp.finfo(ts.dtype).eps * end)
+        rtol, atol = tolerances
+        found = cls(rtol, atol, ts[-1] - ts[0], least_spacing(params, ts.dtype), jnp.finfo(ts.dtype).eps * end)
         return jax.lax.stop_gradient(found)
 
     def error(self, v) -> Array:

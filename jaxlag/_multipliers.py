@@ -66,7 +66,8 @@ def saddle_point(M: lx.AbstractLinearOperator, G: Float[Array, "m n"], f, c, nea
 @jax.custom_jvp
 def _saddle_point(M, G, f, c, near) -> SaddlePoint:
     solve, _, determined, satisfied = _solver(M, G, f, c, near)
-    return SaddlePoint(*solve(f, c), Sound(determined, satisfied))
+    x, multipliers = solve(f, c)
+    return SaddlePoint(x, multipliers, Sound(determined, satisfied))
 
 
 @_saddle_point.defjvp

@@ -43,7 +43,7 @@ def _promises(equations: Equations, ts, ys, samples: Sample, params, tolerances)
     promises = [(finite, RESULTS.undefined)]
     if equations.rows:
         excess, scale = samples.beyond
-        within = excess <= LITTLE * scale + LITTLE**1.5 * jnp.max(jnp.where(jnp.isfinite(scale), scale, 0), axis=0)
+        within = excess <= LITTLE * scale + LITTLE**1.5 * jnp.max(jnp.where(jnp.isfinite(scale), scale, 0), axis=0, keepdims=True)
         promises.append((jnp.all(within, axis=1), RESULTS.missed))
     if equations.projection is not None:
         off = jax.vmap(lambda t, y: _off(equations, t, y, params))(*jax.lax.stop_gradient((ts, ys)))

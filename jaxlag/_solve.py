@@ -205,8 +205,10 @@ def raise_failure(trajectory: Trajectory, start: tuple | None = None) -> None:
         return
     reason = reason_of(trajectory.result)
     if reason in map(reason_of, OF_THE_INPUT):
-        stated = trajectory.stated
-        raise ValueError(reason if start is None else because(reason, stated.system, *start, stated.params, trajectory.ts[0]))
+        if start is None:
+            raise ValueError(reason)
+        q0, qdot0 = start
+        raise ValueError(because(reason, trajectory.stated.system, q0, qdot0, trajectory.stated.params, trajectory.ts[0]))
     samples, coordinate = trajectory.ts.shape[-1], np.asarray(jax.tree.leaves(trajectory.q)[0])
     reached = np.isfinite(coordinate.reshape(-1, samples, coordinate.size // trajectory.ts.size)[..., 0]).sum(1).min()
     numerics = (

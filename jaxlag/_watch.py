@@ -18,7 +18,8 @@ from jaxtyping import Array, Float
 from ._enclosure import OfTime, of_time
 
 LOOKS = 8  # parts of an interval, at whose ends it is looked at
-SECTIONS = 14  # of the one with the end in it, each into as many parts: 8¹⁴ = 4 · 10¹²
+NEARER = (1e-2, 1e-4, 1e-7)  # of an interval with an end in it, how close around the root of its chord it is looked at next
+SECTIONS = 60  # of an interval with an end in it; some four do where the margin is smooth, and each halves it where it jumps
 ROUNDS = 256  # of looks, after which the step is too long to be watched
 BRIEF = 1e-7  # of the motion, how long anything lasts that is looked for,
 UNBOUNDED = 2e-4  # where part of the time dependence has no bounds
@@ -38,9 +39,9 @@ class Seen(NamedTuple):
 class Looks(NamedTuple):
     """Margins and bounds at some times: values and slopes, and by how much the time alone may have changed them in between."""
 
-    value: Float[Array, "k 2e"]
-    slope: Float[Array, "k 2e"]
-    change: Float[Array, "k-1 2e"]
+    value: Float[Array, "k m"]
+    slope: Float[Array, "k m"]
+    change: Float[Array, "k-1 m"]
 
 
 class _Search(NamedTuple):
@@ -51,10 +52,10 @@ class _Search(NamedTuple):
     found: Any
     rounds: Any
     sections: Any
-    before: Float[Array, " 2e"]
-    behind: Float[Array, " 2e"]
-    slope: Float[Array, " 2e"]
-    largest: Float[Array, " 2e"]
+    before: Float[Array, " m"]
+    behind: Float[Array, " m"]
+    slope: Float[Array, " m"]
+    largest: Float[Array, " m"]
 
 
 def first_end(margins: Callable, path: Callable, t0, t1, elements: int, scales: Any, exactly: Any = True) -> Seen:
@@ -70,10 +71,11 @@ def first_end(margins: Callable, path: Callable, t0, t1, elements: int, scales: 
 
     def closer(search):
         low, high, found, rounds, sections, *_, largest = search
-        part = (high - low) / LOOKS
-        value, slope, change = look(low + part * np.arange(LOOKS + 1))
+        ts = jnp.where(found, _around(low, high, *search[5:7]), low + (high - low) / LOOKS * np.arange(LOOKS + 1)).at[-1].set(high)
+        part = jnp.diff(ts)[:, None]
+        value, slope, change = look(ts)
         largest = jnp.maximum(largest, jnp.max(jnp.abs(value), axis=0))
-        value = value.at[:, elements:].add(1e-9 * largest[elements:])  # a bound of zero is none that is negative
+        value = value.at[:, elements:].add(1e-9 * largest[None, elements:])  # a bound of zero is none that is negative
         beyond = jnp.any(value[1:] < 0, axis=1)
         doubtful = jnp.any(_dips(value, slope, part) & (part > near) | (value[:-1] + value[1:] < change) & (part > brief), axis=1)
         wanted = beyond | (doubtful & ~found)
@@ -82,8 +84,8 @@ def first_end(margins: Callable, path: Callable, t0, t1, elements: int, scales: 
         hit = ~onward & beyond[i]
         new = lambda now, before: jnp.where(hit, now, before)
         return _Search(
-            jnp.where(onward, high, low + i * part),
-            jnp.where(onward, t1, jnp.where(i == LOOKS - 1, high, low + (i + 1) * part)),
+            jnp.where(onward, high, ts[i]),
+            jnp.where(onward, t1, ts[i + 1]),
             found | hit,
             rounds + 1,
             sections + (found | hit),
@@ -91,7 +93,11 @@ def first_end(margins: Callable, path: Callable, t0, t1, elements: int, scales: 
             largest,
         )
 
-    going_on = lambda search: jnp.where(search.found, exactly & (search.sections < SECTIONS), (search.low < t1) & (search.rounds < ROUNDS))
+    def going_on(search):
+        wide = search.high - search.low > jnp.maximum(4 * scales.rounding, 1e-13 * (t1 - t0))
+        narrowing = exactly & wide & (search.sections < SECTIONS)
+        return jnp.where(search.found, narrowing, (search.low < t1) & (search.rounds < ROUNDS))
+
     nothing, time = jnp.zeros(2 * elements, path(t0).dtype), jnp.asarray(t0, path(t0).dtype)
     start = _Search(time, jnp.asarray(t1, time.dtype), jnp.array(False), 0, 0, *[nothing] * 4)
     done = jax.lax.while_loop(going_on, closer, start)
@@ -99,6 +105,14 @@ def first_end(margins: Callable, path: Callable, t0, t1, elements: int, scales: 
     slope = jnp.where((done.behind < 0) & (done.before - done.behind > steep), -jnp.inf, done.slope)
     is_margin = jnp.any(done.behind[:elements] < 0)
     return Seen(done.found & is_margin, done.found & ~is_margin, ~done.found & (done.low < t1), done.high, slope[:elements])
+
+
+def _around(low, high, before, behind):
+    """Times close to where the first of some chords is zero, and halfway, for a margin that jumps."""
+    share = jnp.where(behind < 0, before / jnp.where(behind < 0, before - behind, 1), 1)
+    root = low + (high - low) * jnp.clip(jnp.min(share), 0, 1)
+    near = (high - low) * np.array([*NEARER, *(-d for d in NEARER)])
+    return jnp.sort(jnp.clip(jnp.stack([low, high, (low + high) / 2, *(root + near)]), low, high))
 
 
 def _dips(value, slope, part):
@@ -117,12 +131,19 @@ def _looking(margins, path, t0, t1, parted: OfTime | None) -> Callable[..., Look
         return jax.jvp(margins, (t, y), (jnp.ones_like(t), dy))
 
     if parted is None:
-        return lambda ts: Looks(*jax.vmap(along)(ts), jnp.zeros(()))
-    reach = jnp.max(jax.vmap(lambda t: _reach(parted, t, path(t)))(jnp.linspace(t0, t1, 3)), axis=0)
-    return lambda ts: Looks(*jax.vmap(along)(ts), jax.vmap(lambda start, end: _change(parted, reach, start, end))(ts[:-1], ts[1:]))
+        changed = lambda ts: jnp.zeros(())
+    else:
+        reach = jnp.max(jax.vmap(lambda t: _reach(parted, t, path(t)))(jnp.linspace(t0, t1, 3)), axis=0)
+        changed = lambda ts: jax.vmap(lambda start, end: _change(parted, reach, start, end))(ts[:-1], ts[1:])
+
+    def looks(ts):
+        value, slope = jax.vmap(along)(ts)
+        return Looks(value, slope, changed(ts))
+
+    return looks
 
 
-def _reach(parted: OfTime, t, y) -> Float[Array, "2e p"]:
+def _reach(parted: OfTime, t, y) -> Float[Array, "m p"]:
     """|∂f/∂φ|."""
     found = parted.phi(t)
     phi, unravel = ravel_pytree(eqx.filter(found, eqx.is_inexact_array))
@@ -135,5 +156,5 @@ def _change(parted: OfTime, reach, start, end):
     widths = [high - low for low, high in intervals if jnp.issubdtype(low.dtype, jnp.inexact)]
     switches = [jnp.any(low != high) for low, high in intervals if not jnp.issubdtype(low.dtype, jnp.inexact)]
     width = jnp.concatenate([jnp.ravel(width) for width in widths]) if widths else jnp.zeros(0, reach.dtype)
-    change = jnp.sum(jnp.where(reach == 0, 0, reach * width), axis=1)
+    change = jnp.sum(jnp.where(reach == 0, 0, reach * width[None]), axis=1)
     return jnp.where(jnp.any(jnp.stack(switches)), jnp.inf, change) if switches else change
