@@ -186,6 +186,8 @@ def _hull(*values) -> Interval:
 
 
 def _product(_, x, y):
+    if x is y:  # a square, as which a product may be written
+        return _even(jnp.square, x)
     return _hull(*(jnp.where((a == 0) | (b == 0), 0, a * b) for a in x for b in y))
 
 

@@ -18,7 +18,7 @@ from ._motion import Equations, in_other_mode
 from ._power import energy_turnover
 from ._signal import delayed
 from ._system import EXPLICIT_TIME
-from ._watch import Seen, first_end
+from ._watch import Seen, first_end, is_hidden
 
 NEWTON_STEPS = 3  # the first makes the time right and its derivative, the others its higher derivatives
 LAST = NEWTON_STEPS + 1  # pieces: the whole step, those up to the end of a mode, the rest
@@ -130,6 +130,12 @@ def _looks_ahead(solver) -> bool:
     return tableau is not None and any(c > 1 for c in tableau.c)
 
 
+def _nodes(solver) -> np.ndarray:
+    """The times of the stages of a step, from 0 to 1."""
+    tableau = getattr(solver, "tableau", None)
+    return np.linspace(0, 1, 5) if tableau is None else np.unique(np.clip([0.0, *tableau.c, 1.0], 0, 1))
+
+
 class TwoPieces(dfx.AbstractLocalInterpolation):
     """Dense output of a step with a change of mode in it, at `cut`."""
 
@@ -207,6 +213,7 @@ class StickSlipSolver(Kept):
         # Where a bound has turned negative, steps shrink until the motion has come as far as it goes.
         shrinking = made.seen.negative & (t1 - t0 > BARELY * args[1].duration)
         error = jnp.where((ended & ~made.usable) | made.seen.unsure | shrinking, jnp.inf, error)
+        error = jnp.where(is_hidden(lambda t, y: terms.vf(t, y, args), _nodes(self.solver), t0, t1, y0, args[1]), jnp.inf, error)
         possible = ~ended | made.possible | ~made.usable
         refused = dfx.RESULTS.where(possible & begins, dfx.RESULTS.successful, dfx.RESULTS.internal_error)
         refused = dfx.RESULTS.where(made.seen.negative & ~shrinking, NEGATIVE, refused)

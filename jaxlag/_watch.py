@@ -1,4 +1,4 @@
-"""Watching a step for the end of a mode, so that none is missed.
+"""Watching a step, so that no end of a mode and no pulse is missed.
 
 A mode may end and begin again between two looks in two ways. What follows the state is smooth on a step, so a dip shows in the slopes at
 the looks on both sides of it. What follows the time alone, a load that comes as a pulse, need not show at all: bounds of it over the
@@ -23,6 +23,8 @@ SECTIONS = 60  # of an interval with an end in it; some four do where the margin
 ROUNDS = 256  # of looks, after which the step is too long to be watched
 BRIEF = 1e-7  # of the motion, how long anything lasts that is looked for,
 UNBOUNDED = 2e-4  # where part of the time dependence has no bounds
+PARTS = 64  # of a step, over which bounds are taken
+FAINT = 1e-6  # of its largest value, what a pulse may be and be overlooked
 NEAR = 64  # roundings of time, below which no dip is looked for
 
 
@@ -105,6 +107,26 @@ def first_end(margins: Callable, path: Callable, t0, t1, elements: int, scales: 
     slope = jnp.where((done.behind < 0) & (done.before - done.behind > steep), -jnp.inf, done.slope)
     is_margin = jnp.any(done.behind[:elements] < 0)
     return Seen(done.found & is_margin, done.found & ~is_margin, ~done.found & (done.low < t1), done.high, slope[:elements])
+
+
+def is_hidden(rates: Callable, nodes: np.ndarray, t0, t1, y, scales: Any) -> Any:
+    """Whether some part of `rates(t, y)` that follows the time alone goes, within a step, far beyond what the stages see of it.
+
+    Such a pulse the error of the step does not know of. `nodes` are the times of the stages, from 0 to 1.
+    """
+    parted = of_time(rates, t0, y)
+    if parted is None or not parted.is_bounded:
+        return jnp.array(False)
+    flat = lambda leaves: jnp.concatenate([jnp.ravel(leaf).astype(y.dtype) for leaf in leaves])
+    ends = lambda start, end: [flat(side) for side in zip(*parted.bounds(start, end), strict=True)]
+    seen = jax.vmap(lambda t: flat(parted.phi(t)))(t0 + (t1 - t0) * nodes)
+    least, most = jnp.min(seen, axis=0), jnp.max(seen, axis=0)
+    grid = t0 + (t1 - t0) * np.linspace(0, 1, PARTS + 1)
+    low, high = jax.vmap(ends)(grid[:-1], grid[1:])
+    beyond = jnp.maximum(jnp.max(high, axis=0) - most, least - jnp.min(low, axis=0))
+    largest = jnp.max(jnp.abs(jnp.stack(ends(t0, t0 + scales.duration))), axis=0)
+    found = beyond > (most - least) / 2 + FAINT * largest
+    return jax.lax.stop_gradient(jnp.any(found) & (t1 - t0 > BRIEF * scales.duration))
 
 
 def _around(low, high, before, behind):
