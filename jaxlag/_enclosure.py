@@ -240,6 +240,12 @@ def _remainder(_, x, y):
     return jnp.where(within, x[0] % y[0], jnp.where(x[0] < 0, -size, 0)), jnp.where(within, x[1] % y[0], jnp.where(x[1] > 0, size, 0))
 
 
+def _equal(x, y):
+    if x is y:
+        return _hull(jnp.ones_like(x[0], bool))
+    return (x[0] == x[1]) & (y[0] == y[1]) & (x[0] == y[0]), (x[0] <= y[1]) & (y[0] <= x[1])
+
+
 def _chosen(_, which, *cases):
     low, high = functools.reduce(jnp.minimum, [x for x, _ in cases]), functools.reduce(jnp.maximum, [x for _, x in cases])
     known = which[0] == which[1]
@@ -258,7 +264,7 @@ def _contracted(params, x, y):
 
 
 RULES: dict[str, Callable[..., Interval]] = {
-    "sub": lambda _, x, y: (x[0] - y[1], x[1] - y[0]),
+    "sub": lambda _, x, y: (x[0] - y[1], x[1] - y[0]) if x is not y else _hull(jnp.zeros_like(x[0])),
     "mul": _product,
     "div": _quotient,
     "abs": lambda _, x: _even(jnp.abs, x),
@@ -276,8 +282,8 @@ RULES: dict[str, Callable[..., Interval]] = {
     "le": lambda _, x, y: (x[1] <= y[0], x[0] <= y[1]),
     "gt": lambda _, x, y: (x[0] > y[1], x[1] > y[0]),
     "ge": lambda _, x, y: (x[0] >= y[1], x[1] >= y[0]),
-    "eq": lambda _, x, y: ((x[0] == x[1]) & (y[0] == y[1]) & (x[0] == y[0]), (x[0] <= y[1]) & (y[0] <= x[1])),
-    "ne": lambda _, x, y: ((x[1] < y[0]) | (y[1] < x[0]), ~((x[0] == x[1]) & (y[0] == y[1]) & (x[0] == y[0]))),
+    "eq": lambda _, x, y: _equal(x, y),
+    "ne": lambda _, x, y: tuple(~end for end in reversed(_equal(x, y))),
 }  # fmt: skip
 MOVING = {
     "reshape", "squeeze", "expand_dims", "broadcast_in_dim", "transpose", "rev", "slice", "split", "pad", "concatenate", "stack",

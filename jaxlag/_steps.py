@@ -213,7 +213,9 @@ class StickSlipSolver(Kept):
         # Where a bound has turned negative, steps shrink until the motion has come as far as it goes.
         shrinking = made.seen.negative & (t1 - t0 > BARELY * args[1].duration)
         error = jnp.where((ended & ~made.usable) | made.seen.unsure | shrinking, jnp.inf, error)
-        error = jnp.where(is_hidden(lambda t, y: terms.vf(t, y, args), _nodes(self.solver), t0, t1, y0, args[1]), jnp.inf, error)
+        error = jnp.where(
+            is_hidden(lambda t, y: self.equations.rates(t, y, args), _nodes(self.solver), t0, t1, y0, args[1]), jnp.inf, error
+        )
         possible = ~ended | made.possible | ~made.usable
         refused = dfx.RESULTS.where(possible & begins, dfx.RESULTS.successful, dfx.RESULTS.internal_error)
         refused = dfx.RESULTS.where(made.seen.negative & ~shrinking, NEGATIVE, refused)
