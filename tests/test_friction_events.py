@@ -1,7 +1,5 @@
 """No end of a mode of friction is missed: loads of every kind, many elements at once, bounds that vanish; against NumPy and SciPy."""
 
-import functools
-
 import diffrax
 import friction_by_hand as by_hand
 import jax
@@ -32,9 +30,9 @@ blocks = jl.System(
 )
 
 
-@functools.partial(jax.jit, static_argnames="solver")
-def motion_of_blocks(params, solver=None):
-    return jl.simulate(blocks, jnp.zeros(BLOCKS), params["v0"], TS, params, solver=solver, throw=False)
+@jax.jit
+def motion_of_blocks(params):
+    return jl.simulate(blocks, 0 * params["v0"], params["v0"], TS, params, rtol=1e-10, atol=1e-12, throw=False)
 
 
 def drawn(seed):
@@ -63,13 +61,12 @@ def drawn(seed):
     )
 
 
-def compared(seed):
-    """The largest difference of the positions, and the transitions counted here and there."""
-    params = drawn(seed)
+def compared(params):
+    """The positions, and the transitions counted, here and there."""
     found = motion_of_blocks(jax.tree.map(jnp.asarray, params))
-    assert found.succeeded, seed
+    assert found.succeeded
     expected, transitions = by_hand.Blocks(params).run(TS)
-    return np.max(np.abs(found.q - expected)), int(found.stats["transitions"][-1]), transitions
+    return np.asarray(found.q), expected, int(found.stats["transitions"][-1]), transitions
 
 
 T = lambda qdot: 0.5 * jnp.sum(qdot**2)
@@ -79,7 +76,7 @@ def block(load):
     return jl.System(T, dissipation={"dry": lambda t, qdot, wave: 2 * (1 + wave * jnp.cos(6 * t)) * jnp.abs(qdot)}, force=load)
 
 
-# name: load, end, motion before it was mended, transitions, end by `friction_by_hand` and by SciPy's events.
+# name: load, how long, transitions and where it ends, by `friction_by_hand`.
 LOADS = {
     "sin": (lambda t: 2.1 * jnp.sin(t), 100.0, 64, 0.0),
     "pulse": (lambda t: 8 * jnp.exp(-(((t - 15) / 0.3) ** 2)), 30.0, 2, 2.579962264),
@@ -96,9 +93,6 @@ def test_a_stuck_block_under_a_load_of_the_time_alone(name):
     np.testing.assert_allclose(found.q[-1], at, atol=2e-7)
     assert found.stats["transitions"][-1] == transitions
     assert np.max(np.abs(found.friction["dry"].force)) <= 2 * (1 + 1e-9)
-
-
-BY_GROUPS = {"n = 2": 2, "n = 3": 3}
 
 
 def shared_load(t, q, rate):
@@ -174,9 +168,29 @@ def test_a_bound_that_touches_zero_is_no_failure():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", range(24))
-def test_random_blocks(seed):
-    error, here, there = compared(seed)
-    assert error < 1e-7
+@pytest.mark.parametrize("pulse", [-4.0, -8.0, -30.0])
+@pytest.mark.parametrize("wide", [0.02, 0.1])
+@pytest.mark.parametrize("steady", [0.3, 0.45])
+def test_a_pulse_while_a_block_slides(pulse, wide, steady):
+    """A constant deceleration has no error either, so that steps went over the pulse: 36 of 48 such slides missed what it does."""
+    one, none = np.ones(1), np.zeros(1)
+    still = dict(m=one, c=none, b=none, linked=none, wave=none, F_rate=one, belt=none, belt_rate=one)
+    load = dict(size=np.array([[steady], [0.0]]), rate=np.zeros((2, 1)), phase=np.full((2, 1), np.pi / 2))
+    params = still | load | dict(pulse=pulse * one, when=5 * one, wide=wide * one, F=0.5 * one, v0=3 * one)
+    found, expected, here, there = compared(params)
+    np.testing.assert_allclose(found, expected, atol=1e-6)
+    assert here == there
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", range(9))
+def test_random_blocks(seed, monkeypatch):
+    found, expected, here, there = compared(drawn(seed))
+    error, off = np.max(np.abs(found - expected)), 0.0
     if seed % 3:  # where a bound is zero there is no telling which mode it is
         assert here == there
+    else:  # nor are the steps of the other motion as exact where bounds come back
+        monkeypatch.setattr(by_hand, "H", by_hand.H / 2)
+        finer, _ = by_hand.Blocks(drawn(seed)).run(TS)
+        error, off = np.max(np.abs(found - finer)), np.max(np.abs(finer - expected))
+    assert error < 1e-7 + off
