@@ -111,7 +111,7 @@ def _solver(M, G, f, c, near):
         length = None if slack is None else jnp.sqrt(slack @ fixed(M.as_matrix()) @ slack)
         return Asked(by_root(fixed(G.T)).T, fixed(c), by_root(fixed(load(f, c))), length)
 
-    inverse, satisfied = _inverse(fixed(S), fixed(c), lambda D: _by_rows(asked(), D))
+    inverse, satisfied = _inverse(S, fixed(c), lambda D: _by_rows(asked(), fixed(D)))
 
     def solve(f, c):
         free = by_inertia(load(f, c))
@@ -257,11 +257,12 @@ def pseudo_inverse(S: Float[Array, "m m"]) -> Float[Array, "m m"]:
     """Moore–Penrose inverse of a symmetric positive semidefinite S."""
 
     def singular(D):
+        D = jax.lax.stop_gradient(D)
         values, U = jnp.linalg.eigh(jax.lax.stop_gradient(S) * jnp.outer(D, D))
         return _by_values(values, U, values > jnp.finfo(D.dtype).eps ** (2 * CLEAR) * values[-1], D), jnp.array(True)
 
     one = jnp.eye(len(S), dtype=S.dtype)
-    return _applied(S, _inverse(jax.lax.stop_gradient(S), jnp.zeros_like(S), singular)[0], one)
+    return _applied(S, _inverse(S, jnp.zeros_like(S), singular)[0], one)
 
 
 def constrained_acceleration(flat: Flat, t, q, v, feedback=None) -> SaddlePoint:
