@@ -68,8 +68,9 @@ def weightless(M: np.ndarray, G: np.ndarray) -> list[int]:
 
 
 def is_defined(found: dict) -> bool:
-    """Whether M and G are finite."""
-    return bool(np.all(np.isfinite(found["M"])) and np.all(np.isfinite(found["G"])))
+    """Whether M, G and, where they are there, the residuals of the constraints are finite."""
+    named = [found["M"], found["G"], *found.get("position", {}).values(), *found.get("velocity", {}).values()]
+    return all(np.all(np.isfinite(x)) for x in named)
 
 
 def _unheld(found):

@@ -227,7 +227,7 @@ def _by_values(values, U, held, D):
     """R with R Rᵀ = (D⁻¹ A D⁻¹)⁺, for A = U diag(values) Uᵀ with what is not held taken out."""
     size = jnp.where(held, jax.lax.rsqrt(jnp.where(held, values, 1)), 0)
     # Least norm in the units given: take out of range and domain what lies in the null space of S, spanned by V.
-    V = D[:, None] * U * ~held[None, :]
+    V = jnp.where(held[None, :], 0, D[:, None] * U)
     gram = jnp.linalg.cholesky(V.T @ V + jnp.diag(held | (jnp.sum(V**2, axis=0) == 0)).astype(D.dtype))
     out = jnp.eye(len(D), dtype=D.dtype) - V @ jax.scipy.linalg.cho_solve((gram, True), V.T)
     return out @ (D[:, None] * U * size[None, :])
