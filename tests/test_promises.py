@@ -104,7 +104,7 @@ crank = jl.System(lambda qdot: 0.5 * qdot**2, holonomic=lambda t, q: jnp.cos(q) 
 def test_a_mechanism_driven_beyond_its_reach(system, q0):
     """At t = 1/2 the end is as far away as it can be."""
     with pytest.raises(
-        RuntimeError, match=rf"stopped at t = 0\.5 after [56] of 11 samples: {LOCKED}|stopped at t = 0\.5 after 5 .*{LOCKED}"
+        RuntimeError, match=rf"stopped at t = 0\.55 after 6 of 11 samples: {LOCKED}|stopped at t = 0\.5 after 5 .*{LOCKED}"
     ):
         jl.simulate(system, q0, 0 * q0, TS)
 
@@ -146,10 +146,10 @@ FAILURES = {
     "NaN in M": (jl.System(lambda q, qdot: 0.5 * jnp.sqrt(q) * qdot**2), -1.0, 0.0, rf"stopped at t = 0 .*{UNDEFINED}"),
     "NaN in g": (jl.System(lambda qdot: 0.5 * qdot**2, holonomic=lambda q: jnp.sqrt(q - 1)), 0.0, 0.0, rf"stopped at t = 0 .*{UNDEFINED}"),
     "NaN on the way": (
-        jl.System(lambda qdot: 0.5 * qdot**2, force=lambda t: jnp.sqrt(0.5 - t)),
+        jl.System(lambda qdot: 0.5 * qdot**2, force=lambda t: jnp.sqrt(0.55 - t)),
         0.0,
         0.0,
-        rf"stopped at t = 0\.5 after [56] of 11 samples: {UNDEFINED}",
+        rf"stopped at t = 0\.55 after 6 of 11 samples: {UNDEFINED}",
     ),
     "not affine": (
         jl.System(kinetic, nonholonomic=lambda qdot: qdot[0] + qdot[1] ** 2 - 2),
