@@ -240,7 +240,12 @@ def _applied(S: Float[Array, "m m"], inverse: Inverse, R: Float[Array, "m k"]) -
     if len(D) < 2:
         return D[:, None] * R
     by_factor = D[:, None] * jax.scipy.linalg.cho_solve((factor, True), D[:, None] * R)
-    return jnp.where(regular, by_factor, root @ (root.T @ R))  # by parts: the product has lost the smaller values
+    # A forward pass over a reverse one differentiates this body, not its rule: nothing is changed, but the derivative by S.
+    fixed = jax.lax.stop_gradient(S)
+    P = lambda X: root @ (root.T @ X)  # by parts: the product has lost the smaller values
+    N, change, X = lambda X: X - fixed @ P(X), S - fixed, P(R)
+    by_root = X - P(change @ X) + N(change @ P(X)) + P(P(change @ N(R)))
+    return jnp.where(regular, by_factor, by_root)
 
 
 @_applied.defjvp
