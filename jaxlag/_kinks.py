@@ -130,19 +130,25 @@ class _Term(NamedTuple):
         return cls(jaxpr, closed.consts, state, moduli, structure.fresh, structure.branches)
 
     def kinks(self, spoken: str) -> list[Modulus]:
-        """Those that bound a friction force; refuses kinks of what is not affine in q̇."""
+        """Those that bound a friction force; refuses kinks of what is not affine in q̇, or has an unlike force on both sides unread."""
         assert self.moduli is not None
-        candidates = sorted(self.moduli.used(), key=lambda u: u.of[0].place)
+        candidates, left_over = sorted(self.moduli.used(), key=lambda u: u.of[0].place), self.moduli.left_over()
         found = []
         for modulus, (slope, moves, affine) in zip(candidates, self._slopes(candidates), strict=True):
             if is_number(slope) and slope == 0:
                 continue
-            if modulus not in self.moduli.hard and (moves or not affine):
+            signed = not left_over.isdisjoint(modulus.of)
+            if modulus not in self.moduli.hard and (moves or not affine or signed):
                 continue  # a maximum or a selection, not of friction
             if not affine:
                 raise ValueError(
                     f"{spoken} must have its kinks in slip velocities that are affine in qdot, but one is not. "
                     "Take the absolute value or norm of a relative velocity itself."
+                )
+            if signed:
+                raise ValueError(
+                    f"{spoken} must depend on the sign of a slip velocity in a way that is read, but beside its absolute value there is "
+                    "another. Write the coefficient of each side out, D = jnp.where(v > 0, F1, F2) * jnp.abs(v)."
                 )
             found.append(modulus)
         return found

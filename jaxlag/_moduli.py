@@ -40,6 +40,12 @@ class Moduli:
         """Those that stand in what was found."""
         return set().union(*map(moduli_in, self.found.values()))
 
+    def left_over(self) -> set[Entry]:
+        """Those whose sign the results depend on in another way, too."""
+        lost = [y for x in self.cone if x in self.unresolved for y in x.operands]
+        forms = [self.forms[x] or {} for x in (*self.results, *lost) if x in self.forms]
+        return {factor.of for form in forms for product in form for factor, _ in product if isinstance(factor, Sign)}
+
     def jumps(self) -> bool:
         """Whether a result jumps where a velocity changes its sign, or does all but that."""
         jumps = any(self._jumps(x) for x in self.results if x in self.forms)

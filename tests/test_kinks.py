@@ -161,6 +161,10 @@ def test_one_sliding_point(D, forwards, backwards):
         np.testing.assert_allclose(np.abs(slip), abs(v), rtol=1e-15)
 
 
+def _larger(v):  # √(1 + (1 + v)²) + |1 + v|: which of two forms to take, and no friction
+    return jnp.sqrt(1 + (1 + v) ** 2) + jnp.where(1 + v > 0, 1 + v, -(1 + v))
+
+
 SMOOTH = {
     "cube": lambda qdot, F: F * jnp.abs(qdot) ** 3,
     "drag of points": lambda qdot, F: F * jnp.sum(jnp.linalg.norm(jnp.array([[qdot, 1 * qdot], [qdot, 2 * qdot]]), axis=1) ** 3),
@@ -171,6 +175,7 @@ SMOOTH = {
     "an exponent": lambda qdot, F, p: F * jnp.abs(qdot) ** p,
     "power law": lambda qdot, F, p: dissipation.power_law(qdot, F, p),
     "log cosh": lambda qdot, F, w: F * w * jnp.log(jnp.cosh(qdot / w)),
+    "a stable form of two": lambda qdot, F: F * jnp.where(1 + qdot > 0, qdot**2 / _larger(qdot), _larger(qdot)),
     "a name": lambda qdot, F: F * hypot(qdot, qdot),
     "no velocity": lambda q, qdot, F: F * jnp.abs(q) * qdot**2,
 }
@@ -179,6 +184,13 @@ SMOOTH = {
 @pytest.mark.parametrize("D", SMOOTH.values(), ids=SMOOTH)
 def test_what_is_smooth_stays_smooth(D):
     assert read(D, 0.7, {"F": 0.7, "w": 0.1, "p": 1.8}) is None
+
+
+@pytest.mark.parametrize("beside", [jnp.exp, jnp.tanh])
+def test_a_sign_beside_the_absolute_value_that_is_not_read_is_refused(beside):
+    """The bound at rest would be that of a sign of zero, which is neither side's."""
+    with pytest.raises(ValueError, match="`dissipation` must depend on the sign of a slip velocity in a way that is read"):
+        read(lambda qdot, F: F * beside(2 + jnp.sign(qdot)) * jnp.abs(qdot), 0.7, {"F": 0.7})
 
 
 def test_friction_that_is_off_at_times_is_friction():

@@ -1,0 +1,214 @@
+"""Interval arithmetic: bounds of what an operation of JAX makes of operands that lie anywhere between two values.
+
+What an operation has no good bounds for lies anywhere between −∞ and ∞.
+Source: Moore, Kearfott & Cloud, Introduction to Interval Analysis (2009), chapters 2 and 5.
+"""
+
+import functools
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+Interval = tuple[Any, Any]  # the least and the largest value, of arrays entry by entry
+WINDOW = 8  # entries of a table that are looked up at once
+
+
+def _extremes(dtype) -> tuple[Any, Any]:
+    if dtype == bool:
+        return False, True
+    return (-np.inf, np.inf) if jnp.issubdtype(dtype, jnp.inexact) else (jnp.iinfo(dtype).min, jnp.iinfo(dtype).max)
+
+
+def anything(aval) -> Interval:
+    """Of an array of which nothing is known."""
+    least, most = _extremes(aval.dtype)
+    return jnp.full(aval.shape, least, aval.dtype), jnp.full(aval.shape, most, aval.dtype)
+
+
+def _known(where, low, high) -> Interval:
+    least, most = _extremes(low.dtype)
+    return jnp.where(where, low, jnp.asarray(least, low.dtype)), jnp.where(where, high, jnp.asarray(most, low.dtype))
+
+
+def without_nan(low, high) -> Interval:
+    """Where an operation has no value at an end of the interval, or ∞ − ∞, it may be anything."""
+    if not jnp.issubdtype(jnp.result_type(low), jnp.floating):
+        return low, high
+    return _known(~(jnp.isnan(low) | jnp.isnan(high)), low, high)
+
+
+def hull(*values) -> Interval:
+    return functools.reduce(jnp.minimum, values), functools.reduce(jnp.maximum, values)
+
+
+def _product(_, x, y):
+    if x is y:  # a square, as which a product may be written
+        return _even(jnp.square, x)
+    return hull(*(jnp.where((a == 0) | (b == 0), 0, a * b) for a in x for b in y))
+
+
+def _quotient(_, x, y):
+    through_zero = (y[0] <= 0) & (y[1] >= 0)
+    low, high = hull(*(a / b for a in x for b in y))
+    return jnp.where(through_zero, -jnp.inf, low), jnp.where(through_zero, jnp.inf, high)
+
+
+def _even(power, x):
+    """A power that is least at zero."""
+    ends = power(x[0]), power(x[1])
+    return jnp.where((x[0] <= 0) & (x[1] >= 0), 0, jnp.minimum(*ends)), jnp.maximum(*ends)
+
+
+def _integer_power(params, x):
+    n = params["y"]
+    if n < 0:
+        one = jnp.ones_like(x[0])
+        return _quotient(None, (one, one), _integer_power({"y": -n}, x))
+    power = lambda x: x**n
+    return _even(power, x) if n % 2 == 0 else (power(x[0]), power(x[1]))
+
+
+def _power(_, x, y):
+    """xʸ of a base that is nowhere negative; of others anything, for not even its sign is known."""
+    low, high = hull(*(a**b for a in x for b in y))
+    return jnp.where(x[0] >= 0, low, jnp.nan), high
+
+
+def _cosine(x):
+    """Between its values at the ends, unless a multiple of π lies between them."""
+    crest = jnp.floor(x[1] / (2 * jnp.pi)) >= jnp.ceil(x[0] / (2 * jnp.pi))
+    trough = jnp.floor(x[1] / (2 * jnp.pi) - 0.5) >= jnp.ceil(x[0] / (2 * jnp.pi) - 0.5)
+    low, high = hull(jnp.cos(x[0]), jnp.cos(x[1]))
+    return jnp.where(trough, -1, low), jnp.where(crest, 1, high)
+
+
+def _tangent(_, x):
+    within = jnp.floor(x[0] / jnp.pi + 0.5) == jnp.floor(x[1] / jnp.pi + 0.5)
+    return jnp.where(within, jnp.tan(x[0]), -jnp.inf), jnp.where(within, jnp.tan(x[1]), jnp.inf)
+
+
+def _remainder(_, x, y):
+    size = jnp.maximum(jnp.abs(y[0]), jnp.abs(y[1]))
+    turn = lambda a: jnp.trunc(a / y[0])
+    within = (y[0] == y[1]) & (turn(x[0]) == turn(x[1])) & (jnp.sign(x[0]) == jnp.sign(x[1]))
+    low, high = (jax.lax.rem(end, y[0]) for end in x)
+    return jnp.where(within, low, jnp.where(x[0] < 0, -size, 0)), jnp.where(within, high, jnp.where(x[1] > 0, size, 0))
+
+
+def _converted(params, x):
+    """To another kind of number: to a truth, which is whether it is not zero, or to integers, which may be too small for it."""
+    kind = params["new_dtype"]
+    if kind == bool:
+        return (x[0] > 0) | (x[1] < 0), (x[0] != 0) | (x[1] != 0)
+    return _exactly(kind, *x) if jnp.issubdtype(kind, jnp.integer) else tuple(end.astype(kind) for end in x)
+
+
+def _exactly(kind, low, high) -> Interval:
+    """Integers that were reckoned as real numbers; anything where they are too large for that, or for their kind."""
+    limit = min(1 / jnp.finfo(float).eps, float(jnp.iinfo(kind).max))
+    fits = (low >= max(-limit, float(jnp.iinfo(kind).min))) & (high <= limit)
+    return _known(fits, *(jnp.where(fits, jnp.trunc(end), 0).astype(kind) for end in (low, high)))
+
+
+def in_integers(kind, rule: Callable, operands) -> Interval:
+    """A rule of arithmetic on integers, which begin anew behind the largest one."""
+    return _exactly(kind, *rule(*(tuple(end.astype(float) for end in x) for x in operands)))
+
+
+def _finite(x):
+    fine = jnp.isfinite(x[0]) & jnp.isfinite(x[1])
+    return fine, jnp.ones_like(fine)
+
+
+def _equal(x, y):
+    if x is y:
+        return hull(jnp.ones_like(x[0], bool))
+    return (x[0] == x[1]) & (y[0] == y[1]) & (x[0] == y[0]), (x[0] <= y[1]) & (y[0] <= x[1])
+
+
+def _chosen(_, which, *cases):
+    low, high = functools.reduce(jnp.minimum, [x for x, _ in cases]), functools.reduce(jnp.maximum, [x for _, x in cases])
+    known = which[0] == which[1]
+    one = [jax.lax.select_n(jnp.broadcast_to(which[0], jnp.shape(low)), *(x[end] for x in cases)) for end in (0, 1)]
+    return jnp.where(known, one[0], low), jnp.where(known, one[1], high)
+
+
+def _contracted(params, x, y):
+    """A product of matrices, by centres and radii."""
+    product = functools.partial(
+        jax.lax.dot_general, **{key: params[key] for key in ("dimension_numbers", "precision", "preferred_element_type")}
+    )
+    (cx, rx), (cy, ry) = (((low + high) / 2, (high - low) / 2) for low, high in (x, y))
+    centre, radius = product(cx, cy), product(jnp.abs(cx), ry) + product(rx, jnp.abs(cy)) + product(rx, ry)
+    return centre - radius, centre + radius
+
+
+def _looked_up(take, table, *indices):
+    """Entries of a table whose numbers are not quite known: the extremes of what they may be, where these are few."""
+    unsure = [high - low for low, high in indices if low is not high]
+    windows = [[low + jnp.minimum(k, high - low).astype(low.dtype) for low, high in indices] for k in range(WINDOW)]
+    found = hull(*(take(x, *window) for window in windows for x in ({id(x): x for x in table}.values())))
+    few = jnp.all(jnp.stack([jnp.all(width < WINDOW) for width in unsure])) if unsure else True
+    return _known(few if len(unsure) <= 1 else False, *found)
+
+
+def _gathered(params, table, index):
+    take = functools.partial(jax.lax.gather_p.bind, **params)
+    one_way = index[0].shape[-1] == 1 or index[0] is index[1]
+    return _looked_up(take, table, index) if one_way else _known(False, *[take(table[0], index[0])] * 2)
+
+
+def _scattered(params, x, index, updates):
+    """What is added to entries in known places."""
+    ends = [jax.lax.scatter_add_p.bind(*end, **params) for end in zip(x, index, updates, strict=True)]
+    return _known(index[0] is index[1], *ends)
+
+
+def _sliced(params, table, *starts):
+    return _looked_up(lambda x, *at: jax.lax.dynamic_slice(x, at, params["slice_sizes"]), table, *starts)
+
+
+RULES: dict[str, Callable[..., Interval]] = {
+    "sub": lambda _, x, y: (x[0] - y[1], x[1] - y[0]) if x is not y else hull(jnp.zeros_like(x[0])),
+    "mul": _product,
+    "div": _quotient,
+    "abs": lambda _, x: _even(jnp.abs, x),
+    "square": lambda _, x: _even(jnp.square, x),
+    "integer_pow": _integer_power,
+    "pow": _power,
+    "cos": lambda _, x: _cosine(x),
+    "sin": lambda _, x: _cosine((x[0] - jnp.pi / 2, x[1] - jnp.pi / 2)),
+    "cosh": lambda _, x: tuple(1 + end for end in _even(lambda x: jnp.cosh(x) - 1, x)),
+    "tan": _tangent,
+    "rem": _remainder,
+    "select_n": _chosen,
+    "dot_general": _contracted,
+    "convert_element_type": _converted,
+    "is_finite": lambda _, x: _finite(x),
+    "scatter-add": _scattered,
+    "gather": _gathered,
+    "dynamic_slice": _sliced,
+    "lt": lambda _, x, y: (x[1] < y[0], x[0] < y[1]),
+    "le": lambda _, x, y: (x[1] <= y[0], x[0] <= y[1]),
+    "gt": lambda _, x, y: (x[0] > y[1], x[1] > y[0]),
+    "ge": lambda _, x, y: (x[0] >= y[1], x[1] >= y[0]),
+    "lt_to": lambda _, x, y: (x[1] < y[0], x[0] < y[1]),
+    "le_to": lambda _, x, y: (x[1] <= y[0], x[0] <= y[1]),
+    "eq": lambda _, x, y: _equal(x, y),
+    "ne": lambda _, x, y: tuple(~end for end in reversed(_equal(x, y))),
+}  # fmt: skip
+MOVING = {
+    "reshape", "squeeze", "expand_dims", "broadcast_in_dim", "transpose", "rev", "slice", "split", "pad", "concatenate", "stack",
+    "unstack", "tile", "copy", "stop_gradient", "reduce_sum", "reduce_max", "reduce_min", "reduce_and",
+    "reduce_or", "cumsum", "cummax", "cummin", "optimization_barrier",
+}  # fmt: skip
+RISING = MOVING | {
+    "add", "add_any", "max", "min", "clamp", "exp", "exp2", "expm1", "log", "log1p", "sqrt", "cbrt", "sinh", "tanh", "asinh", "acosh",
+    "atanh", "asin", "atan", "erf", "logistic", "floor", "ceil", "round", "sign", "and", "or",
+}  # fmt: skip
+FALLING = {"neg", "rsqrt", "acos", "erfc", "not"}
+ARITHMETIC = {"add", "add_any", "sub", "mul", "neg", "div", "abs", "square", "integer_pow", "reduce_sum", "cumsum"}
+LOGICAL = {"and", "or", "not", "reduce_and", "reduce_or"}  # of other integers they are neither rising nor falling
