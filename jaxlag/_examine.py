@@ -13,7 +13,7 @@ from ._checks import at_state, coordinates
 from ._friction import settled
 from ._kinks import unread_friction
 from ._mechanics import applied_force, constraint_rows, inertia, position_residual, velocity_residual
-from ._multipliers import constrained_acceleration
+from ._multipliers import augmented, constrained_acceleration
 from ._scalarised import scalarised
 from ._system import Flat, System, bind, leaf_names, rows_by_name
 
@@ -237,7 +237,9 @@ def _defects(mode, t, q, v):
     terms = rate, -jax.grad(L, argnums=1)(t, q, v), -applied_force(mode, t, q, v, multipliers), -G.T @ multipliers
     largest = lambda *terms: jnp.max(jnp.abs(jnp.concatenate(terms)), initial=0)
     in_equations = largest(sum(terms)), largest(*terms)
-    in_rows = largest(G @ qddot + gamma), largest(jnp.abs(G) @ jnp.abs(qddot), gamma)
+    A, _ = augmented(jax.hessian(L, argnums=2)(t, q, v), G)
+    moved = jnp.abs(jnp.linalg.inv(A)) @ sum(map(jnp.abs, terms))  # by each force alone, before they cancel each other
+    in_rows = largest(G @ qddot + gamma), largest(jnp.abs(G) @ moved, gamma)
     return multipliers, jnp.where(sound.determined & jnp.all(jnp.isfinite(qddot)), jnp.stack([*in_equations, *in_rows]), 0)
 
 

@@ -55,7 +55,14 @@ class Projection:
                 g, G = position_residual(flat, t, q)
                 q = q + saddle_point(metric, G, jnp.zeros_like(q), -g, Near(q)).x
         psi, G, _ = constraint_rows(flat, t, q, v)
-        return q, v + saddle_point(M, G, jnp.zeros_like(v), -psi, Near(v)).x
+        return q, _put_right(v, saddle_point(M, G, jnp.zeros_like(v), -psi, Near(v)).x)
+
+
+def _put_right(v, dv):
+    """v + dv, and zero where that is rounding alone: what comes to rest is at rest."""
+    left = v + dv
+    nothing = jnp.abs(left) <= 4 * jnp.finfo(v.dtype).eps * jnp.abs(v)
+    return jnp.where(nothing, left - jax.lax.stop_gradient(left), left)
 
 
 def _metric_of_positions(flat, M, t, q, v):

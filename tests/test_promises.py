@@ -71,17 +71,22 @@ def test_random_constraints_are_satisfied_or_refused(kind, e):
 
 @pytest.mark.parametrize("kind, e", [("near", 1e-3), ("near", 1e-6), ("same", 0.0), ("against", 1.0), ("against", 1e-3)])
 def test_random_constraints_are_kept_or_the_motion_fails(kind, e):
-    case = rows(7, kind, e) | {"s": 0.35}
-    motion = jl.simulate(linear, np.zeros(N), np.zeros(N), TS, case | {"f": 0 * case["f"]}, throw=False)
+    """Exact, or a failure by name; where rows are nearly the same, a tenth is refused, as more is asked of them than of all else."""
     rest, moving = TS <= 0.35, np.where(TS > 0.35, TS - 0.35, 0)
-    np.testing.assert_allclose(motion.q[rest], 0, rtol=0, atol=1e-12)
-    if kind == "against":
-        assert reason_of(motion.result).startswith(CONTRADICTORY) and 0.35 < motion.stats["reached"] < 0.45
-        assert np.all(np.isnan(motion.q[~rest])) and np.all(np.isnan(motion.multipliers["holonomic"][~rest]))
-        return
-    assert motion.succeeded
-    expected = exact(case | {"f": 0 * case["f"]}, ROWS if kind == "near" else 2)
-    np.testing.assert_allclose(motion.q, 0.5 * np.outer(moving**2, expected), rtol=0, atol=1e-9 / (e or 1) ** 0.5)
+    refused = 0
+    for seed in range(20):
+        case = rows(seed, kind, e)
+        case |= {"s": 0.35, "f": 0 * case["f"]}
+        motion = jl.simulate(linear, np.zeros(N), np.zeros(N), TS, case, throw=False)
+        np.testing.assert_allclose(motion.q[rest], 0, rtol=0, atol=1e-12)
+        if not motion.succeeded:
+            refused += 1
+            assert reason_of(motion.result).startswith(CONTRADICTORY) and 0.35 < motion.stats["reached"] < 0.45
+            assert np.all(np.isnan(motion.q[~rest])) and np.all(np.isnan(motion.multipliers["holonomic"][~rest]))
+        else:
+            expected = exact(case, ROWS if kind == "near" else 2)
+            np.testing.assert_allclose(motion.q, 0.5 * np.outer(moving**2, expected), rtol=0, atol=1e-9 / (e or 1) ** 0.5)
+    assert refused == 20 if kind == "against" else refused <= (2 if e == 1e-6 else 0)
 
 
 def test_one_of_many_that_contradicts_itself_says_so():
