@@ -17,7 +17,7 @@ WINDOW = 8  # entries of a table that are looked up at once
 
 
 def _extremes(dtype) -> tuple[Any, Any]:
-    if dtype == bool:
+    if jnp.issubdtype(dtype, bool):
         return False, True
     return (-np.inf, np.inf) if jnp.issubdtype(dtype, jnp.inexact) else (jnp.iinfo(dtype).min, jnp.iinfo(dtype).max)
 
@@ -101,15 +101,15 @@ def _remainder(_, x, y):
 def _converted(params, x):
     """To another kind of number: to a truth, which is whether it is not zero, or to integers, which may be too small for it."""
     kind = params["new_dtype"]
-    if kind == bool:
+    if jnp.issubdtype(kind, bool):
         return (x[0] > 0) | (x[1] < 0), (x[0] != 0) | (x[1] != 0)
     return _exactly(kind, *x) if jnp.issubdtype(kind, jnp.integer) else tuple(end.astype(kind) for end in x)
 
 
 def _exactly(kind, low, high) -> Interval:
     """Integers that were reckoned as real numbers; anything where they are too large for that, or for their kind."""
-    limit = min(1 / jnp.finfo(float).eps, float(jnp.iinfo(kind).max))
-    fits = (low >= max(-limit, float(jnp.iinfo(kind).min))) & (high <= limit)
+    limit = 1 / float(jnp.finfo(float).eps)
+    fits = (low >= max(-limit, float(jnp.iinfo(kind).min))) & (high <= min(limit, float(jnp.iinfo(kind).max)))
     return _known(fits, *(jnp.where(fits, jnp.trunc(end), 0).astype(kind) for end in (low, high)))
 
 
