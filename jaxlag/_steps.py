@@ -303,7 +303,7 @@ class Wary(dfx.PIDController):
         return jnp.where(jnp.isfinite(tnext), tnext, t1), state
 
     def adapt_step_size(self, t0, t1, y0, y1, args, error, *rest):
-        finite = jnp.all(jnp.isfinite(y1)) & jnp.all(jnp.isfinite(error))
+        finite = jnp.all(jnp.isfinite(y1)) & ~jnp.any(jnp.isnan(error))  # an infinite error is a step that was refused
         *step, result = super().adapt_step_size(t0, t1, y0, jnp.where(finite, y1, y0), args, jnp.where(finite, error, jnp.inf), *rest)
         lost = (result == dfx.RESULTS.dt_min_reached) & ~finite
         return *step, dfx.RESULTS.where(lost, dfx.RESULTS.nonlinear_divergence, result)
