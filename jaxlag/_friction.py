@@ -18,6 +18,7 @@ from jaxtyping import Array, Bool, Float
 from ._kinks import Kinks, kinks_of
 from ._multipliers import constrained_acceleration
 from ._numbers import count, number
+from ._share import shared
 from ._system import Flat
 
 
@@ -39,25 +40,14 @@ def in_mode(flat: Flat, kinks: Kinks, sigma: Float[Array, " r"]) -> Flat:
 
 def sticking(kinks: Kinks, sigma: Float[Array, " r"]) -> Bool[Array, " e"]:
     """Which elements stick."""
-    return norms(kinks, sigma) == 0
-
-
-def norms(kinks: Kinks, rows: Float[Array, " r"]) -> Float[Array, " e"]:
-    """Norm of each element's rows, with a zero derivative at zero."""
-    squared = _per_element(kinks, rows**2)
-    return jnp.where(squared > 0, jnp.sqrt(jnp.where(squared > 0, squared, 1)), 0)
-
-
-def _per_element(kinks, rows):
-    return jnp.zeros(kinks.elements, rows.dtype).at[kinks.element_of_row].add(rows)
+    return kinks.norms(sigma) == 0
 
 
 def _extent(kinks, sigma, slip):
     """u = ‖s‖ of each element: σ s for a single row, which goes on smoothly through s = 0; of several rows σ·s near rest alone."""
-    along, norm = _per_element(kinks, sigma * slip), norms(kinks, slip)
-    several = np.bincount(kinks.element_of_row) > 1
-    near_rest = norm <= jnp.finfo(slip.dtype).tiny ** 0.25
-    return jnp.where(sticking(kinks, sigma), 0, jnp.where(several & ~near_rest, norm, along))
+    along, norm = kinks.sums(sigma * slip), kinks.norms(slip)
+    near_rest = norm <= jnp.maximum(kinks.near_rest, jnp.finfo(slip.dtype).tiny ** 0.25)
+    return jnp.where(sticking(kinks, sigma), 0, jnp.where(kinks.several & ~near_rest, norm, along))
 
 
 class Friction(NamedTuple):
@@ -82,9 +72,12 @@ def friction(flat: Flat, kinks: Kinks, sigma, t, q, v, feedback=None) -> Frictio
     extent, pull = jax.vjp(lambda slip: _extent(kinks, sigma, slip), slip)
     bound = jax.grad(total)(extent)
     held = multipliers[flat.rows :]
+    left = bound - kinks.norms(held)
+    if kinks.are_shared:
+        held, left = shared(kinks, jax.jacfwd(kinks.slip, argnums=2)(t, q, v), held, bound, stuck)
     force = jnp.where(stuck[of], held, -pull(bound)[0])
-    slack = 1e2 * jnp.finfo(v.dtype).eps * jnp.abs(bound)
-    margin = jnp.where(stuck, bound + slack - norms(kinks, held), _per_element(kinks, sigma * slip))
+    going = kinks.sums(sigma * slip) + 1e-6 * kinks.near_rest
+    margin = jnp.where(stuck, left + 1e2 * jnp.finfo(v.dtype).eps * jnp.abs(bound), going)
     return Friction(qddot, multipliers, force, slip_rate, bound, margin)
 
 
@@ -126,17 +119,18 @@ def settle(flat: Flat, kinks: Kinks, t, q, v, sigma, at_rest: Bool[Array, " e"],
         released = at_rest & ~sticking(kinks, mode.sigma)
         freed = jnp.where(stage == LOOSE, at_rest, released & (stage == HOLD))
         found = jax.lax.stop_gradient(friction(flat, kinks, jnp.where(freed[of], loose, mode.sigma), t, q, v))
-        rate = norms(kinks, found.slip_rate)
+        rate = kinks.norms(found.slip_rate)
 
         over = jnp.where(sticking(kinks, mode.sigma), -found.margin, -jnp.inf)
         beyond = _greatest(over, over > 0)
-        backwards = -_per_element(kinks, found.slip_rate * mode.sigma)
+        backwards = -kinks.sums(found.slip_rate * mode.sigma)
         returning = _greatest(backwards, released & (backwards > jnp.where(search.clearly, 0, 1e-6 * search.free_rate)))
-        torn = _torn(kinks, t, q, v, found, over > -jnp.inf) & ~jnp.any(beyond)
-        leaving = jnp.where((stage == FIRST) & jnp.any(breaking), breaking, beyond | torn)
+        torn = _torn(kinks, t, q, v, found, search.free_rate, over > -jnp.inf) & ~jnp.any(beyond)
+        along = (over > -1e-6 * jnp.abs(found.bound)) & kinks.are_shared  # those of a share break away together
+        leaving = jnp.where((stage == FIRST) & jnp.any(breaking), breaking | along, beyond | torn)
         returning = returning & ~jnp.any(leaving)
-        way = jnp.where((beyond | breaking)[of], -found.force, found.slip_rate)
-        size = norms(kinks, way)[of]
+        way = jnp.where((beyond | breaking | along)[of], -found.force, found.slip_rate)
+        size = kinks.norms(way)[of]
         sigma = jnp.where(leaving[of], way / jnp.where(size > 0, size, 1), jnp.where(returning[of], 0, mode.sigma))
         clearly = (search.clearly | (leaving & (over > 1e-6 * jnp.abs(found.bound)))) & ~returning
         settled = ~jnp.any(leaving | returning)
@@ -167,17 +161,17 @@ def _greatest(x, among):
     return among & (jnp.arange(x.size) == jnp.argmax(jnp.where(among, x, -jnp.inf)))
 
 
-def _torn(kinks, t, q, v, found, stuck):
+def _torn(kinks, t, q, v, found, free_rate, stuck):
     """Of elements that cannot stick together, as on belts that part, the one farthest from its rest."""
     _, drift = jax.jvp(lambda t, q: kinks.slip(t, q, v), (t, q), (jnp.ones_like(t), v))
-    most, rate = jnp.max(norms(kinks, drift), initial=0.0), norms(kinks, found.slip_rate)
-    return _greatest(rate, stuck & (most > 0) & (rate > 1e-6 * most))
+    most, rate = jnp.max(kinks.norms(drift), initial=0.0), kinks.norms(found.slip_rate)
+    return _greatest(rate, stuck & (rate > 1e-6 * most) & (rate > 1e-9 * free_rate) & (most > 0))
 
 
 def first_mode(flat: Flat, kinks: Kinks, t, q, v) -> Mode:
     """The mode at a start: what moves slips along its motion; what rests sticks, or breaks away."""
     slip = jax.lax.stop_gradient(kinks.slip(t, q, v))
-    size = norms(kinks, slip)
+    size = kinks.norms(slip)
     at_rest = size <= slip_of(kinks, t, q, v, 1e2 * jnp.finfo(v.dtype).eps * jnp.abs(v))
     sigma = slip / jnp.where(at_rest, 1, size)[kinks.element_of_row]
     return settle(flat, kinks, t, q, v, sigma, at_rest, jnp.zeros_like(at_rest))
@@ -185,13 +179,13 @@ def first_mode(flat: Flat, kinks: Kinks, t, q, v) -> Mode:
 
 def slip_of(kinks: Kinks, t, q, v, errors: Float[Array, " n"]) -> Float[Array, " e"]:
     """How much slip errors of the velocities come to, per element: each in its own units."""
-    return norms(kinks, jnp.abs(jax.jacfwd(kinks.slip, argnums=2)(t, q, v)) @ errors)
+    return kinks.norms(jnp.abs(jax.jacfwd(kinks.slip, argnums=2)(t, q, v)) @ errors)
 
 
 def redirected(kinks: Kinks, sigma, held, t, q, v):
     """σ of the slipping elements of several rows, turned along with their motion."""
     of, slip = kinks.element_of_row, kinks.slip(t, q, v)
-    several, size = np.bincount(of) > 1, norms(kinks, slip)
+    several, size = kinks.several, kinks.norms(slip)
     turns = (several & (size > slip_of(kinks, t, q, v, jnp.finfo(v.dtype).eps * jnp.abs(v))) & ~sticking(kinks, sigma) & ~held)[of]
     return jnp.where(turns, slip / jnp.where(turns, size[of], 1), sigma) if np.any(several) else sigma
 
@@ -260,7 +254,7 @@ class Regularised:
         """The system with smooth friction."""
 
         def extent(t, q, v):
-            return jnp.sqrt(_per_element(kinks, kinks.slip(t, q, v) ** 2) + self.width**2) - self.width
+            return jnp.sqrt(kinks.sums(kinks.slip(t, q, v) ** 2) + self.width**2) - self.width
 
         def smoothed(D):
             return lambda t, q, v, multipliers: D(t, q, v, multipliers, extent(t, q, v))

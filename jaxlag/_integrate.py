@@ -94,7 +94,7 @@ def _simulate(system, how, q0, qdot0, ts, params, tolerances):
     equations = Equations.of(system, q0, how.stabilisation, how.friction, how.audit, t0, q, v, params)
     solve = functools.partial(_motion, equations, how)
     if how.adjoint is None:
-        drift = lambda inputs, ts, ys: jax.vmap(lambda t, y: equations.rates(t, y, inputs[3:]))(ts, ys)
+        drift = lambda inputs, ts, ys: jax.vmap(lambda t, y: equations.rates(t, y, (inputs[3], None)))(ts, ys)
         forward, reverse = (functools.partial(solve, adjoint) for adjoint in (dfx.ForwardMode(), dfx.RecursiveCheckpointAdjoint()))
         run = differentiable(forward, reverse, drift, functools.partial(_varied_motion, equations, how))
     else:

@@ -32,11 +32,31 @@ class Kinks(NamedTuple):
     lifted: dict[str, Callable[..., Float[Array, ""]]]  # D of each term (t, q, v, λ, u), with u of length e
     element_of_row: np.ndarray
     rows_of_term: dict[str, np.ndarray]  # of each term with kinks
+    near_rest: Array | float = 0.0  # of a slip of several rows, how slow it is where it keeps its direction; per element
 
     @property
     def elements(self) -> int:
         """How many elements there are."""
         return int(self.element_of_row.max(initial=-1)) + 1
+
+    @property
+    def several(self) -> np.ndarray:
+        """Which elements have more than one row."""
+        return np.bincount(self.element_of_row) > 1
+
+    @property
+    def are_shared(self) -> bool:
+        """Whether elements of several rows may hold a load together."""
+        return self.elements > 1 and bool(np.any(self.several))
+
+    def sums(self, rows: Float[Array, " r"]) -> Float[Array, " e"]:
+        """Of each element's rows."""
+        return jnp.zeros(self.elements, rows.dtype).at[self.element_of_row].add(rows)
+
+    def norms(self, rows: Float[Array, " r"]) -> Float[Array, " e"]:
+        """Of each element's rows, with a zero derivative at zero."""
+        squared = self.sums(rows**2)
+        return jnp.where(squared > 0, jnp.sqrt(jnp.where(squared > 0, squared, 1)), 0)
 
     @property
     def own_rows(self) -> dict[str, np.ndarray]:

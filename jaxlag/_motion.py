@@ -22,7 +22,6 @@ from ._friction import (
     friction,
     friction_by_term,
     in_mode,
-    norms,
     redirected,
     settle,
     slip_of,
@@ -109,8 +108,9 @@ class Equations:
         structure, shapes = self.like
         return bind(self.system, jax.tree.unflatten(structure, [jax.ShapeDtypeStruct(*shape) for shape in shapes]), params)
 
-    def mode(self, t, q, v, sigma, params) -> tuple[Flat, Flat, Kinks | None]:
+    def mode(self, t, q, v, sigma, args) -> tuple[Flat, Flat, Kinks | None]:
         """The system, the system in the mode σ, and its kinks where there is dry friction."""
+        params, scales = args
         flat = self.flat(params)
         if isinstance(self.friction, StickSlip) and self.rows == 0:
             return flat, flat, None
@@ -118,6 +118,8 @@ class Equations:
         if isinstance(self.friction, Regularised):
             return flat, flat if kinks is None else self.friction.smooth(flat, kinks), None
         assert kinks is not None  # rows were counted from them
+        if scales is not None and np.any(kinks.several):
+            kinks = kinks._replace(near_rest=jnp.where(kinks.several, slip_of(kinks, t, q, v, jnp.full_like(v, scales.slow)), 0))
         return flat, in_mode(flat, kinks, sigma), kinks
 
     @property
@@ -145,7 +147,7 @@ class Equations:
 
     def start(self, t, q, v, params) -> Start:
         """y at the start, on the constraints already."""
-        flat, _, kinks = self.mode(t, q, v, jnp.zeros(self.rows, q.dtype), params)
+        flat, _, kinks = self.mode(t, q, v, jnp.zeros(self.rows, q.dtype), (params, None))
         works = jnp.zeros(len(self.works), q.dtype)
         if kinks is None:
             return Start(jnp.concatenate([q, v, works]), jnp.array(True), jnp.array(True))
@@ -155,11 +157,11 @@ class Equations:
 
     def rates(self, t, y, args):
         """ẏ."""
-        return _rates(self, t, y, args[0])
+        return _rates(self, t, y, args)
 
     def kept(self, t, y, args):
         """y, put back on the constraints."""
-        return _kept(self, t, y, args[0])
+        return _kept(self, t, y, args)
 
     def error_norm(self, error):
         """The size of an error."""
@@ -167,7 +169,7 @@ class Equations:
 
     def margins(self, t, y, args):
         """Per element of dry friction, how far its mode is from its end, negative beyond; and then its bound."""
-        return _margins(self, t, y, args[0])
+        return _margins(self, t, y, args)
 
     def changed(self, t, y, args, ended):
         """y in the mode that follows where the modes of the elements `ended` have; whether there is one; whether slip has come to rest."""
@@ -181,15 +183,15 @@ class Equations:
         """One sample, from y on the constraints."""
         rtol, atol = tolerances
         q, v, works, sigma, held, transitions, time_stuck = self.parts(y)
-        flat, _, kinks = self.mode(t, q, v, sigma, params)
+        flat, _, kinks = self.mode(t, q, v, sigma, (params, None))
         rubbing, counts, beyond = {}, {}, Beyond(jnp.zeros(0), jnp.zeros(0))
         if kinks is None:
-            qddot, multipliers, sound = _accelerated(self, t, y, params)
+            qddot, multipliers, sound = _accelerated(self, t, y, (params, None))
         else:
             found = friction(flat, kinks, sigma, t, q, v, self.stabilisation.feedback())
             qddot, multipliers, sound = found.qddot, found.multipliers, Sound(jnp.array(True), jnp.array(True))
             rubbing = friction_by_term(kinks, sigma, held > 0, t, q, v, found)
-            stuck, load = sticking(kinks, sigma), norms(kinks, found.force)
+            stuck, load = sticking(kinks, sigma), kinks.norms(found.force)
             scale = jnp.where(stuck, jnp.abs(found.bound) + load, slip_of(kinks, t, q, v, SLIGHT * (rtol * jnp.abs(v) + atol)))
             excess = jnp.where(held > 0, 0, -found.margin)
             beyond = Beyond(jnp.concatenate([excess, -found.bound]), jnp.concatenate([scale, jnp.abs(found.bound)]))
@@ -200,27 +202,27 @@ class Equations:
 
 
 @jitted  # so that diffrax's many calls trace it once
-def _accelerated(equations: Equations, t, y, params):
+def _accelerated(equations: Equations, t, y, args):
     q, v, _, sigma, *_ = equations.parts(y)
-    _, mode, _ = equations.mode(t, q, v, sigma, params)
+    _, mode, _ = equations.mode(t, q, v, sigma, args)
     feedback = equations.stabilisation.feedback()
     return scalarised(lambda t, q, v: constrained_acceleration(mode, t, q, v, feedback))(t, q, v)
 
 
 @jitted
-def _rates(equations: Equations, t, y, params):
+def _rates(equations: Equations, t, y, args):
     q, v, works, sigma, held, transitions, time_stuck = equations.parts(y)
-    _, mode, kinks = equations.mode(t, q, v, sigma, params)
-    qddot = _accelerated(equations, t, y, params).x
+    _, mode, kinks = equations.mode(t, q, v, sigma, args)
+    qddot = _accelerated(equations, t, y, args).x
     powers = listed_powers(mode, t, q, v) if equations.audit else works
     stuck = time_stuck if kinks is None else jnp.maximum(sticking(kinks, sigma).astype(y.dtype), held)
     return jnp.concatenate([v, qddot, powers, 0 * sigma, 0 * held, 0 * transitions, stuck])
 
 
 @jitted
-def _margins(equations: Equations, t, y, params):
+def _margins(equations: Equations, t, y, args):
     q, v, _, sigma, held, *_ = equations.parts(y)
-    flat, _, kinks = equations.mode(t, q, v, sigma, params)
+    flat, _, kinks = equations.mode(t, q, v, sigma, args)
     assert kinks is not None  # asked of systems with dry friction alone
     found = friction(flat, kinks, sigma, t, q, v)
     return jnp.concatenate([jnp.where(held > 0, 1, found.margin), found.bound])
@@ -228,12 +230,12 @@ def _margins(equations: Equations, t, y, params):
 
 @jitted
 def _changed(equations: Equations, t, y, args, ended):
-    params, scales = args
+    _, scales = args
     q, v, _, sigma, held, *_ = equations.parts(y)
-    flat, _, kinks = equations.mode(t, q, v, sigma, params)
+    flat, _, kinks = equations.mode(t, q, v, sigma, args)
     assert kinks is not None
     stuck = sticking(kinks, sigma) | (held > 0)
-    slow = norms(kinks, kinks.slip(t, q, v)) <= slip_of(kinks, t, q, v, scales.error(v))
+    slow = kinks.norms(kinks.slip(t, q, v)) <= slip_of(kinks, t, q, v, scales.error(v))
     mode = settle(flat, kinks, t, q, v, sigma, stuck | ended | slow, ended & stuck)
     y = in_other_mode(equations, kinks, y, mode)
     return equations.kept(t, y, args), mode.consistent, jnp.all(~ended | stuck | slow)
@@ -244,14 +246,14 @@ def in_other_mode(equations: Equations, kinks: Kinks, y, mode: Mode):
     q, v, works, sigma, held, transitions, time_stuck = equations.parts(y)
     of = kinks.element_of_row
     before, after = jnp.where((held > 0)[of], 0, sigma), jnp.where(mode.held[of], 0, mode.sigma)
-    changes = jnp.sum((norms(kinks, after - before) > 0.5) & (mode.bound != 0))
+    changes = jnp.sum((kinks.norms(after - before) > 0.5) & (mode.bound != 0))
     return jnp.concatenate([q, v, works, mode.sigma, mode.held.astype(y.dtype), transitions + changes, time_stuck])
 
 
 @jitted
-def _kept(equations: Equations, t, y, params):
+def _kept(equations: Equations, t, y, args):
     q, v, works, sigma, held, *counts = equations.parts(y)
-    _, mode, kinks = equations.mode(t, q, v, sigma, params)
+    _, mode, kinks = equations.mode(t, q, v, sigma, args)
     assert equations.projection is not None  # asked where there is something to keep
     projection = equations.projection
     on_q, on_v = scalarised(lambda t, q, v: projection.project(mode, t, q, v))(t, q, v)
@@ -284,6 +286,11 @@ class Scales(NamedTuple):
         rtol, atol = tolerances
         found = cls(rtol, atol, ts[-1] - ts[0], least_spacing(params, ts.dtype), jnp.finfo(ts.dtype).eps * end)
         return jax.lax.stop_gradient(found)
+
+    @property
+    def slow(self) -> Array:
+        """Of each velocity, what is so slow that the direction of a slip is not worth the many steps that it would take."""
+        return 1e3 * self.atol
 
     def error(self, v) -> Array:
         """Of each velocity, what the integration may be off by: so little slip counts as rest where another element changes its mode."""

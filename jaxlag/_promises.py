@@ -55,7 +55,7 @@ def _promises(equations: Equations, ts, ys, samples: Sample, params, tolerances)
 
 def _off(equations, t, y, params):
     q, v, _, sigma, *_ = equations.parts(y)
-    _, mode, _ = equations.mode(t, q, v, sigma, params)
+    _, mode, _ = equations.mode(t, q, v, sigma, (params, None))
     return off_constraints(mode, t, q, v)
 
 

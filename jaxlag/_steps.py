@@ -13,7 +13,7 @@ from equinox.internal import prevbefore
 from jaxtyping import Array, Float
 
 from ._compiled import jitted
-from ._friction import norms, settle, slip_of
+from ._friction import settle, slip_of
 from ._motion import Equations, in_other_mode
 from ._power import energy_turnover
 from ._signal import delayed
@@ -277,7 +277,7 @@ def behind_a_jump(equations: Equations, t, y, args):
     """
     params, scales = args
     q, v, works, sigma, *counts = equations.parts(y)
-    flat, _, kinks = equations.mode(t, q, v, sigma, params)
+    flat, _, kinks = equations.mode(t, q, v, sigma, args)
     if equations.audit:
         lift = energy_turnover(flat, t, q, v)[0] - energy_turnover(flat, prevbefore(prevbefore(t)), q, v)[0]
         works = works.at[equations.works.index(EXPLICIT_TIME)].add(lift)
@@ -287,7 +287,7 @@ def behind_a_jump(equations: Equations, t, y, args):
         return y, jnp.array(True)
     q, v, works, *_ = equations.parts(y)
     slip = kinks.slip(t, q, v)
-    size = norms(kinks, slip)
+    size = kinks.norms(slip)
     along = slip / jnp.where(size > 0, size, 1)[kinks.element_of_row]
     at_rest = size <= slip_of(kinks, t, q, v, scales.error(v))
     mode = settle(flat, kinks, t, q, v, along, at_rest, jnp.zeros_like(at_rest))

@@ -39,6 +39,7 @@ ORDER = [
     "_moduli",
     "_rewritten",
     "_kinks",
+    "_share",
     "_friction",
     "_acceleration",
     "_power",

@@ -7,7 +7,6 @@ import pytest
 
 import jaxlag as jl
 from jaxlag import dissipation
-from jaxlag._friction import norms
 from jaxlag._kinks import kinks_of
 from jaxlag._solve import How
 from jaxlag._system import bind
@@ -28,7 +27,7 @@ def read(D, v, params):
             return None
         (lifted,) = kinks.lifted.values()
         slip = lambda v: kinks.slip(*rest[:2], v)
-        force = -jax.grad(lambda v: lifted(*rest[:2], v, rest[3], norms(kinks, slip(v))))(flat_v)
+        force = -jax.grad(lambda v: lifted(*rest[:2], v, rest[3], kinks.norms(slip(v))))(flat_v)
         bounds = jax.grad(lifted, argnums=4)(*rest, jnp.zeros(kinks.elements))
         return force.reshape(v.shape), bounds, slip(flat_v)
 
