@@ -211,9 +211,14 @@ class StickSlip:
     Each kink μN|s| of D slips with the force −μN sign(s), sticks as a constraint s = 0 with a multiplier of its own while that is
     within ±μN, and the times at which it changes from one to the other are located to rounding and differentiated.
 
+    Where elements hold a load that they can share in more than one way, as the legs of a plate, they hold it as long as one way is
+    possible, and the motion is the same for all. The forces reported are then one of them: of slip velocities of several components that
+    which uses the most loaded element least, of others those of least norm until one is at its bound. They are not differentiated so.
+
     **Arguments:** `max_transitions`: changes of mode after which the motion is given up as chattering.
 
-    **Source:** Pfeiffer & Glocker, Multibody Dynamics with Unilateral Contacts, chapters 5 and 6.
+    **Source:** Pfeiffer & Glocker, Multibody Dynamics with Unilateral Contacts, chapters 5 and 6; of shares Moreau, Application of
+    convex analysis to some problems of dry friction (1979).
 
     ```python
     import jaxlag as jl

@@ -131,9 +131,11 @@ def _looks_ahead(solver) -> bool:
 
 
 def _nodes(solver) -> np.ndarray:
-    """The times of the stages of a step, from 0 to 1."""
+    """The times of the stages of a step, from 0 to 1, but for those that its dense output alone has."""
     tableau = getattr(solver, "tableau", None)
-    return np.linspace(0, 1, 5) if tableau is None else np.unique(np.clip([0.0, *tableau.c, 1.0], 0, 1))
+    if tableau is None:
+        return np.linspace(0, 1, 5)
+    return np.unique(np.clip([0.0, *tableau.c[: getattr(tableau, "stages", None)], 1.0], 0, 1))
 
 
 class TwoPieces(dfx.AbstractLocalInterpolation):
