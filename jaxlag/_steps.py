@@ -18,6 +18,7 @@ from ._motion import Equations, in_other_mode
 from ._power import energy_turnover
 from ._signal import delayed
 from ._system import EXPLICIT_TIME
+from ._tableaux import Tableau
 from ._watch import Seen, first_end, is_hidden
 
 NEWTON_STEPS = 3  # the first makes the time right and its derivative, the others its higher derivatives
@@ -131,11 +132,13 @@ def _looks_ahead(solver) -> bool:
 
 
 def _nodes(solver) -> np.ndarray:
-    """The times of the stages of a step, from 0 to 1, but for those that its dense output alone has."""
+    """The times, from 0 to 1, of the stages of a step that its error is estimated from."""
     tableau = getattr(solver, "tableau", None)
     if tableau is None:
         return np.linspace(0, 1, 5)
-    return np.unique(np.clip([0.0, *tableau.c[: getattr(tableau, "stages", None)], 1.0], 0, 1))
+    estimates = tableau.errors if isinstance(tableau, Tableau) else [tableau.b_error]
+    times = tableau.c if isinstance(tableau, Tableau) else [0.0, *tableau.c]
+    return np.unique(np.clip([c for weights in estimates for c, weight in zip(times, weights, strict=False) if weight], 0, 1))
 
 
 class TwoPieces(dfx.AbstractLocalInterpolation):

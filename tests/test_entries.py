@@ -9,6 +9,7 @@ import jax.scipy
 import numpy as np
 import pytest
 from jax import lax
+from operations import doubled_slope, tripled_slope
 
 import jaxlag as jl
 from jaxlag import _arithmetic
@@ -229,23 +230,6 @@ def test_single_precision_stays_single():
 
 
 # Derivatives.
-
-
-@jax.custom_jvp
-def doubled_slope(x):
-    """sin with twice its derivative, so that a rule that is lost shows."""
-    return jnp.sin(x)
-
-
-doubled_slope.defjvp(lambda primals, tangents: (doubled_slope(primals[0]), 2 * jnp.cos(primals[0]) * tangents[0]))
-
-
-@jax.custom_vjp
-def tripled_slope(x):
-    return jnp.sin(x)
-
-
-tripled_slope.defvjp(lambda x: (jnp.sin(x), x), lambda x, ct: (3 * jnp.cos(x) * ct,))
 
 
 def held_factor(x):
