@@ -41,6 +41,7 @@ def without_nan(low, high) -> Interval:
 
 
 def hull(*values) -> Interval:
+    """The least and the largest of some arrays."""
     return functools.reduce(jnp.minimum, values), functools.reduce(jnp.maximum, values)
 
 
@@ -138,9 +139,7 @@ def _chosen(_, which, *cases):
 
 def _contracted(params, x, y):
     """A product of matrices, by centres and radii."""
-    product = functools.partial(
-        jax.lax.dot_general, **{key: params[key] for key in ("dimension_numbers", "precision", "preferred_element_type")}
-    )
+    product = functools.partial(jax.lax.dot_general, **{key: params[key] for key in ("dimension_numbers", "precision")})
     (cx, rx), (cy, ry) = (((low + high) / 2, (high - low) / 2) for low, high in (x, y))
     centre, radius = product(cx, cy), product(jnp.abs(cx), ry) + product(rx, jnp.abs(cy)) + product(rx, ry)
     return centre - radius, centre + radius
@@ -150,7 +149,8 @@ def _looked_up(take, table, *indices):
     """Entries of a table whose numbers are not quite known: the extremes of what they may be, where these are few."""
     unsure = [high - low for low, high in indices if low is not high]
     windows = [[low + jnp.minimum(k, high - low).astype(low.dtype) for low, high in indices] for k in range(WINDOW)]
-    found = hull(*(take(x, *window) for window in windows for x in ({id(x): x for x in table}.values())))
+    tables = table[:1] if table[0] is table[1] else table
+    found = hull(*(take(x, *window) for window in windows for x in tables))
     few = jnp.all(jnp.stack([jnp.all(width < WINDOW) for width in unsure])) if unsure else True
     return _known(few if len(unsure) <= 1 else False, *found)
 
@@ -164,7 +164,7 @@ def _gathered(params, table, index):
 def _scattered(params, x, index, updates):
     """What is added to entries in known places."""
     ends = [jax.lax.scatter_add_p.bind(*end, **params) for end in zip(x, index, updates, strict=True)]
-    return _known(index[0] is index[1], *ends)
+    return _known(index[0] is index[1] and jnp.issubdtype(x[0].dtype, jnp.floating), *ends)  # integers may begin anew
 
 
 def _sliced(params, table, *starts):
@@ -210,5 +210,5 @@ RISING = MOVING | {
     "atanh", "asin", "atan", "erf", "logistic", "floor", "ceil", "round", "sign", "and", "or",
 }  # fmt: skip
 FALLING = {"neg", "rsqrt", "acos", "erfc", "not"}
-ARITHMETIC = {"add", "add_any", "sub", "mul", "neg", "div", "abs", "square", "integer_pow", "reduce_sum", "cumsum"}
+ARITHMETIC = {"add", "add_any", "sub", "mul", "neg", "div", "abs", "square", "integer_pow", "pow", "reduce_sum", "cumsum", "dot_general"}
 LOGICAL = {"and", "or", "not", "reduce_and", "reduce_or"}  # of other integers they are neither rising nor falling

@@ -193,7 +193,7 @@ def _inverse(S: Float[Array, "m m"], c: Float[Array, "m k"], singular: Callable)
         D = jnp.where(size > 0, 1 / jnp.where(size > 0, size, 1), 0)
         return Inverse(jnp.array(True), D, S, S), jnp.all((size > 0)[:, None] | (c == 0))
     there = size > (4 * eps) ** 2 * jnp.max(size)  # a row of nothing but rounding has no part in it
-    D = jnp.where(there, 1 / jnp.sqrt(jnp.where(there, size, 1)), 0)
+    D = jnp.where(there, jax.lax.rsqrt(jnp.where(there, size, 1)), 0)
     nearly_zero = jnp.abs(c) <= eps**FOLLOWS * jnp.max(jnp.abs(c), axis=0, keepdims=True)
     follows = jnp.all(there[:, None] | nearly_zero)
     one, nothing = jnp.eye(m, dtype=S.dtype), jnp.zeros_like(S)

@@ -44,6 +44,7 @@ LOADS = {
     "rows of a table": lambda t: jnp.sum(jnp.asarray(A)[jnp.clip(t, 0, 2).astype(int)] * t),
     "a slice": lambda t: jax.lax.dynamic_slice(jnp.asarray(VALUES), (jnp.floor(3 * t).astype(int),), (3,)) @ jnp.ones(3),
     "matrices": lambda t: jnp.sum(jnp.asarray(A) @ jnp.stack([t, t**2, jnp.sin(t)]) ** 2),
+    "matrices of integers": lambda t: jnp.sum(jnp.arange(6).reshape(2, 3) @ (jnp.stack([3 * t, -t, 5 * t]).astype(int))) * 1.0,
     "sums": lambda t: jnp.cumsum(jnp.stack([t, -t, t**2]))[1] + jnp.zeros(3).at[jnp.array([0, 2, 0])].add(t)[0],
     "an order": lambda t: jnp.sort(jnp.stack([t, 1 - t, t**2]))[1],
     "an angle": lambda t: jnp.arctan2(t, 1 - t),
