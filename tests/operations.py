@@ -28,9 +28,9 @@ def gathered(x, indices, mode=None):
     return lax.gather(x, np.asarray(indices)[:, None], how, (1, 2), mode=mode)
 
 
-def scattering(function, **more):
+def scattering(function, places=(2, 0, 2), **more):
     how = lax.ScatterDimensionNumbers(update_window_dims=(), inserted_window_dims=(0,), scatter_dims_to_operand_dims=(0,))
-    return lambda x, y: function(x, np.array([[2], [0], [2]]), y, how, **more)
+    return lambda x, y: function(x, np.array(places)[:, None], y, how, **more)
 
 
 @jax.custom_jvp
@@ -200,7 +200,7 @@ OPERATIONS = [
         "fv,fv",
         scatter=scattering(lax.scatter),
         scatter_add=scattering(lax.scatter_add),
-        scatter_mul=scattering(lax.scatter_mul, unique_indices=True),
+        scatter_mul=scattering(lax.scatter_mul, (2, 0, 1), unique_indices=True),
     ),
     *on("fv,fv", scatter_min=scattering(lax.scatter_min), scatter_max=scattering(lax.scatter_max), scatter_sub=scattering(lax.scatter_sub)),
     *on("iv,iv", scatter=scattering(lax.scatter), scatter_add=scattering(lax.scatter_add), scatter_mul=scattering(lax.scatter_mul)),
