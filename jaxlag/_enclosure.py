@@ -65,6 +65,7 @@ def of_time(function: Callable, t: Array, y: Array) -> OfTime | None:
     return OfTime(phi, bounds, rest, all(_is_known(step.equation) for step in early if by_t.intersection(step.results)))
 
 
+TURNS = 100  # of a loop that is followed; a search in a table takes twenty for a million entries
 T, Y = 0, 1  # the numbers of the arguments among all quantities
 
 
@@ -133,9 +134,9 @@ def _enclosed(equation, operands: list[Interval]) -> list[Interval]:
         return [(x, x) for x in on_arrays(equation)(*(low for low, _ in operands))]
     if name in PROGRAMS:
         return _through(body(equation), operands)
-    if name in LOOPS:
+    if name in LOOPS and params.get("length", 1) <= TURNS:
         return LOOPS[name](params, operands)
-    if not _is_known(equation):
+    if name in LOOPS or not _is_known(equation):
         return [anything(variable.aval) for variable in equation.outvars]
     kind = equation.outvars[0].aval.dtype
     if name in ARITHMETIC and jnp.issubdtype(kind, jnp.integer):
@@ -196,7 +197,9 @@ def _is_known(equation) -> bool:
     if name in PROGRAMS:
         return all(map(_is_known, body(equation).jaxpr.eqns))
     if name in LOOPS:
-        return all(_is_known(step) for inner in params.get("branches", [params.get("jaxpr")]) for step in inner.jaxpr.eqns)
+        return params.get("length", 1) <= TURNS and all(
+            _is_known(step) for inner in params.get("branches", [params.get("jaxpr")]) for step in inner.jaxpr.eqns
+        )
     if any(is_extended(x) or jnp.issubdtype(x.aval.dtype, jnp.complexfloating) for x in (*equation.invars, *equation.outvars)):
         return False
     if name in LOGICAL:

@@ -119,7 +119,8 @@ class Equations:
             return flat, flat if kinks is None else self.friction.smooth(flat, kinks), None
         assert kinks is not None  # rows were counted from them
         if scales is not None and np.any(kinks.several):
-            kinks = kinks._replace(near_rest=jnp.where(kinks.several, slip_of(kinks, t, q, v, jnp.full_like(v, scales.slow)), 0))
+            slow = slip_of(kinks, t, q, v, jnp.full_like(v, scales.slow))
+            kinks = kinks._replace(near_rest=jax.lax.stop_gradient(jnp.where(kinks.several, slow, 0)))
         return flat, in_mode(flat, kinks, sigma), kinks
 
     @property
@@ -289,8 +290,11 @@ class Scales(NamedTuple):
 
     @property
     def slow(self) -> Array:
-        """Of each velocity, what is so slow that the direction of a slip is not worth the many steps that it would take."""
-        return 1e3 * self.atol
+        """Of each velocity, what is so slow that the direction of a slip is not worth the many steps that it would take.
+
+        Where elements begin to slide together, a velocity may be off by so much.
+        """
+        return 1e2 * self.atol
 
     def error(self, v) -> Array:
         """Of each velocity, what the integration may be off by: so little slip counts as rest where another element changes its mode."""
