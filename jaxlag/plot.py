@@ -4,12 +4,12 @@ from typing import Any
 
 import numpy as np
 
-from ._canvas import COLOURS as COLOURS
-from ._canvas import pyplot
-from ._equations import Equations
-from ._plot_fit import convergence, fit, parameters
-from ._plot_forces import forces, friction
-from ._plot_motion import balance, energy, motion, phase
+from ._draw.axes import COLOURS as COLOURS
+from ._draw.axes import pyplot
+from ._draw.fit import convergence, fit, parameters
+from ._draw.forces import forces, friction
+from ._draw.motion import balance, energy, motion, phase
+from ._paper.equations import Equations
 
 __all__ = ["balance", "convergence", "energy", "equations", "fit", "forces", "friction", "motion", "parameters", "phase"]
 

@@ -1,6 +1,6 @@
 """Tests run in double precision, with strict ranks and every shape annotation checked.
 
-They are compiled as README advises for a CPU, in two thirds of the time; `test_compiled` compares with the compiler's default.
+They are compiled as README advises for a CPU, in two thirds of the time; `program/test_jit` compares with the compiler's default.
 """
 
 import os

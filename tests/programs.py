@@ -16,11 +16,11 @@ import jax.numpy as jnp
 import numpy as np
 from operations import OPERATIONS, SHAPES
 
-from jaxlag import _scalarised
-from jaxlag._arithmetic import KNOWN, folded
-from jaxlag._entries import Reader, opened
-from jaxlag._folding import TooLong, UnknownPrimitive, filled
-from jaxlag._primitives import CALLS, RULED, body, primitives
+from jaxlag._program import scalarise
+from jaxlag._program.constants import KNOWN, folded
+from jaxlag._program.interpreter import Reader, opened
+from jaxlag._program.rules import CALLS, RULED, body, primitives
+from jaxlag._program.scalar_graph import TooLong, UnknownPrimitive, filled
 
 SIZE = 3  # of x and of v
 LIMIT = 5000
@@ -103,7 +103,7 @@ def once(equation, *operands):
 # The rewritten one.
 
 
-class OnNumbers(type(_scalarised.JAX_ALGEBRA)):
+class OnNumbers(type(scalarise.JAX_ALGEBRA)):
     """What production takes apart, on NumPy's scalars."""
 
     def function(self, primitive, params, dtype):
@@ -293,7 +293,7 @@ def compared(seed):
     found, other = rewritten(closed, x, v)
     error = differs(found, functools.partial(plain, closed), x, v, single)
     if other and not error and seed % 8 == 0:  # derivatives of the rewritten program itself, as production makes it
-        written_out, one = _scalarised._written_out(FORMS[form](run), LIMIT), np.ones(SIZE)
+        written_out, one = scalarise._written_out(FORMS[form](run), LIMIT), np.ones(SIZE)
         along = lambda f: lambda x, v: jax.jvp(f, (x, v), (one, -one))[1]
         closed = traced(along(FORMS[form](run)), x, v)
         if closed is not None:

@@ -3,14 +3,13 @@
 import functools
 import inspect
 import re
-import sys
 import warnings
-from pathlib import Path
 from typing import NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import make_stribeck
 import numpy as np
 import optax
 import pytest
@@ -18,12 +17,9 @@ from jax.flatten_util import ravel_pytree
 from scipy.optimize import isotonic_regression
 
 import jaxlag as jl
-from jaxlag._sensitivities import FORWARD_LIMIT
+from jaxlag._motion.derivative_rule import FORWARD_LIMIT
 from jaxlag.examples import stribeck
 from jaxlag.learnt import ConvexDissipation, ConvexPotential, PassiveDissipation, Potential
-
-sys.path.insert(0, str(Path(__file__).parent / "data"))
-import make_stribeck
 
 DISSIPATIONS = (ConvexDissipation, PassiveDissipation)
 CLASSES = (*DISSIPATIONS, Potential, ConvexPotential)

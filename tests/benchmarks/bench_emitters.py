@@ -1,6 +1,6 @@
 """What XLA's two ways to make its CPU kernels cost: seconds to compile, and each further call.
 
-By default each kernel is made by a compiler of its own (MLIR). `jaxlag._compiled` takes the emitters from before it where Python calls
+By default each kernel is made by a compiler of its own (MLIR). `jaxlag._program.jit` takes the emitters from before it where Python calls
 a program of this package; here both compile the same programs.
 Run: python tests/benchmarks/bench_emitters.py
 """

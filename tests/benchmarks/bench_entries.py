@@ -25,9 +25,9 @@ import jax.numpy as jnp
 import numpy as np
 
 import jaxlag as jl
-from jaxlag._multipliers import constrained_acceleration
-from jaxlag._scalarised import scalarised
-from jaxlag._system import bind
+from jaxlag._mechanics.saddle_point import constrained_acceleration
+from jaxlag._model.system import bind
+from jaxlag._program.scalarise import scalarised
 from jaxlag.examples import vehicle
 
 GRAVITY = 9.81

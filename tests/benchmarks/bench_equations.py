@@ -20,7 +20,7 @@ def here(n):
     import sympy
 
     import jaxlag as jl
-    from jaxlag import _derivation, _notation, _statement, _symbols, _tidy  # noqa: F401
+    from jaxlag._paper import derivation, printers, simplify, symbolic_system, to_sympy  # noqa: F401
 
     system = jl.System(chain)
     start = time.perf_counter()

@@ -1,6 +1,6 @@
 """Where reverse mode overtakes the one forward pass: value and gradient of a motion with p parameters, both ways.
 
-Four oscillators, whose stiffnesses are mixed from p parameters. The crossing sets FORWARD_LIMIT in jaxlag/_sensitivities.py.
+Four oscillators, whose stiffnesses are mixed from p parameters. The crossing sets FORWARD_LIMIT in jaxlag/_motion/derivative_rule.py.
 Run: python tests/benchmarks/bench_gradient.py
 """
 
@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from timing import medians, once
 
 import jaxlag as jl
-from jaxlag import _sensitivities
+from jaxlag._motion import derivative_rule
 
 jax.config.update("jax_enable_x64", True)
 oscillators = jl.System(lambda q, qdot, c, mix: 0.5 * qdot @ qdot - 0.5 * (4 + mix @ c) @ q**2)
@@ -18,7 +18,7 @@ TS = jnp.linspace(0, 5, 100)
 
 def seconds(p, limit):
     """Compilation, and one evaluation (median)."""
-    _sensitivities.FORWARD_LIMIT = limit
+    derivative_rule.FORWARD_LIMIT = limit
     jax.clear_caches()
     q0 = jnp.ones(4)
     spread = jnp.linspace(0.5, 1.5, 4 * p).reshape(4, p) / p

@@ -15,7 +15,6 @@ from bench_first_use import CODES
 from timing import medians, once
 
 import jaxlag as jl
-from jaxlag import _identify
 from jaxlag.examples import vehicle
 
 jax.config.update("jax_enable_x64", True)
@@ -36,7 +35,7 @@ def of_a_fit(repeats=50):
     fit = lambda: jl.fit(vehicle.system, experiment, start, free=("b", "c", "k"))
     fit()
     parts = {"stating the problem": "_stated", "residuals with Jacobian": "linearise", "report": "report"}
-    spent, calls, before = dict.fromkeys(parts, 0.0), dict.fromkeys(parts, 0), {name: getattr(_identify, name) for name in parts.values()}
+    spent, calls, before = dict.fromkeys(parts, 0.0), dict.fromkeys(parts, 0), {name: getattr(fit, name) for name in parts.values()}
 
     def counted(part, function):
         def run(*given, **named):
@@ -49,13 +48,13 @@ def of_a_fit(repeats=50):
         return run
 
     for part, name in parts.items():
-        setattr(_identify, name, counted(part, before[name]))
+        setattr(fit, name, counted(part, before[name]))
     begin = time.perf_counter()
     for _ in range(repeats):
         fit()
     whole = time.perf_counter() - begin
     for name, function in before.items():
-        setattr(_identify, name, function)
+        setattr(fit, name, function)
     shares = {f"{part}, {calls[part] // repeats} times": seconds for part, seconds in spent.items()}
     shares["iteration between them, and the rest"] = whole - sum(spent.values())
     return {part: seconds / repeats for part, seconds in shares.items()}

@@ -1,0 +1,191 @@
+"""Pictures of an identification: the fit against what was measured, the parameters, and how it converged."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from .._fit.result import Fit, plus_minus
+from .axes import GREY, Units, canvas, channels, chosen, colour, label, legend_above, legend_beside, panels
+
+READABLE = 40  # parameters in one picture
+WRITTEN = 8  # up to which correlations are written out
+
+
+def fit(fit: Fit, *, number: int = 0, level: float = 0.95, units: Units = None, axes: Any = None) -> Any:
+    r"""What was measured with the fitted motion and its confidence band, and below it what is left: one column for each channel.
+
+    $$ \hat z_i = h(t_i, q(t_i; \hat\theta), \dot q(t_i; \hat\theta)) \pm t\,\mathrm{se}(\hat z_i), \qquad r_i = z_i - \hat z_i,
+       \qquad |r_i| < 2\sigma $$
+
+    The band of the fit says how far its uncertain parameters and starts let the motion be off; it is often thinner than the line.
+    The band of the residuals is ±2σ, with the sigma of the experiment where one was given and the estimated one where not. Of
+    residuals that are noise, 95 % lie in it, without any pattern; a pattern is motion that the model has not.
+
+    **Arguments:**
+
+    - `fit`: what `jaxlag.fit` returned.
+    - `number`: which of the experiments of the fit to draw.
+    - `level`: of the confidence band.
+    - `units`: units by name of channel, and of `"t"`, to be written on the axes. A recording that is one array is named `"z"`.
+    - `axes`: matplotlib axes to draw in, 2 × number of channels. Default: a new figure.
+
+    **Returns:** the axes, an array of shape (2, channels).
+
+    **Raises:** `ValueError` where `axes` do not fit the channels, `ImportError` without matplotlib.
+
+    **Source:** Ljung, System Identification, 2nd ed., section 16.6 (residual analysis); Seber & Wild, Nonlinear Regression (1989),
+    section 5.1 (the band).
+
+    ```python
+    import jaxlag as jl
+    from jaxlag import plot
+    from jaxlag.examples import vehicle
+    record = jl.Experiment.from_csv(vehicle.recording, vehicle.q0, vehicle.qdot0, time="t", observe=vehicle.observe)
+    fit = jl.fit(vehicle.system, record, vehicle.params | {"b": 4000.0, "c": 30000.0}, free=("b", "c", "k"))
+    axes = plot.fit(fit, units={"t": "s", "y": "m", "phi": "rad", "xdot": "m/s"})
+    axes.shape  # (2, 3)
+    ```
+    """
+    experiment = fit.experiments[number]
+    sigma = experiment.sigma
+    if sigma is None:
+        sigma = jax.tree.map(lambda value: np.full(value.shape, fit.sigma), experiment.values)
+    trees = (experiment.values, fit.predictions[number], fit.band(number, level)[1], fit.residuals[number], sigma)
+    measured, fitted, upmost, residuals, sigma = (channels(tree, "z") for tree in trees)
+    ts = np.asarray(experiment.ts)
+
+    size = (max(5.0, 3.6 * len(measured)), 4.8)
+    drawn = panels(axes, (2, len(measured)), "two for each channel", figsize=size, height_ratios=(3, 2))
+    for (upper, lower), (name, entries) in zip(drawn.T, measured.items(), strict=True):
+        several = len(entries) > 1
+        for i, (entry, z) in enumerate(entries.items()):
+            model, noise = fitted[name][entry], 2 * sigma[name][entry]
+            upper.plot(ts, z, ".", color=GREY, markersize=3, label=None if i else "measured")
+            upper.plot(ts, model, color=colour(i), label=f"{entry} fitted" if several else "fitted")
+            reach = upmost[name][entry] - model
+            known = np.isfinite(reach)
+            if known.any():
+                reach = np.interp(ts, ts[known], reach[known])  # where a sample is missing, from its neighbours
+                said = None if i else f"{100 * level:g} % confidence"
+                upper.fill_between(ts, model - reach, model + reach, color=colour(i), alpha=0.3, linewidth=0, label=said)
+            lower.fill_between(ts, -noise, noise, color=GREY, alpha=0.3 / len(entries), linewidth=0)
+            lower.plot(ts, residuals[name][entry], ".", color=colour(i), markersize=3)
+        upper.set_ylabel(label(name, units))
+        if several:
+            legend_beside(upper)
+        elif upper is drawn[0, 0]:
+            legend_above(upper)
+        lower.set_ylabel("residual, ±2σ" + label(name, units).removeprefix(name))
+        lower.set_xlabel(label("t", units))
+    return drawn
+
+
+def parameters(fit: Fit, names: Sequence[str] | None = None, *, axes: Any = None) -> Any:
+    r"""Estimates with their errors in percent of the value, so that all units fit in one picture, and the matrix of correlations.
+
+    $$ \frac{\mathrm{se}(\hat\theta_i)}{|\hat\theta_i|}, \qquad
+       \rho_{ij} = \frac{\mathrm{cov}_{ij}}{\sqrt{\mathrm{cov}_{ii}\,\mathrm{cov}_{jj}}} $$
+
+    The thick bar is one standard error to either side, the thin one the 95 % interval. Two parameters of correlation near ±1 are
+    told apart by these measurements only badly: blue is +1, red is −1; of many parameters, those of more than ½ have a sign.
+
+    **Arguments:**
+
+    - `fit`: what `jaxlag.fit` returned.
+    - `names`: the parameters to be drawn, entries of `fit.names`, at most 40. Default: all.
+    - `axes`: two matplotlib axes to draw in. Default: a new figure.
+
+    **Returns:** the axes, an array of shape (2,).
+
+    **Raises:** `ValueError` where `names` name no parameters or too many, or `axes` are not two; `ImportError` without matplotlib.
+
+    **Source:** Seber & Wild, Nonlinear Regression (1989), section 5.1.
+
+    ```python
+    import jaxlag as jl
+    from jaxlag import plot
+    from jaxlag.examples import vehicle
+    record = jl.Experiment.from_csv(vehicle.recording, vehicle.q0, vehicle.qdot0, time="t", observe=vehicle.observe)
+    fit = jl.fit(vehicle.system, record, vehicle.params | {"b": 4000.0, "c": 30000.0}, free=("b", "c", "k"))
+    plot.parameters(fit)
+    ```
+    """
+    names = chosen(names, fit.names, "fitted parameters")
+    if not 0 < len(names) <= READABLE:
+        raise ValueError(f"`names` must be between 1 and {READABLE}, to be readable, but are {len(names)}. Choose among `fit.names`.")
+    at = [fit.names.index(name) for name in names]
+    values = np.asarray(fit.problem.free.theta(jnp.asarray(fit.x[: len(fit.names)])))[at]
+    errors, correlation = np.sqrt(np.diag(fit.covariance))[at], fit.correlation[np.ix_(at, at)]
+    height = 1.6 + 0.45 * len(names)
+    size = (4.8 + height, height)
+    bars, matrix = panels(axes, (1, 2), "for errors and correlations", sharex=False, figsize=size, width_ratios=(4.8, height))[0]
+
+    rows = np.arange(len(names))
+    percent = np.where(np.isfinite(errors) & (values != 0), 100 * errors / np.abs(np.where(values == 0, 1, values)), np.nan)
+    known = np.isfinite(percent)
+    for width, reach in ((1.5, fit._quantile(0.95)), (6.0, 1.0)):
+        bars.hlines(rows[known], -reach * percent[known], reach * percent[known], color=colour(0), linewidth=width)
+    bars.plot(0 * rows[known], rows[known], "o", color="white", markeredgecolor=colour(0), markersize=5)
+    bars.set_yticks(rows, [f"{name}\n{_spoken(*pair)}" for name, *pair in zip(names, values, errors, strict=True)])
+    bars.set_ylim(len(names) - 0.5, -0.5)
+    bars.set_xlabel("standard error and 95 % interval (% of the value)")
+    bars.grid(axis="x", alpha=0.4)
+
+    image = matrix.imshow(np.where(np.isfinite(correlation), correlation, 0), cmap="coolwarm_r", vmin=-1, vmax=1)
+    matrix.set_xticks(rows, names, rotation=90 if max(map(len, names)) > 4 else 0)
+    matrix.set_yticks(rows, names)
+    matrix.set_title("correlation", fontsize="medium")
+    for (i, j), rho in np.ndenumerate(correlation):
+        sign = "+−"[int(rho < 0)] if abs(rho) > 0.5 else ""
+        said = sign if len(names) > WRITTEN else f"{rho:+.2f}" if np.isfinite(rho) else "–"
+        matrix.text(j, i, said, ha="center", va="center", fontsize="small", color="white" if abs(rho) > 0.7 else "black")
+    if len(names) > WRITTEN:
+        matrix.figure.colorbar(image, ax=matrix)
+    return np.array([bars, matrix])
+
+
+def convergence(fit: Fit, *, ax: Any = None) -> Any:
+    r"""The cost of a fit after each of its steps.
+
+    $$ \tfrac12\sum_i \left(\frac{r_i}{\sigma_i}\right)^2 $$
+
+    The first is that of the start. It can rise where the problem itself is changed on the way: where the weight of gaps between
+    pieces (`pieces=`) grows, and where the scale of a robust loss is estimated anew.
+
+    **Arguments:** `fit`: what `jaxlag.fit` returned; `ax`: matplotlib axes to draw in. Default: a new figure.
+
+    **Returns:** the axes.
+
+    **Raises:** `ImportError` without matplotlib.
+
+    **Source:** Nocedal & Wright, Numerical Optimization, section 10.3.
+
+    ```python
+    import jaxlag as jl
+    from jaxlag import plot
+    from jaxlag.examples import vehicle
+    record = jl.Experiment.from_csv(vehicle.recording, vehicle.q0, vehicle.qdot0, time="t", observe=vehicle.observe)
+    fit = jl.fit(vehicle.system, record, vehicle.params | {"b": 4000.0, "c": 30000.0}, free=("b", "c", "k"))
+    plot.convergence(fit)
+    ```
+    """
+    costs = np.asarray(fit.costs)
+    ax = canvas(ax, figsize=(5.4, 3.4))
+    ax.plot(costs, color=colour(0), marker="o" if costs.size < 60 else None, markersize=4)
+    if np.all(costs > 0):
+        ax.set_yscale("log")
+    ax.xaxis.get_major_locator().set_params(integer=True)
+    ax.set_xlabel("step")
+    ax.set_ylabel("cost ½ Σ (r/σ)²")
+    ax.set_title(f"converged after {fit.steps} steps" if fit.converged else fit.reason, fontsize="medium")
+    return ax
+
+
+def _spoken(value, error):
+    """The estimate in words."""
+    if np.isfinite(error):
+        return plus_minus(value, error)
+    return "not determined" if np.isinf(error) else f"{value:.4g}"

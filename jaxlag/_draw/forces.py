@@ -1,0 +1,155 @@
+"""Pictures of the forces along one motion: those of constraints, and dry friction."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from .._motion.trajectory import Trajectory
+from .axes import (
+    COLOURS,
+    GREY,
+    Units,
+    channels,
+    chosen,
+    colour,
+    curve,
+    label,
+    legend_above,
+    legend_beside,
+    one_motion,
+    over_time,
+    panels,
+    zero_line,
+)
+
+
+def forces(trajectory: Trajectory, names: Sequence[str] | None = None, *, units: Units = None, axes: Any = None) -> Any:
+    r"""The multipliers λ over time, one panel for each constraint, with a ring wherever one changes its sign.
+
+    Of a constraint that `System` was told to be `one_sided`, the times at which it would have to pull are shaded.
+
+    $$ M\ddot q = f + G^T\lambda $$
+
+    λ > 0 pushes along +∇g: the tension of a rod or a string with g = r − l is −λ, so it goes slack where λ becomes positive. A multiplier
+    is a force where g is a length, and a moment where g is an angle.
+
+    **Arguments:**
+
+    - `trajectory`: one motion, as `simulate` returns it.
+    - `names`: the constraints to be drawn, in this order. Default: all.
+    - `units`: units by name of constraint, and of `"t"`, to be written on the axes, e.g. `{"t": "s", "rod": "N"}`.
+    - `axes`: matplotlib axes to draw in, as many as there are constraints. Default: a new figure with a common time axis.
+
+    **Returns:** the axes, an array, one for each constraint.
+
+    **Raises:** `ValueError` where there are no constraints, or `names` or `axes` do not fit them; `ImportError` without matplotlib.
+
+    **Source:** Goldstein, Classical Mechanics, 3rd ed., section 2.4.
+
+    ```python
+    import jax.numpy as jnp
+    import jaxlag as jl
+    from jaxlag import plot
+    from jaxlag.examples import pendulum
+    start = pendulum.cartesian_state(2.0, 0.0, 1.0)
+    trajectory = jl.simulate(pendulum.cartesian, *start, jnp.linspace(0.0, 2.0, 101), pendulum.params)
+    (ax,) = plot.forces(trajectory, units={"t": "s", "rod": "N"})
+    ax.get_ylabel()  # λ rod (N)
+    ```
+    """
+    multipliers = channels(one_motion(trajectory).multipliers, "λ")
+    if not multipliers:
+        raise ValueError(
+            "`trajectory` must be of a system with constraints, but it has none. State them by `System(..., holonomic=...)`, "
+            "or draw its coordinates by `plot.motion`."
+        )
+    names = chosen(names, tuple(multipliers), "constraints")
+    shown = {name: multipliers[name] for name in names}
+    drawn = over_time(trajectory.ts, shown, [f"λ {name}" for name in names], "one for each constraint", units, axes)
+    pulling = channels(trajectory.pulling(), "λ")
+    for ax, (name, entries) in zip(drawn, shown.items(), strict=True):
+        zero_line(ax)
+        pulled = [x for row in pulling.get(name, {}).values() for x in _intervals(np.asarray(trajectory.ts), row)]
+        for i, interval in enumerate(pulled):
+            ax.axvspan(*interval, color=COLOURS[1], alpha=0.25, linewidth=0, label=None if i else "would have to pull")
+        crossings = np.concatenate([_sign_changes(np.asarray(trajectory.ts), samples) for samples in entries.values()])
+        if crossings.size:
+            ax.plot(crossings, 0 * crossings, "o", markerfacecolor="white", markeredgecolor="black", label="λ changes its sign")
+        if crossings.size or pulled:
+            if len(entries) == 1:
+                ax.lines[0].set_label(None)
+                legend_above(ax)
+            else:
+                legend_beside(ax)
+    return drawn
+
+
+def friction(trajectory: Trajectory, names: Sequence[str] | None = None, *, units: Units = None, axes: Any = None) -> Any:
+    r"""Dry friction over time: the slip velocity and below it the force, one column for each term; where it sticks is shaded.
+
+    $$ F = -\mu N\,\frac{s}{|s|} \ (s \neq 0), \qquad |F| \le \mu N \ (s = 0) $$
+
+    **Arguments:**
+
+    - `trajectory`: one motion with dry friction, as `simulate` returns it.
+    - `names`: the dissipation terms to be drawn. Default: all that have a kink.
+    - `units`: units of `"t"`, of `"slip"`, and of the force by the name of the term, e.g. `{"t": "s", "slip": "m/s", "brake": "N"}`.
+    - `axes`: matplotlib axes to draw in, 2 × number of terms. Default: a new figure with a common time axis.
+
+    **Returns:** the axes, an array of shape (2, terms).
+
+    **Raises:** `ValueError` where there is no dry friction, or `names` or `axes` do not fit it; `ImportError` without matplotlib.
+
+    **Source:** Pfeiffer & Glocker, Multibody Dynamics with Unilateral Contacts, chapter 5.
+
+    ```python
+    import jax.numpy as jnp
+    import jaxlag as jl
+    from jaxlag import plot
+    block = jl.System(lambda q, qdot: 0.5 * qdot**2 - 2.0 * q**2, dissipation={"dry": lambda qdot: 0.3 * jnp.abs(qdot)})
+    trajectory = jl.simulate(block, 1.0, 0.0, jnp.linspace(0.0, 14.0, 201))
+    plot.friction(trajectory, units={"t": "s", "slip": "m/s", "dry": "N"})
+    ```
+    """
+    if not one_motion(trajectory).friction:
+        raise ValueError(
+            "`trajectory` must have dry friction that sticks and slips, but has none. Write it with a kink, e.g. `F * jnp.abs(qdot)`, "
+            "and simulate with `friction=StickSlip()`, which is the default."
+        )
+    names = chosen(names, tuple(trajectory.friction), "dissipation terms with dry friction")
+    slip = channels(trajectory.slip(), "")
+    force = channels({name: rubbing.force for name, rubbing in trajectory.friction.items()}, "")
+    drawn = panels(axes, (2, len(names)), "two for each term", figsize=(max(6.4, 4.2 * len(names)), 4.6))
+    for (upper, lower), name in zip(drawn.T, names, strict=True):
+        for ax, entries in ((upper, slip[name]), (lower, force[name])):
+            zero_line(ax)
+            for i, (entry, samples) in enumerate(entries.items()):
+                curve(ax, trajectory.ts, samples, color=colour(i), label=entry)
+            stuck = np.reshape(trajectory.friction[name].sticking, (trajectory.ts.size, -1)).T
+            intervals = [interval for row in stuck for interval in _intervals(np.asarray(trajectory.ts), row)]
+            for i, (start, end) in enumerate(intervals):
+                ax.axvspan(start, end, color=GREY, alpha=0.35 / len(stuck), linewidth=0, label=None if i else "sticks")
+        upper.set_ylabel(label(f"slip {name}", units, "slip"))
+        lower.set_ylabel(label(f"force {name}", units, name))
+        lower.set_xlabel(label("t", units))
+        several = len(slip[name]) > 1
+        if not several:
+            upper.lines[-1].set_label(None)
+        if several or intervals:
+            legend_above(upper)
+    return drawn
+
+
+def _sign_changes(ts, samples):
+    """The times at which the straight lines between samples cross zero."""
+    before, after = samples[:-1], samples[1:]
+    at = np.flatnonzero(before * after < 0)
+    return ts[at] + (ts[at + 1] - ts[at]) * before[at] / (before[at] - after[at])
+
+
+def _intervals(ts, sticking):
+    """Begin and end of each run of samples that stick, half a sample wider on either side."""
+    edges = np.concatenate([ts[:1], (ts[1:] + ts[:-1]) / 2, ts[-1:]])
+    steps = np.diff(np.concatenate([[0], np.asarray(sticking, int), [0]]))
+    return list(zip(edges[np.flatnonzero(steps == 1)], edges[np.flatnonzero(steps == -1)], strict=True))

@@ -1,0 +1,223 @@
+"""Pictures of one motion: coordinates, phase portrait, energy and where it goes."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from .._motion.trajectory import Trajectory, energies
+from .axes import (
+    GREY,
+    Units,
+    canvas,
+    channels,
+    chosen,
+    colour,
+    curve,
+    label,
+    legend_above,
+    legend_beside,
+    one_motion,
+    over_time,
+    panels,
+    zero_line,
+)
+
+THIN = 1e-3  # of the largest area, below which none can be seen
+
+
+def motion(trajectory: Trajectory, names: Sequence[str] | None = None, *, units: Units = None, axes: Any = None) -> Any:
+    r"""The coordinates of a motion over time, one panel each.
+
+    $$ q_i(t), \qquad i = 1 \dots n $$
+
+    A coordinate that is an array has one line for each entry, `r[0]`, `r[1]`, …. Samples that were not reached are left out.
+
+    **Arguments:**
+
+    - `trajectory`: one motion, as `simulate` returns it.
+    - `names`: the coordinates to be drawn, in this order, by their path in q (`"phi"`, `"body.x"`, `"q"` where q is one array).
+      Default: all.
+    - `units`: units by name of coordinate, and of `"t"`, to be written on the axes, e.g. `{"t": "s", "phi": "rad"}`.
+    - `axes`: matplotlib axes to draw in, as many as there are coordinates. Default: a new figure with a common time axis.
+
+    **Returns:** the axes, an array of shape (n,).
+
+    **Raises:** `ValueError` where `names` or `axes` do not fit the motion, `ImportError` without matplotlib.
+
+    **Source:** the colours are those of Okabe & Ito, Color Universal Design (2008).
+
+    ```python
+    import jax.numpy as jnp
+    import jaxlag as jl
+    from jaxlag import plot
+    from jaxlag.examples import pendulum
+    start = pendulum.cartesian_state(2.0, 0.0, 1.0)
+    trajectory = jl.simulate(pendulum.cartesian, *start, jnp.linspace(0.0, 2.0, 101), pendulum.params)
+    axes = plot.motion(trajectory, units={"t": "s", "x": "m", "y": "m"})
+    axes[0].get_ylabel()  # x (m)
+    ```
+    """
+    coordinates = channels(one_motion(trajectory).q, "q")
+    names = chosen(names, tuple(coordinates), "coordinates")
+    return over_time(trajectory.ts, {name: coordinates[name] for name in names}, names, "one for each coordinate", units, axes)
+
+
+def phase(trajectory: Trajectory, names: Sequence[str] | None = None, *, units: Units = None, ax: Any = None) -> Any:
+    r"""The phase portrait of a motion: velocity over position, with a dot at the start, one panel for each number.
+
+    $$ (q_i(t), \dot q_i(t)) $$
+
+    Drawn again on the same axes, another motion has the next colour: so a phase portrait is made of many. A coordinate that is an array
+    has one panel for each entry.
+
+    **Arguments:**
+
+    - `trajectory`: one motion, as `simulate` returns it.
+    - `names`: the coordinates to be drawn, by their path in q. Default: all.
+    - `units`: units by name of coordinate, and of `"t"`; the velocity has the one divided by the other.
+    - `ax`: matplotlib axes to draw in: one for each panel, or one that all share. Default: a new figure.
+
+    **Returns:** the axes, where there are several panels an array of them.
+
+    **Raises:** `ValueError` where `names` or `ax` do not fit the motion, `ImportError` without matplotlib.
+
+    **Source:** Arnold, Mathematical Methods of Classical Mechanics, 2nd ed., section 4.
+
+    ```python
+    import jax.numpy as jnp
+    import jaxlag as jl
+    from jaxlag import plot
+    from jaxlag.examples import pendulum
+    start = pendulum.cartesian_state(2.0, 0.0, 1.0)
+    trajectory = jl.simulate(pendulum.cartesian, *start, jnp.linspace(0.0, 2.0, 101), pendulum.params)
+    ax = plot.phase(trajectory, ("x",), units={"t": "s", "x": "m"})
+    ax.get_ylabel()  # dx/dt (m/s)
+    ```
+    """
+    positions, velocities = (channels(tree, "q") for tree in (one_motion(trajectory).q, trajectory.qdot))
+    names = chosen(names, tuple(positions), "coordinates")
+    entries = [(name, entry, x, velocities[name][entry]) for name in names for entry, x in positions[name].items()]
+    if np.size(ax) == 1 and ax is not None:
+        ax, own = np.ravel(ax)[0], False
+    elif len(entries) == 1:
+        ax, own = canvas(None, figsize=(5.4, 4.2)), True
+    else:
+        shape = 1, len(entries)
+        ax, own = panels(ax, shape, "one for each number, or one for all", sharex=False, figsize=(1.0 + 3.4 * len(entries), 3.6))[0], True
+    for one, (_, entry, x, v) in zip(np.broadcast_to(ax, len(entries)), entries, strict=True):
+        one.plot(x, v, color=colour(len(one.lines)), marker="o", markevery=[0], label=entry)
+    alike = {(units or {}).get(name) for name in names}
+    named = [(name, entry) for name, entry, *_ in entries] if own else [(names[0], names[0] if len(names) == 1 else "q")]
+    for one, (name, whose) in zip(np.ravel(ax), named, strict=True):
+        unit, time = (units or {}).get(name) if own or len(alike) == 1 else None, (units or {}).get("t")
+        one.set_xlabel(label(whose, {whose: unit} if unit else None))
+        one.set_ylabel(label(f"d{whose}/dt", {f"d{whose}/dt": f"{unit}/{time}"} if unit and time else None))
+    if len(entries) > 1 and not own:
+        legend_beside(ax)
+    return ax
+
+
+def energy(trajectory: Trajectory, *, units: Units = None, ax: Any = None) -> Any:
+    r"""The energy over time, and beside it the work of each term since the start.
+
+    $$ h(t) = \dot q\cdot\frac{\partial L}{\partial\dot q} - L, \qquad h(t) = h(0) + \sum_i W_i(t) $$
+
+    The dashed line is the right side of that balance: it lies on the energy where the integration is good. Works need
+    `simulate(..., audit=True)`; without, the energy is drawn alone. Terms that do no work to be seen, as constraints at rest, are left out;
+    a curve that lies on another is dashed, so that both are seen.
+
+    **Arguments:**
+
+    - `trajectory`: one motion, as `simulate` returns it.
+    - `units`: units of `"t"` and `"energy"`, to be written on the axes.
+    - `ax`: matplotlib axes to draw in. Default: a new figure.
+
+    **Returns:** the axes.
+
+    **Raises:** `ValueError` for a batch of motions, `ImportError` without matplotlib.
+
+    **Source:** Goldstein, Classical Mechanics, 3rd ed., eqs. 2.53 and 2.63.
+
+    ```python
+    import jax.numpy as jnp
+    import jaxlag as jl
+    from jaxlag import plot
+    from jaxlag.examples import vehicle
+    trajectory = jl.simulate(vehicle.system, vehicle.q0, vehicle.qdot0, jnp.linspace(0.0, 5.0, 101), vehicle.params, audit=True)
+    ax = plot.energy(trajectory, units={"t": "s", "energy": "J"})
+    [line.get_label() for line in ax.lines]  # energy, work of air, work of dampers, work of drive, energy at the start + works
+    ```
+    """
+    h, ts = np.asarray(one_motion(trajectory).energy()), trajectory.ts
+    ax = canvas(ax, figsize=(6.4, 3.6))
+    ax.plot(ts, h, color=colour(0), linewidth=2.5, label="energy")
+    if trajectory.works is not None:
+        for name, work in _shown_works(trajectory).items():
+            curve(ax, ts, work, color=colour(len(ax.lines)), label=f"work of {name}")
+        ax.plot(ts, h[0] + sum(np.asarray(work) for work in trajectory.works.values()), "k--", label="energy at the start + works")
+        zero_line(ax)
+    ax.set_xlabel(label("t", units))
+    ax.set_ylabel(label("energy", units))
+    legend_above(ax)
+    return ax
+
+
+def balance(trajectory: Trajectory, *, units: Units = None, ax: Any = None) -> Any:
+    r"""The energy balance as stacked areas that add up to nothing: above the line where energy went to, below it where it came from.
+
+    $$ \Delta h(t) - \sum_i W_i(t) = 0 $$
+
+    The change of energy and the work of each term with its sign turned are stacked, the positive ones upwards and the negative ones
+    downwards: at each time both stacks are equally high. What brakes lies above and what drives below; energy that is stored lies
+    above, and energy that the motion has given away since the start below. Terms thinner than 1/1000 of the largest are left out.
+
+    **Arguments:**
+
+    - `trajectory`: one motion, computed by `simulate(..., audit=True)`.
+    - `units`: units of `"t"` and `"energy"`, to be written on the axes.
+    - `ax`: matplotlib axes to draw in. Default: a new figure.
+
+    **Returns:** the axes.
+
+    **Raises:** `ValueError` where the motion was computed without its works, `ImportError` without matplotlib.
+
+    **Source:** Goldstein, Classical Mechanics, 3rd ed., eqs. 2.52 to 2.58.
+
+    ```python
+    import jax.numpy as jnp
+    import jaxlag as jl
+    from jaxlag import plot
+    from jaxlag.examples import vehicle
+    trajectory = jl.simulate(vehicle.system, vehicle.q0, vehicle.qdot0, jnp.linspace(0.0, 5.0, 101), vehicle.params, audit=True)
+    plot.balance(trajectory, units={"t": "s", "energy": "J"})
+    ```
+    """
+    one_motion(trajectory).work()  # which says what to do where there are none
+    h, turned = map(np.asarray, energies(trajectory))
+    parts = {"change of energy": h - h[0]} | {name: -work for name, work in _shown_works(trajectory).items()}
+    ax = canvas(ax, figsize=(6.4, 3.6))
+    above = below = np.zeros_like(h)
+    for i, (name, part) in enumerate(parts.items()):
+        style = {"color": colour(i - 1) if i else GREY, "edgecolor": "white", "linewidth": 0.5}
+        up, down = above + np.maximum(part, 0), below + np.minimum(part, 0)
+        ax.fill_between(trajectory.ts, above, up, label=name, **style)
+        ax.fill_between(trajectory.ts, below, down, **style)
+        above, below = up, down
+    height = 1.05 * max(np.nanmax(above), -np.nanmin(below), THIN * np.nanmax(np.abs(turned)), np.finfo(h.dtype).tiny)
+    ax.set_ylim(-height, height)
+    ax.set_xlim(float(trajectory.ts[0]), float(trajectory.ts[-1]))
+    ax.axhline(0.0, color="black", linewidth=0.8)
+    ax.set_xlabel(label("t", units))
+    ax.set_ylabel(f"← from    {label('energy', units)}    to →")
+    legend_above(ax, 4)
+    return ax
+
+
+def _shown_works(trajectory):
+    """The works that can be seen beside the largest change of energy."""
+    works = {name: np.asarray(work) for name, work in trajectory.work().items()}
+    h, turned = map(np.asarray, energies(trajectory))
+    sizes = {name: np.nanmax(np.abs(work)) for name, work in works.items()}
+    least = THIN * max(*sizes.values(), np.nanmax(np.abs(h - h[0])), THIN * np.nanmax(np.abs(turned)))
+    return {name: works[name] for name, size in sizes.items() if size > least}

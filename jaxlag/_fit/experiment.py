@@ -1,0 +1,251 @@
+"""Experiments: recordings of a motion, with gaps and noise, as they come from a laboratory."""
+
+import csv
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, PyTree
+
+from .._model.injection import check_function
+from .._model.numbers import number, numbers
+from .._model.paths import entry_names, is_within
+from .._model.validation import is_vector, parameters, sample_times, state
+from .._program.jit import is_concrete
+
+
+class Experiment(eqx.Module):
+    r"""A recording of the system's motion, and how it was measured.
+
+    $$ z_i = h(t_i, q, \dot q, \ddot q, \lambda) + \sigma_i e_i, \qquad e_i \text{ independent, of variance 1} $$
+
+    **Arguments:**
+
+    - `ts`: the T times of the samples, increasing, at any intervals; the motion starts at ts[0].
+    - `values`: what was measured, any pytree of arrays with the samples as first axis, e.g. `{"y": ..., "phi": ...}`. NaN is a
+      missing sample. None for an experiment that is only planned (`jaxlag.information`).
+    - `q0`, `qdot0`: the state at ts[0], as for `simulate`; where it is unknown, a guess.
+    - `observe`: what the sensors see of one state, structured like one sample of `values`; it receives the arguments it names, of
+      `t`, `q`, `qdot`, `qddot`, `multipliers`, `params` and the entries of `params`: so gains and offsets of sensors are parameters
+      like others. Left out: the coordinates that `values` names, or q as a whole. One function for all experiments of a kind: they
+      are computed side by side, and a function made anew is compiled anew.
+    - `sigma`: standard deviation of the noise, a number or a pytree like `values` with one for each channel or sample. Where it is
+      left out, one common sigma is estimated from the residuals.
+    - `params`: parameters of this experiment alone, which override those of the fit: a payload, a measured input (`Signal`).
+    - `unknown`: what is to be estimated of this experiment alone: `"q0"`, `"qdot0"`, coordinates of them (`"qdot0.x"`), or entries of
+      its own `params`. An unknown start is sought on the constraints.
+    - `delay`: how much later than the motion the sensors show it, a number, or a function that names parameters. Until the delay
+      is over they show the state at ts[0].
+
+    Any consistent units. **Raises:** `ValueError` where times, values and sigma do not fit each other.
+
+    **Source:** Ljung, System Identification, 2nd ed., section 7.2.
+
+    ```python
+    import jax.numpy as jnp
+    import jaxlag as jl
+    ts = jnp.linspace(0.0, 1.0, 5)
+    jl.Experiment(ts, {"position": jnp.cos(ts)}, q0=1.0, qdot0=0.0, observe=lambda q: {"position": q}, sigma=1e-3)
+    ```
+    """
+
+    ts: Float[Array, " T"]
+    values: PyTree
+    q0: PyTree
+    qdot0: PyTree
+    sigma: PyTree | None
+    params: dict[str, Any]
+    observe: Callable = eqx.field(static=True)
+    unknown: tuple[str, ...] = eqx.field(static=True)
+    delay: Callable | float | None = eqx.field(static=True)
+
+    def __init__(
+        self,
+        ts: Any,
+        values: PyTree,
+        q0: PyTree,
+        qdot0: PyTree,
+        *,
+        observe: Callable | None = None,
+        sigma: PyTree | None = None,
+        params: Mapping[str, Any] | None = None,
+        unknown: Sequence[str] = (),
+        delay: Callable | float | None = None,
+    ):
+        self.q0, self.qdot0 = state(q0, qdot0, ("q0", "qdot0"))
+        for which, tree in (("q0", self.q0), ("qdot0", self.qdot0)):
+            if is_concrete(tree) and not all(np.all(np.isfinite(leaf)) for leaf in jax.tree.leaves(tree)):
+                raise ValueError(f"`{which}` must be finite, but has a missing value. Give a guess, and say that it is `unknown`.")
+        dtype = jax.tree.leaves(self.q0)[0].dtype
+        self.ts = sample_times(ts, dtype)
+        self.values = _measured(values, self.ts, dtype)
+        self.sigma = None if sigma is None else _deviations(sigma, self.values)
+        if params is not None and not isinstance(params, Mapping):
+            raise TypeError(f"`params` of an experiment must be a mapping, but is a {type(params).__name__}. Name its entries in a dict.")
+        self.params = dict(parameters(params or {}, self.q0))
+        self.observe = _Coordinates.named_by(self.values, self.q0) if observe is None else observe
+        check_function(self.observe, "`observe`")
+        self.unknown = (unknown,) if isinstance(unknown, str) else tuple(unknown)
+        if callable(delay):
+            check_function(delay, "`delay`")
+        elif delay is not None and is_concrete(delay):
+            delay = float(number(delay, "`delay`", cure="Give the time by which the sensors are late."))
+        self.delay = delay
+        for name in self.unknown:
+            self._check_unknown(name)
+
+    def _check_unknown(self, name):
+        known = [*start_entries(self), *self.params]
+        if not (name in self.params or any(is_within(entry, name) for entry in start_entries(self))):
+            raise ValueError(
+                f"`unknown` must name q0, qdot0, entries of them or of the experiment's own params, but holds {name!r}. "
+                f"There are q0, qdot0, {', '.join(known)}."
+            )
+
+    @classmethod
+    def from_csv(
+        cls, file: str | Path, q0: PyTree, qdot0: PyTree, *, time: str, channels: Any = None, delimiter: str = ",", **more: Any
+    ) -> "Experiment":
+        """An experiment from a table in a text file, whose first line names the columns; an empty cell is a missing sample.
+
+        **Arguments:** `time`: the column of times; `channels`: names of the columns to be used, or a mapping from channels to columns;
+        left out, all others. The rest as for `Experiment`.
+
+        **Raises:** `ValueError` where a column does not exist or a cell is no number.
+        """
+        with open(file, newline="", encoding="utf-8-sig") as lines:
+            reader = csv.DictReader(lines, delimiter=delimiter, skipinitialspace=True)
+            rows = list(reader)
+        column = lambda name: np.array([_number(row[name], name, i + 2) for i, row in enumerate(rows)])
+        ts, values = _from_columns([name for name in reader.fieldnames or () if name], column, time, channels)
+        return cls(ts, values, q0, qdot0, **more)
+
+    @classmethod
+    def from_dataframe(cls, frame: Any, q0: PyTree, qdot0: PyTree, *, time: str, channels: Any = None, **more: Any) -> "Experiment":
+        """An experiment from a data frame (pandas, polars, or whatever has `columns` and `frame[name].to_numpy()`).
+
+        **Arguments, raises:** as `from_csv`.
+        """
+        ts, values = _from_columns(list(frame.columns), lambda name: np.asarray(frame[name].to_numpy()), time, channels)
+        return cls(ts, values, q0, qdot0, **more)
+
+
+def measured(experiments: Any, params: PyTree, *, planned: bool = False) -> tuple[tuple[Experiment, ...], PyTree]:
+    """One experiment or several as a tuple, and `params` as arrays, after the checks that all who take them need."""
+    experiments = (experiments,) if isinstance(experiments, Experiment) else tuple(experiments)
+    if not experiments or not all(isinstance(e, Experiment) for e in experiments):
+        raise ValueError("`experiments` must be an `Experiment` or a list of them, but is not. Make one by `jl.Experiment(...)`.")
+    for i, e in enumerate(experiments):
+        if e.values is None and not planned:
+            raise ValueError(f"`experiments` must have been measured, but number {i} has no values. Use `information` to plan one.")
+    if params is None or (jax.tree_util.all_leaves([params]) and not isinstance(params, Mapping)):
+        raise ValueError(f"`params` must have entries that `free` can name, but is a {type(params).__name__}. Use a dict.")
+    params = parameters(params, experiments[0].q0)
+    for e in experiments:
+        with_own(params, e.params)
+    return experiments, params
+
+
+def with_own(params: PyTree, own: Mapping[str, Any]) -> PyTree:
+    """The parameters of the fit with those of an experiment's own over them."""
+    if not own:
+        return params
+    if not isinstance(params, Mapping):
+        raise ValueError(
+            f"`params` must be a mapping where an experiment has params of its own to be put over them, but is a {type(params).__name__}. "
+            "Use a dict, which may hold it as an entry."
+        )
+    return {**params, **own}
+
+
+def _measured(values, ts, dtype):
+    def channel(path, value):
+        at = f"`values{jax.tree_util.keystr(path)}`"
+        if not (hasattr(value, "shape") or is_vector(value)):
+            raise TypeError(f"{at} must be an array of real numbers, but is a {type(value).__name__}. Give one number for each time.")
+        value = numbers(value, at, dtype)
+        if value.shape[:1] != ts.shape:
+            raise ValueError(f"{at} must have one row for each of the {ts.size} times, but has shape {value.shape}. Put the samples first.")
+        if is_concrete(value):
+            if np.any(np.isinf(value)):
+                raise ValueError(f"{at} must be finite, but has infinities. Mark missing samples by NaN.")
+            if value.size and np.any(np.all(np.isnan(value), axis=0)):
+                raise ValueError(f"{at} must hold some measurements, but every sample of a channel is missing. Leave the channel out.")
+        return value
+
+    return jax.tree_util.tree_map_with_path(channel, values, is_leaf=is_vector)
+
+
+def _deviations(sigma, values):
+    spoken = lambda path: f"`sigma{jax.tree_util.keystr(path)}`"
+    sigma = jax.tree_util.tree_map_with_path(lambda path, s: numbers(s, spoken(path)), sigma, is_leaf=is_vector)
+    values = sigma if values is None else values  # of an experiment that is only planned
+    spread = lambda s, v: jnp.broadcast_to(jnp.asarray(s, jnp.result_type(v, float)), jnp.shape(v))
+    try:
+        sigma = jax.tree.map(lambda s, v: jax.tree.map(lambda v: spread(s, v), v), sigma, values)
+    except ValueError as error:
+        raise ValueError(
+            f"`sigma` must be a number or structured like `values`, but does not fit: {error}. Give one for each channel."
+        ) from None
+    for s in jax.tree.leaves(sigma):
+        if is_concrete(s) and not np.all((np.asarray(s) > 0) & np.isfinite(s)):
+            raise ValueError(
+                "`sigma` must be positive and finite, but has an entry that is not. Give the standard deviation of the noise; "
+                "mark samples that are not to count by NaN in `values`."
+            )
+    return sigma
+
+
+class _Coordinates(eqx.Module):
+    """Sees the coordinates that the channels are named after."""
+
+    names: tuple[str, ...] | None = eqx.field(static=True)
+
+    @classmethod
+    def named_by(cls, values, q0):
+        if isinstance(values, Mapping) and isinstance(q0, Mapping) and set(values) <= set(q0):
+            return cls(tuple(values))
+        if values is None or jax.tree.structure(values) == jax.tree.structure(q0):
+            return cls(None)
+        raise ValueError(
+            "`observe` must say what the sensors see, but was left out, and `values` does not name coordinates of q. "
+            'Write e.g. `observe=lambda q: {"x": q["x"]}`.'
+        )
+
+    def __call__(self, q):
+        return q if self.names is None else {name: q[name] for name in self.names}
+
+
+def start_entries(experiment: Experiment) -> tuple[str, ...]:
+    """Names of the coordinates at the start, in the order of the flat (q0, qdot0)."""
+    return tuple(
+        which if name == "" else f"{which}{'' if name.startswith('[') else '.'}{name}"
+        for which, tree in (("q0", experiment.q0), ("qdot0", experiment.qdot0))
+        for name in entry_names(tree)
+    )
+
+
+def _from_columns(columns, column, time, channels):
+    channels = [channels] if isinstance(channels, str) else channels
+    if channels is None:
+        channels = [name for name in columns if name != time]
+    chosen = dict(channels) if isinstance(channels, Mapping) else {name: name for name in channels}
+    for name in (time, *chosen.values()):
+        if name not in columns:
+            raise ValueError(f"the table must have a column {name!r}, but has {', '.join(map(repr, columns))}. Name it in the first line.")
+    return column(time), {channel: column(name) for channel, name in chosen.items()}
+
+
+def _number(text, column, line):
+    if text is None or text.strip() == "":
+        return np.nan
+    try:
+        return float(text)
+    except ValueError:
+        raise ValueError(
+            f"line {line}, column {column!r} must be a number, but is {text!r}. Leave the cell empty where it is missing."
+        ) from None

@@ -1,0 +1,1 @@
+"""Mechanics of one state at one time: Lagrange's equations, the constrained solve, projection, dry friction, power."""

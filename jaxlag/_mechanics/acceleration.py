@@ -1,0 +1,140 @@
+"""What holds at one state: acceleration, multipliers, and the forces of the constraints."""
+
+import dataclasses
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax.flatten_util import ravel_pytree
+from jaxtyping import PyTree
+
+from .._model.injection import check_function
+from .._model.system import Flat, System, rows_by_name
+from .._model.validation import at_state
+from .._program.jit import is_concrete
+from .._program.scalarise import scalarised
+from .lagrange import constraint_rows
+from .saddle_point import CONTRADICTION, NO_INERTIA, Sound, constrained_acceleration, pseudo_inverse
+from .singular_directions import because
+from .stick_slip import settled
+
+
+class Acceleration(NamedTuple):
+    """q̈, structured like q, and the multipliers λ by the constraint's name."""
+
+    qddot: PyTree
+    multipliers: dict[str, PyTree]
+
+
+def acceleration(system: System, q: PyTree, qdot: PyTree, params: PyTree = None, *, t: Any = 0.0) -> Acceleration:
+    r"""Acceleration and multipliers of the constrained motion.
+
+    $$ M\ddot q = f + G^T\lambda, \qquad G\ddot q = -\gamma $$
+
+    λ > 0 pushes along +∇g. With redundant constraints q̈ and Gᵀλ are still unique, and λ is the one of least norm;
+    M may be singular where the constraints hold what it leaves free.
+
+    **Arguments:** the state `q`, `qdot` (one pytree structure), `params`, the time `t`. Any consistent units.
+
+    **Returns:** `Acceleration(qddot, multipliers)`: q̈ structured like q; λ by the constraint's name, structured like what g or a returns.
+
+    **Raises:** `ValueError` where a direction has no inertia and no constraint holds it, or where constraints contradict each other.
+    Under `jit` the result is NaN there.
+
+    **Source:** Hairer & Wanner, Solving Ordinary Differential Equations II, eqs. VII.1.46.
+
+    ```python
+    import jax.numpy as jnp
+    import jaxlag as jl
+    pendulum = jl.System(
+        lambda q, qdot, m, g: 0.5 * m * (qdot["r"] ** 2 + q["r"] ** 2 * qdot["phi"] ** 2) + m * g * q["r"] * jnp.cos(q["phi"]),
+        holonomic={"rod": lambda q, l: q["r"] - l},
+    )
+    state = {"r": 2.0, "phi": 0.0}, {"r": 0.0, "phi": 1.0}
+    jl.acceleration(pendulum, *state, {"m": 3.0, "g": 9.81, "l": 2.0}).multipliers["rod"]  # −m l φ̇² − m g cos φ = −35.43
+    ```
+    """
+    result, sound = at_state(_acceleration, system, q, qdot, params, t)
+    _refuse(sound, system, q, qdot, params, t)
+    return result
+
+
+def _refuse(sound: Sound, *given) -> None:
+    """Raises what a solve lacks; under `jit` its result is NaN."""
+    if is_concrete(sound) and not sound.determined:
+        raise ValueError(because(NO_INERTIA, *given))
+    if is_concrete(sound) and not sound.satisfied:
+        raise ValueError(CONTRADICTION)
+
+
+def _acceleration(flat, t, q, v):
+    mode = settled(flat, t, q, v)
+
+    def known(t, q, v):
+        qddot, multipliers, sound = constrained_acceleration(mode, t, q, v)
+        known = sound.determined & sound.satisfied
+        return jnp.where(known, qddot, jnp.nan), jnp.where(known, multipliers, jnp.nan), sound
+
+    qddot, multipliers, sound = scalarised(known)(t, q, v)
+    return Acceleration(flat.unravel(qddot), flat.unravel_multipliers(multipliers)), sound
+
+
+def constraint_force(
+    system: System, q: PyTree, qdot: PyTree, params: PyTree = None, *, t: Any = 0.0, at: Callable | None = None
+) -> dict[str, PyTree]:
+    r"""Constraint forces by the constraint's name: generalized, λ ∂g/∂q (or λ ∂a/∂q̇), or as a force on a point.
+
+    $$ Q = \lambda\,\frac{\partial g}{\partial q}, \qquad F \cdot \delta x = Q \cdot \delta q \text{ for the point } x(t, q) $$
+
+    **Arguments:** as `acceleration`; `at`: the position map x(t, q) of a point, which receives the arguments it names.
+
+    **Returns:** Q structured like q; their sum is Gᵀλ. With `at`, F structured like x: the force at that point that does the same
+    virtual work, NaN where the constraint does not act through that point alone. With redundant constraints the sum is unique, its parts
+    are those of the λ of least norm. Any consistent units.
+
+    **Raises:** as `acceleration`.
+
+    **Source:** Goldstein, Classical Mechanics, 3rd ed., eqs. 2.24 and 1.49.
+
+    ```python
+    import jax.numpy as jnp
+    import jaxlag as jl
+    block = jl.System(
+        lambda q, qdot, m, g: 0.5 * m * qdot @ qdot - m * g * q[1], holonomic={"floor": lambda q: 2 * q[1]}
+    )
+    jl.constraint_force(block, jnp.zeros(2), jnp.zeros(2), {"m": 2.0, "g": 9.81})["floor"]  # [0, 19.62]
+    ```
+    """
+    if at is not None:
+        check_function(at, "`at`")
+    force, sound = at_state(_ConstraintForce(at), system, q, qdot, params, t)
+    _refuse(sound, system, q, qdot, params, t)
+    return force
+
+
+@dataclasses.dataclass(frozen=True)
+class _ConstraintForce:
+    """The forces over flat vectors; compared by the point, so that it compiles once."""
+
+    at: Callable | None
+
+    def __call__(self, flat: Flat, t, q, v):
+        _, multipliers, sound = constrained_acceleration(settled(flat, t, q, v), t, q, v)
+        _, G, _ = constraint_rows(flat, t, q, v)
+        forces = {name: multipliers[rows] @ G[rows] for name, rows in rows_by_name(flat).items()}
+        shown = flat.unravel if self.at is None else _force_on_point(flat, self.at, t, q)
+        return {name: shown(jnp.where(sound.determined & sound.satisfied, Q, jnp.nan)) for name, Q in forces.items()}, sound
+
+
+def _force_on_point(flat, at, t, q):
+    """Q ↦ F with JᵀF = Q, J = ∂x/∂q."""
+    x, unravel = ravel_pytree(flat.position(at, t, q))
+    J = jax.jacobian(lambda q: ravel_pytree(flat.position(at, t, q))[0])(q)
+
+    def force(Q):
+        F = pseudo_inverse(J @ J.T) @ (J @ Q)
+        does_the_work = jnp.max(jnp.abs(J.T @ F - Q)) <= jnp.finfo(q.dtype).eps ** 0.5 * jnp.max(jnp.abs(Q))
+        return unravel(jnp.where(does_the_work, F, jnp.nan))
+
+    return force

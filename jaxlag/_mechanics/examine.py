@@ -1,0 +1,266 @@
+"""A check-up of a system at one state, before it is run: findings in words, with the cure."""
+
+import dataclasses
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import PyTree
+
+from .._model.paths import entry_names, leaf_names
+from .._model.system import Flat, System, bind, rows_by_name
+from .._model.validation import at_state, coordinates
+from .._program.scalarise import scalarised
+from .friction_terms import unread_friction
+from .lagrange import applied_force, constraint_rows, inertia, position_residual, velocity_residual
+from .saddle_point import augmented, constrained_acceleration
+from .singular_directions import UNDEFINED, allowed, bends, is_defined, weightless
+from .stick_slip import settled
+
+
+@dataclasses.dataclass(frozen=True)
+class Examination:
+    """What `examine` found; printed, a report.
+
+    - `coordinates`, `degrees_of_freedom`, `rank` of G, `redundant`: rows of G that depend on rows before them, by constraint.
+    - `off_position`, `off_velocity`: the largest residual of each constraint. `smallest_inertia`: the least eigenvalue of M on the
+      motions the constraints allow. `dissipated`: the least of q̇·∂D/∂q̇ near the state, by term.
+    - `time_constants`: 1/|eigenvalue| of the linearised motion, the fastest and the slowest. `findings`: sentences with the cure.
+    """
+
+    coordinates: tuple[str, ...]
+    degrees_of_freedom: int
+    rank: int
+    rows: int
+    redundant: dict[str, int]
+    off_position: dict[str, float]
+    off_velocity: dict[str, float]
+    smallest_inertia: float
+    dissipated: dict[str, float]
+    time_constants: tuple[float, float]
+    findings: tuple[str, ...]
+
+    def __repr__(self) -> str:
+        fastest, slowest = self.time_constants
+        rows = [
+            ("coordinates", ", ".join(self.coordinates)),
+            ("degrees of freedom", str(self.degrees_of_freedom)),
+            ("constraint rows", f"{self.rows}, of rank {self.rank}"),
+            ("smallest inertia", f"{self.smallest_inertia:.3g}"),
+            ("time constants", f"{fastest:.3g} … {slowest:.3g}"),
+        ]
+        lines = [f"  {name:<20}{value}" for name, value in rows]
+        return "\n".join(["Examination", *lines, *(f"  - {finding}" for finding in self.findings or ("nothing to mend",))])
+
+
+def examine(system: System, q: PyTree, qdot: PyTree, params: PyTree = None, *, t: Any = 0.0) -> Examination:
+    r"""A check-up of a system at one state: rank, redundancy, inertia, dissipation, stiffness, in numbers and in words.
+
+    $$ \text{degrees of freedom} = n - \mathrm{rank}\,G, \qquad N^T M N > 0, \qquad \dot q\cdot\frac{\partial D}{\partial\dot q} \ge 0,
+       \qquad \tau = 1/|\lambda_i| \text{ of the linearised motion} $$
+
+    N spans the null space of G: the motions that the constraints allow.
+
+    **Arguments:** as `acceleration`. Any consistent units. **Returns:** an `Examination`; print it.
+
+    **Raises:** `TypeError` or `ValueError` where an argument or a function of the system is of the wrong kind, or gives no finite
+    numbers at this state.
+
+    **Source:** Hairer & Wanner, Solving Ordinary Differential Equations II, sections IV.1 (stiffness) and VII.1.
+
+    ```python
+    import jaxlag as jl
+    from jaxlag.examples import vehicle
+    print(jl.examine(vehicle.system, vehicle.q0, vehicle.qdot0, vehicle.params))
+    ```
+    """
+    found = jax.tree.map(np.asarray, at_state(_measure, system, q, qdot, params, t))
+    if not is_defined(found):
+        raise ValueError(UNDEFINED)
+    q = coordinates(q, "q")
+    eps = float(jnp.finfo(found["M"].dtype).eps)
+    G, M = found["G"], found["M"]
+    rows = {name: found["rows"][name] for name in system.constraints}  # in the order of the rows of G
+    N = allowed(G, eps)
+    rank = G.shape[1] - N.shape[1]
+    inertia_on_N = np.linalg.eigvalsh(N.T @ M @ N) if N.shape[1] else np.zeros(0)
+    smallest = float(inertia_on_N[0]) if inertia_on_N.size else float("inf")
+    redundant = _redundant_rows(G, rows, eps)
+    largest = lambda named: {name: float(np.max(np.abs(value), initial=0.0)) for name, value in named.items()}
+    constants = _time_constants(found, N) if np.all(np.isfinite(found["A"])) else (float("nan"), float("nan"))
+    numbers = {
+        "coordinates": leaf_names(q),
+        "degrees_of_freedom": N.shape[1],
+        "rank": rank,
+        "rows": G.shape[0],
+        "redundant": redundant,
+        "off_position": largest(found["position"]),
+        "off_velocity": largest(found["velocity"]),
+        "smallest_inertia": smallest,
+        "dissipated": {name: float(np.min(value)) for name, value in found["dissipated"].items()},
+        "time_constants": constants,
+    }
+    off, size, rows_off, rows_size = found["defects"].max(axis=0)
+    defect = max(off / max(size, eps), rows_off / max(rows_size, eps) if rank == G.shape[0] else 0)  # rows may contradict each other
+    names = entry_names(q, "q")
+    findings = [
+        *_without_inertia(names, M, G),
+        *_not_affine(names, found["bends"]),
+        *_pushes(names, M, G, rows, system),
+        *_findings(numbers, defect, found["M"].dtype),
+        *_pulling(system, found["multipliers"]),
+        *_of_friction(system, q, qdot, params, t),
+    ]
+    return Examination(**numbers, findings=tuple(findings))
+
+
+def _of_friction(system, q, qdot, params, t):
+    """Dry friction that is written in a way that is not read as such."""
+    q = coordinates(q, "q")
+    v = jax.flatten_util.ravel_pytree(coordinates(qdot, "qdot"))[0]
+    return unread_friction(bind(system, q, params), jnp.asarray(t, v.dtype), jax.flatten_util.ravel_pytree(q)[0], v)
+
+
+def _pulling(system, multipliers):
+    """One-sided constraints that would have to pull."""
+    for name in system.one_sided:
+        least, size = np.min(multipliers[name], initial=0.0), np.max(np.abs(multipliers[name]), initial=0.0)
+        if least < -np.sqrt(np.finfo(multipliers[name].dtype).eps) * size:
+            yield (
+                f"the one-sided constraint {name!r} would have to pull here (λ = {least:.3g}), so its contact would open: "
+                "the motion keeps it all the same, until the contact is stated as one"
+            )
+
+
+def _without_inertia(names, M, G):
+    free = [names[i] for i in weightless(M, G)]
+    if free:
+        yield (
+            f"a direction that no constraint holds has no inertia: {', '.join(map(repr, free))}; add the missing mass (a small one with "
+            "`solver=diffrax.Kvaerno5()`), a constraint that holds it, or leave the coordinate out"
+        )
+
+
+def _not_affine(names, bends):
+    bent = [names[i] for i in np.flatnonzero(bends)]
+    if bent:
+        listed = ", ".join(map(repr, bent))
+        yield f"a nonholonomic constraint is not affine in the velocity of {listed}: write its derivative, or a root of it"
+
+
+def _pushes(names, M, G, rows, system):
+    """Rows of velocities that tie a coordinate without inertia to others: their λ acts on these too, as a law of first order would not."""
+    size = np.max(np.abs(M), axis=1)
+    massless = size <= 100 * len(M) * np.finfo(M.dtype).eps * np.max(size, initial=0.0)
+    for name in (name for name, _ in system.nonholonomic):
+        for row in G[rows[name]]:
+            part = np.abs(row) > 1e-12 * np.max(np.abs(row), initial=0.0)
+            driven, pushed = ([names[i] for i in np.flatnonzero(part & of)] for of in (massless, ~massless))
+            if driven and pushed:
+                yield (
+                    f"constraint {name!r} ties {', '.join(map(repr, driven))}, without inertia, to {', '.join(map(repr, pushed))}, and its "
+                    "λ pushes these too: right for a rod or a gear, wrong for a law such as that of a spring and damper in series, "
+                    "which is to push by a force or an energy alone"
+                )
+
+
+def _findings(numbers, defect, dtype):
+    if defect > float(jnp.finfo(dtype).eps) ** 0.5:
+        yield (
+            f"the accelerations miss Lagrange's equations, as JAX alone differentiates them, by {defect:.2g} of the largest term: "
+            "do not trust them, and report the functions of this system as an error of jaxlag"
+        )
+    if numbers["degrees_of_freedom"] == 0:
+        yield "no degree of freedom is left: the constraints hold every coordinate"
+    for name, count in numbers["redundant"].items():
+        yield (
+            f"of constraint {name!r} {count} of the rows follow from those before: the motion is unique, λ is the one of least norm; "
+            "leave the rows out where each reaction matters"
+        )
+    tolerance = float(jnp.finfo(dtype).eps) ** 0.5
+    for what, off in (("position", numbers["off_position"]), ("velocity", numbers["off_velocity"])):
+        for name, value in off.items():
+            if value > tolerance:
+                yield f"the {what} is off constraint {name!r} by {value:.2g}: `consistent_state` puts it right, `simulate` does by itself"
+    for name, least in numbers["dissipated"].items():
+        if least < 0:
+            yield (
+                f"dissipation {name!r} feeds energy in near this state (q̇·∂D/∂q̇ = {least:.2g}): "
+                "right for wind or a moving belt, else look at its sign"
+            )
+    fastest, slowest = numbers["time_constants"]
+    if np.isfinite(slowest) and slowest > 1e4 * fastest:
+        yield f"the motion is stiff (time constants from {fastest:.2g} to {slowest:.2g}): take `solver=diffrax.Kvaerno5()`"
+    if jnp.finfo(dtype).bits < 64:
+        yield 'single precision: `jax.config.update("jax_enable_x64", True)` gives twice the digits'
+
+
+def _measure(flat: Flat, t, q, v):
+    """All that needs derivatives, in one compiled program."""
+    _, G, _ = constraint_rows(flat, t, q, v)
+    mode = settled(flat, t, q, v)
+    beside = jnp.linspace(-0.1, 0.1, q.size, dtype=q.dtype)
+    around = jnp.stack([jnp.zeros_like(beside), beside, -beside[::-1]])
+    multipliers, defects = jax.vmap(lambda near: _defects(mode, t, q + near, v + near))(around)
+    multipliers = multipliers[0]
+    rates = lambda y: jnp.concatenate([y[q.size :], constrained_acceleration(mode, t, y[: q.size], y[q.size :]).x])
+    scale = 1 + jnp.max(jnp.abs(v))
+    near = v[None] + 0.1 * scale * jax.random.normal(jax.random.key(0), (64, v.size), v.dtype)
+    fed = {name: jax.vmap(lambda v, D=D: v @ jax.grad(D, argnums=2)(t, q, v, multipliers))(near) for name, D in flat.dissipations.items()}
+    g, _ = position_residual(flat, t, q)
+    split = rows_by_name(flat)
+    psi, _, _ = constraint_rows(flat, t, q, v)
+    return {
+        "M": inertia(flat, t, q, v)[0].as_matrix(),
+        "G": G,
+        "A": jax.jacfwd(rates)(jnp.concatenate([q, v])),
+        "bends": bends(flat, t, q, v),
+        "rows": {name: jnp.asarray(rows) for name, rows in split.items()},
+        "position": {name: g[split[name]] for name in flat.holonomic_names},
+        "velocity": {name: psi[rows] for name, rows in split.items()},
+        "dissipated": fed,
+        "multipliers": {name: multipliers[rows] for name, rows in split.items()},
+        "defects": defects,
+    }
+
+
+def _defects(mode, t, q, v):
+    """λ; and how far q̈ and λ, by the program as it is rewritten, are from the equations as JAX alone differentiates them.
+
+    Of M q̈ − f − Gᵀλ and of G q̈ + γ: what is left, and beside it the largest term; zeros where inertia is missing.
+    """
+    qddot, multipliers, sound = scalarised(lambda t, q, v: constrained_acceleration(mode, t, q, v))(t, q, v)
+    one, L, psi = jnp.ones_like(t), mode.lagrangian, lambda t, q, v: velocity_residual(mode, t, q, v)
+    _, rate = jax.jvp(jax.grad(L, argnums=2), (t, q, v), (one, v, qddot))
+    _, gamma = jax.jvp(lambda t, q: psi(t, q, v), (t, q), (one, v))
+    G = jax.jacfwd(psi, argnums=2)(t, q, v)
+    terms = rate, -jax.grad(L, argnums=1)(t, q, v), -applied_force(mode, t, q, v, multipliers), -G.T @ multipliers
+    largest = lambda *terms: jnp.max(jnp.abs(jnp.concatenate(terms)), initial=0)
+    in_equations = largest(sum(terms)), largest(*terms)
+    A, _ = augmented(jax.hessian(L, argnums=2)(t, q, v), G)
+    moved = jnp.abs(jnp.linalg.inv(A)) @ sum(map(jnp.abs, terms))  # by each force alone, before they cancel each other
+    in_rows = largest(G @ qddot + gamma), largest(jnp.abs(G) @ moved, gamma)
+    return multipliers, jnp.where(sound.determined & jnp.all(jnp.isfinite(qddot)), jnp.stack([*in_equations, *in_rows]), 0)
+
+
+def _redundant_rows(G, rows, eps):
+    """How many rows of each constraint depend on rows before them."""
+    redundant, before = {}, np.zeros((0, G.shape[1]))
+    for name, indices in rows.items():
+        of_name = np.concatenate([before, G[indices]])
+        dependent = len(indices) - (allowed(before, eps).shape[1] - allowed(of_name, eps).shape[1])
+        if dependent:
+            redundant[name] = dependent
+        before = of_name
+    return redundant
+
+
+def _time_constants(found, N):
+    """Of the motion linearised on what the constraints allow: 1/|λ| of the nonzero eigenvalues, the fastest and the slowest."""
+    n = N.shape[0]
+    A = found["A"]
+    reduced = np.block([[np.zeros((N.shape[1],) * 2), np.eye(N.shape[1])], [N.T @ A[n:, :n] @ N, N.T @ A[n:, n:] @ N]])
+    sizes = np.abs(np.linalg.eigvals(reduced))
+    sizes = sizes[sizes > 1e-7 * np.max(sizes, initial=0.0)]  # a double eigenvalue 0 is some √eps of the largest, after rounding
+    return (1 / np.max(sizes), 1 / np.min(sizes)) if sizes.size else (float("inf"), float("inf"))

@@ -1,0 +1,160 @@
+"""Lagrange's equations: mass matrix, forces and constraint rows by automatic differentiation.
+
+M q̈ = f + Gᵀ λ,    M = ∂²L/∂q̇²,    f = ∂L/∂q − (∂²L/∂q̇∂q) q̇ − ∂²L/∂q̇∂t − ∂D/∂q̇ + Q
+G q̈ = −γ,          G = ∂ψ/∂q̇,      γ = ∂ψ/∂t + (∂ψ/∂q) q̇,    ψ = (dg/dt, a)
+"""
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import lineax as lx
+from jaxtyping import Array, Float, PyTree
+
+from .._model.system import Flat, System
+from .._model.validation import at_state
+from .._program.sparse_jacobian import jacobian
+
+
+def inertia(flat: Flat, t, q, v) -> tuple[lx.AbstractLinearOperator, Float[Array, " n"]]:
+    """M and the force of the Lagrangian alone, ∂L/∂q − (∂²L/∂q̇∂q) q̇ − ∂²L/∂q̇∂t."""
+    momentum = jax.grad(flat.lagrangian, argnums=2)
+    _, M = jacobian(lambda v: momentum(t, q, v), v)
+    _, carried = jax.jvp(lambda t, q: momentum(t, q, v), (t, q), (jnp.ones_like(t), v))
+    return M, jax.grad(flat.lagrangian, argnums=1)(t, q, v) - carried
+
+
+def applied_force(flat: Flat, t, q, v, multipliers) -> Float[Array, " n"]:
+    """−∂D/∂q̇ + Q."""
+    D = lambda v: sum((D(t, q, v, multipliers) for D in flat.dissipations.values()), start=jnp.zeros((), v.dtype))
+    Q = sum((Q(t, q, v, multipliers) for Q in flat.forces.values()), start=jnp.zeros_like(v))
+    return Q - jax.grad(D)(v)
+
+
+def position_residual(flat: Flat, t, q) -> tuple[Float[Array, " h"], Float[Array, "h n"]]:
+    """g and its Jacobian ∂g/∂q."""
+    g, G = jacobian(lambda q: flat.holonomic(t, q), q)
+    return g, G.as_matrix()
+
+
+def velocity_residual(flat: Flat, t, q, v) -> Float[Array, " m"]:
+    """ψ: dg/dt of the holonomic constraints, and a of the nonholonomic ones."""
+    dg_dt = jax.jvp(flat.holonomic, (t, q), (jnp.ones_like(t), v))[1]
+    return jnp.concatenate([dg_dt, flat.nonholonomic(t, q, v)])
+
+
+def constraint_rows(flat: Flat, t, q, v) -> tuple[Float[Array, " m"], Float[Array, "m n"], Float[Array, " m"]]:
+    """ψ, G and γ, such that dψ/dt = G q̈ + γ."""
+    psi, G = jacobian(lambda v: velocity_residual(flat, t, q, v), v)
+    _, gamma = jax.jvp(lambda t, q: velocity_residual(flat, t, q, v), (t, q), (jnp.ones_like(t), v))
+    return psi, G.as_matrix(), gamma
+
+
+def mass_matrix(system: System, q: PyTree, qdot: PyTree, params: PyTree = None, *, t: Any = 0.0) -> Float[Array, "n n"]:
+    """Mass matrix M = ∂²L/∂q̇², in the flat order of `jax.flatten_util.ravel_pytree(q)`.
+
+    **Arguments:** the state `q`, `qdot` (one pytree structure, n numbers in all), `params`, the time `t`. Any consistent units.
+
+    **Returns:** an (n, n) array, symmetric.
+
+    **Raises:** `TypeError` or `ValueError` where an argument or a function of the system is of the wrong kind.
+
+    **Source:** Goldstein, Classical Mechanics, 3rd ed., eq. 1.71.
+
+    ```python
+    import jaxlag as jl
+    system = jl.System(lambda q, qdot, m: 0.5 * m * (qdot["x"] ** 2 + q["x"] ** 2 * qdot["phi"] ** 2))
+    jl.mass_matrix(system, {"x": 2.0, "phi": 0.0}, {"x": 0.0, "phi": 0.0}, {"m": 3.0})  # rows phi, x: [[12, 0], [0, 3]]
+    ```
+    """
+    return at_state(_mass_matrix, system, q, qdot, params, t)
+
+
+def _mass_matrix(flat, t, q, v):
+    return inertia(flat, t, q, v)[0].as_matrix()
+
+
+def momentum(system: System, q: PyTree, qdot: PyTree, params: PyTree = None, *, t: Any = 0.0) -> PyTree:
+    """Generalized momentum p = ∂L/∂q̇, structured like q.
+
+    **Arguments, raises:** as `mass_matrix`. **Source:** Goldstein, 3rd ed., eq. 2.44.
+
+    ```python
+    import jaxlag as jl
+    jl.momentum(jl.System(lambda qdot, m: 0.5 * m * qdot**2), 0.0, 2.0, {"m": 3.0})  # 6.0
+    ```
+    """
+    return at_state(_momentum, system, q, qdot, params, t)
+
+
+def _momentum(flat, t, q, v):
+    return flat.unravel(jax.grad(flat.lagrangian, argnums=2)(t, q, v))
+
+
+def energy(system: System, q: PyTree, qdot: PyTree, params: PyTree = None, *, t: Any = 0.0) -> Float[Array, ""]:
+    """Energy h = q̇ · ∂L/∂q̇ − L, which is T + V where L = T − V with T quadratic in q̇.
+
+    **Arguments, raises:** as `mass_matrix`. **Source:** Goldstein, 3rd ed., eq. 2.53 (energy function).
+
+    ```python
+    import jaxlag as jl
+    jl.energy(jl.System(lambda q, qdot, m, c: 0.5 * m * qdot**2 - 0.5 * c * q**2), 1.0, 2.0, {"m": 3.0, "c": 4.0})  # 8.0
+    ```
+    """
+    return at_state(_energy, system, q, qdot, params, t)
+
+
+def _energy(flat, t, q, v):
+    L, p = jax.value_and_grad(flat.lagrangian, argnums=2)(t, q, v)
+    return v @ p - L
+
+
+def constraint_jacobian(system: System, q: PyTree, qdot: PyTree, params: PyTree = None, *, t: Any = 0.0) -> Float[Array, "m n"]:
+    """Constraint Jacobian G: rows ∂g/∂q of the holonomic, then ∂a/∂q̇ of the nonholonomic constraints.
+
+    **Arguments, raises:** as `mass_matrix`. **Returns:** an (m, n) array; rows in the order of `system.constraints`.
+
+    **Source:** Hairer & Wanner, Solving Ordinary Differential Equations II, section VII.1.
+
+    ```python
+    import jax.numpy as jnp
+    import jaxlag as jl
+    rod = jl.System(lambda qdot: 0.5 * qdot @ qdot, holonomic=lambda q, l: q @ q - l**2)
+    jl.constraint_jacobian(rod, jnp.array([3.0, 4.0]), jnp.zeros(2), {"l": 5.0})  # [[6, 8]]
+    ```
+    """
+    return at_state(_constraint_jacobian, system, q, qdot, params, t)
+
+
+def _constraint_jacobian(flat, t, q, v):
+    return constraint_rows(flat, t, q, v)[1]
+
+
+class Residual(NamedTuple):
+    """How far a state is from its constraints: `position` holds g, `velocity` holds dg/dt and a, each by the constraint's name."""
+
+    position: dict[str, PyTree]
+    velocity: dict[str, PyTree]
+
+
+def constraint_residual(system: System, q: PyTree, qdot: PyTree, params: PyTree = None, *, t: Any = 0.0) -> Residual:
+    """Constraint residuals: `position` holds g, `velocity` holds dg/dt and a, each by the constraint's name.
+
+    **Arguments, raises:** as `mass_matrix`. **Returns:** `Residual(position, velocity)`; values structured like what g and a return.
+
+    **Source:** Hairer & Wanner, Solving Ordinary Differential Equations II, section VII.1.
+
+    ```python
+    import jax.numpy as jnp
+    import jaxlag as jl
+    rod = jl.System(lambda qdot: 0.5 * qdot @ qdot, holonomic={"rod": lambda q, l: q @ q - l**2})
+    jl.constraint_residual(rod, jnp.array([3.0, 4.0]), jnp.array([1.0, 0.0]), {"l": 5.0})  # rod: g = 0, dg/dt = 6
+    ```
+    """
+    return at_state(_constraint_residual, system, q, qdot, params, t)
+
+
+def _constraint_residual(flat, t, q, v):
+    g, psi = flat.holonomic(t, q), velocity_residual(flat, t, q, v)
+    position = flat.unravel_multipliers(jnp.concatenate([g, jnp.zeros(psi.size - g.size, g.dtype)]))
+    return Residual({name: position[name] for name in flat.holonomic_names}, flat.unravel_multipliers(psi))

@@ -1,0 +1,230 @@
+"""Kinematics: velocities and generalized forces of points and angles, from their position maps alone; new coordinates."""
+
+import dataclasses
+import inspect
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.flatten_util import ravel_pytree
+
+from .._program.jit import is_concrete
+from .injection import call, check_function, names
+from .numbers import numbers
+from .system import System, Terms, flat_like, role
+
+
+def rate(coordinate: Callable) -> Callable:
+    r"""Velocity of a point or rate of an angle, as a function of the state, from its position map.
+
+    $$ \dot x = \frac{\partial x}{\partial q}\,\dot q + \frac{\partial x}{\partial t} $$
+
+    **Arguments:** `coordinate`: the position x(t, q), a number, a vector or any pytree; it receives the arguments it names, of
+    `t`, `q`, `params` and the entries of `params`.
+
+    **Returns:** a function of `(t, q, qdot, params)`, structured like x. Any consistent units.
+
+    **Source:** Goldstein, Classical Mechanics, 3rd ed., eq. 1.46.
+
+    ```python
+    import jaxlag as jl
+    front = lambda q, a: q["y"] + a * q["phi"]
+    state = {"y": 0.5, "phi": 0.1}, {"y": 2.0, "phi": -1.0}
+    jl.rate(front)(0.0, *state, {"a": 1.5})  # ẏ + a φ̇ = 0.5
+    ```
+    """
+    check_function(coordinate, "`coordinate`")
+    return _Rate(coordinate)
+
+
+def virtual_work(coordinate: Callable, effort: Any) -> Callable:
+    r"""Generalized force of a force on a point, or of a moment on an angle, to hand to `System(force=...)`.
+
+    $$ \delta W = F \cdot \delta x, \qquad Q_j = F \cdot \frac{\partial x}{\partial q_j} $$
+
+    **Arguments:**
+
+    - `coordinate`: the position x(t, q) of the point, or the angle; a number, a vector or any pytree.
+    - `effort`: the force or moment that does work on x, structured like it: a number, a sequence of numbers, or a function, which
+      receives the arguments it names (`t`, `q`, `qdot`, `multipliers`, `params` and its entries).
+
+    **Returns:** a function for `System(force=...)`; its value is structured like q. Any consistent units.
+
+    **Raises:** `ValueError`, when first used, where the effort is not structured like the coordinate.
+
+    **Source:** Goldstein, Classical Mechanics, 3rd ed., eq. 1.49.
+
+    ```python
+    import jaxlag as jl
+    # a wheel of radius r that rolls turns by φ = −x/r; a moment −M0 on φ drives the car by M0/r
+    drive = jl.virtual_work(lambda q, r: -q["x"] / r, lambda M0: -M0)
+    car = jl.System(lambda qdot, m: 0.5 * m * qdot["x"] ** 2, force={"drive": drive})
+    jl.acceleration(car, {"x": 0.0}, {"x": 0.0}, {"m": 10.0, "r": 0.5, "M0": 20.0}).qddot["x"]  # 4.0
+    ```
+    """
+    check_function(coordinate, "`coordinate`")
+    if not callable(effort):
+        return _VirtualWork(coordinate, _Constant.of(effort))
+    check_function(effort, "`effort`")
+    return _VirtualWork(coordinate, effort)
+
+
+def substitute(system: System, coordinates: Callable) -> System:
+    r"""The same system in new generalized coordinates: L, D, Q, g and a are pulled back along x = x(t, q).
+
+    $$ L'(t, q, \dot q) = L(t, x, \dot x), \qquad Q' = \left(\frac{\partial x}{\partial q}\right)^T Q, \qquad
+       \dot x = \frac{\partial x}{\partial q}\,\dot q + \frac{\partial x}{\partial t} $$
+
+    With fewer new coordinates than old ones this eliminates constraints: x(t, q) are the constraint equations solved
+    (Bindungsgleichungen), and their forces do no work.
+
+    **Arguments:** `coordinates`: x(t, q), structured like the old coordinates; it receives the arguments it names, of `t`, `q`, `params`
+    and the entries of `params`. Time may appear.
+
+    **Returns:** a `System` whose terms keep their names. Any consistent units.
+
+    **Source:** Goldstein, Classical Mechanics, 3rd ed., section 1.4; Lurie, Analytical Mechanics, section 1.4.
+
+    ```python
+    import jax.numpy as jnp
+    import jaxlag as jl
+    bob = jl.System(lambda q, qdot, m, g: 0.5 * m * qdot @ qdot - m * g * q[1])  # in x and y
+    pendulum = jl.substitute(bob, lambda q, l: l * jnp.stack([jnp.sin(q), -jnp.cos(q)]))  # in the angle
+    jl.acceleration(pendulum, 0.5, 0.0, {"m": 1.0, "g": 9.81, "l": 2.0}).qddot  # −(g/l) sin φ = −2.35
+    ```
+    """
+
+    check_function(coordinates, "`coordinates`")
+
+    def pulled(slot: str, kind: type) -> dict[str, Callable]:
+        terms: Terms = getattr(system, slot)
+        return {name: kind(function, coordinates, role(slot, name)) for name, function in terms}
+
+    return System(
+        pulled("lagrangian", _PulledBack),
+        dissipation=pulled("dissipation", _PulledBack),
+        force=pulled("force", _PulledForce),
+        holonomic=pulled("holonomic", _PulledPosition),
+        nonholonomic=pulled("nonholonomic", _PulledBack),
+        one_sided=system.one_sided,
+    )
+
+
+class _Stated:
+    """A function of the state made from a user's functions: it shows the names it needs, so that the one rule holds for it too."""
+
+    @property
+    def __signature__(self) -> inspect.Signature:
+        return inspect.Signature([inspect.Parameter(name, inspect.Parameter.POSITIONAL_OR_KEYWORD) for name in self._names()])
+
+    def _names(self) -> tuple[str, ...]:
+        raise NotImplementedError
+
+
+def _multipliers_of(function: Callable) -> tuple[str, ...]:
+    return ("multipliers",) if names(function, "multipliers") else ()
+
+
+def _moving(coordinate: Callable, spoken: str, t: Any, q: Any, qdot: Any, params: Any) -> tuple[Any, Any]:
+    """A position and its velocity, by one `jvp`."""
+    t = jnp.asarray(t, jnp.result_type(*jax.tree.leaves(q), 1.0))
+    q, qdot = (jax.tree.map(lambda leaf: jnp.asarray(leaf, t.dtype), tree) for tree in (q, qdot))
+    return jax.jvp(lambda t, q: call(coordinate, spoken, params, t=t, q=q), (t, q), (jnp.ones_like(t), qdot))
+
+
+@dataclasses.dataclass(frozen=True)
+class _Rate(_Stated):
+    coordinate: Callable
+
+    def _names(self):
+        return ("t", "q", "qdot", "params")
+
+    def __call__(self, t=None, q=None, qdot=None, params=None):
+        if t is None and not names(self.coordinate, "t"):
+            t = 0.0
+        for name, value in (("t", t), ("q", q), ("qdot", qdot)):
+            if value is None:
+                raise TypeError(f"a rate must be given t, q and qdot, but `{name}` is missing. Call it `rate(x)(t, q, qdot, params)`.")
+        return _moving(self.coordinate, "`coordinate`", t, q, qdot, params)[1]
+
+
+@dataclasses.dataclass(frozen=True)
+class _Constant:
+    value: Any  # a number, or tuples of them
+
+    @classmethod
+    def of(cls, effort: Any) -> "_Constant":
+        if not is_concrete(effort):
+            raise TypeError("`effort` must be known when it is stated, but is traced. Make it an entry of params: `lambda F: F`.")
+        return cls(_tuples(np.asarray(numbers(effort, "`effort`")).tolist()))
+
+    def __call__(self):
+        return np.asarray(self.value)
+
+
+@dataclasses.dataclass(frozen=True)
+class _VirtualWork(_Stated):
+    coordinate: Callable
+    effort: Callable
+
+    def _names(self):
+        return ("t", "q", "qdot", "params", *_multipliers_of(self.effort))
+
+    def __call__(self, t, q, qdot, params, **multipliers):
+        x, pull = jax.vjp(lambda q: _vectors(call(self.coordinate, "`coordinate`", params, t=t, q=q)), q)
+        effort = _vectors(call(self.effort, "`effort`", params, t=t, q=q, qdot=qdot, **multipliers))
+        need, have = (jax.tree.map(jnp.shape, tree) for tree in (x, effort))
+        if need != have:
+            raise ValueError(
+                f"`effort` must be structured like its `coordinate`, {need}, but is {have}. Give a force the components of its point."
+            )
+        return pull(jax.tree.map(lambda force, position: jnp.asarray(force, position.dtype), effort, x))[0]
+
+
+@dataclasses.dataclass(frozen=True)
+class _PulledBack(_Stated):
+    """L, D or a of the old coordinates."""
+
+    function: Callable
+    coordinates: Callable
+    spoken: str
+
+    def _names(self):
+        return ("t", "q", "qdot", "params", *_multipliers_of(self.function))
+
+    def __call__(self, t, q, qdot, params, **multipliers):
+        x, xdot = map(_vectors, _moving(self.coordinates, "`coordinates`", t, q, qdot, params))
+        return call(self.function, self.spoken, params, t=t, q=x, qdot=xdot, **multipliers)
+
+
+class _PulledPosition(_PulledBack):
+    """g of the old coordinates."""
+
+    def _names(self):
+        return ("t", "q", "params")
+
+    def __call__(self, t, q, params):
+        x = _vectors(call(self.coordinates, "`coordinates`", params, t=t, q=q))
+        return call(self.function, self.spoken, params, t=t, q=x)
+
+
+class _PulledForce(_PulledBack):
+    """Q of the old coordinates, brought to the new ones by its virtual work."""
+
+    def __call__(self, t, q, qdot, params, **multipliers):
+        force = super().__call__(t, q, qdot, params, **multipliers)
+        x, pull = jax.vjp(lambda q: _vectors(call(self.coordinates, "`coordinates`", params, t=t, q=q)), q)
+        return pull(ravel_pytree(x)[1](flat_like(x, self.spoken, force)))[0]
+
+
+def _vectors(tree: Any) -> Any:
+    """Lists and plain tuples of numbers as vectors: a point (x, 0.0) is one."""
+    is_number = lambda x: isinstance(x, (jax.Array, np.ndarray)) and x.shape == ()
+    is_vector = lambda node: type(node) in (list, tuple) and len(node) > 0 and all(map(is_number, node))
+    return jax.tree.map(lambda node: jnp.stack(node) if is_vector(node) else node, tree, is_leaf=is_vector)
+
+
+def _tuples(lists: Any) -> Any:
+    return tuple(map(_tuples, lists)) if isinstance(lists, list) else lists

@@ -1,0 +1,27 @@
+"""Names of what a pytree holds: its leaves, their numbers, and what lies within a name."""
+
+import jax
+import numpy as np
+from jaxtyping import PyTree
+
+
+def leaf_names(tree: PyTree, bare: str = "q") -> tuple[str, ...]:
+    """The leaves by their paths, e.g. "wheel.phi"; `bare` names a leaf without a path."""
+    paths = [jax.tree_util.keystr(path, simple=True, separator=".") for path, _ in jax.tree_util.tree_flatten_with_path(tree)[0]]
+    return tuple(path or bare for path in paths)
+
+
+def entry_names(tree: PyTree, bare: str = "") -> tuple[str, ...]:
+    """A name for each number of a pytree of arrays, in flat order: "arm.l", "c[1]"; `bare` names a number without a path."""
+    named = zip(leaf_names(tree, bare), jax.tree.leaves(tree), strict=True)
+    return tuple(label for name, leaf in named for label in labels(name, np.shape(leaf)))
+
+
+def labels(name: str, shape: tuple[int, ...]) -> list[str]:
+    """A label for each number of an array, e.g. "c[1]"; of a single number, its name."""
+    return [f"{name}[{', '.join(map(str, index))}]" if index else name for index in np.ndindex(shape)]
+
+
+def is_within(entry: str, name: str) -> bool:
+    """Whether the entry is the one named, or part of it."""
+    return entry == name or entry.startswith((f"{name}.", f"{name}["))

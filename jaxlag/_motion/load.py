@@ -1,0 +1,90 @@
+"""Motions and fits from files."""
+
+import json
+import zipfile
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from .._mechanics.stick_slip import Regularised, StickSlip
+from .export import FORMAT, filled_outline
+from .provenance import Recorded
+from .results import result_of
+from .trajectory import Rubbing, Trajectory
+
+
+def load(file: str | Path) -> Any:
+    """A motion or a fit from a file that `Trajectory.save` or `Fit.save` has written. None of the user's functions are needed.
+
+    **Arguments:** `file`: the path, as it was given to `save`.
+
+    **Returns:** of a motion a `Trajectory` with all its samples, its result, stats, energies and slip velocities, and the numbers of its
+    params; what needs the system itself, as forces on points in `animate`, it refuses in a sentence. Mappings and sequences are dicts and
+    lists, of a NamedTuple or another object there is the dict of its fields. Of a fit the dict that `Fit.to_dict` made, and its card under
+    `"card"`.
+
+    **Raises:** `ValueError` where the file is none of these; what `open` raises.
+
+    **Source:** NumPy's format NPY 1.0 (NEP 1) in a ZIP archive, without pickled objects; JSON, RFC 8259.
+
+    ```python
+    import pathlib, tempfile
+    import jax.numpy as jnp
+    import jaxlag as jl
+    oscillator = jl.System(lambda q, qdot, c: 0.5 * qdot**2 - 0.5 * c * q**2)
+    motion = jl.simulate(oscillator, 1.0, 0.0, jnp.linspace(0, 10, 11), {"c": 4.0})
+    file = pathlib.Path(tempfile.mkdtemp()) / "motion.npz"
+    motion.save(file)
+    jl.load(file).q[-1]  # cos(2 · 10) = 0.408
+    ```
+    """
+    try:
+        about, arrays = _read(Path(file))
+        version = about.pop("format")
+        if about.pop("jaxlag") != ("Trajectory" if arrays else "Fit"):
+            raise KeyError
+    except (KeyError, TypeError, ValueError, zipfile.BadZipFile) as error:
+        raise ValueError(f"`file` must be written by `save` of a motion or a fit, but {str(file)!r} is not. Look at its name.") from error
+    if version > FORMAT:
+        raise ValueError(f"`file` must be of format {FORMAT} or before, but is of format {version}. Load it with a newer jaxlag.")
+    return _motion(about, arrays) if arrays else about
+
+
+def _read(file):
+    """What is said in a file, and its arrays."""
+    with open(file, "rb") as stream:
+        is_archive = stream.read(2) == b"PK"
+    if not is_archive:
+        return json.loads(file.read_text(encoding="utf-8")), {}
+    with np.load(file, allow_pickle=False) as archive:
+        arrays = dict(archive)
+    return json.loads(str(arrays.pop("about"))), arrays
+
+
+def _motion(about, arrays):
+    def part(prefix):
+        """The arrays of one kind, by their names within it."""
+        return {name.removeprefix(f"{prefix}."): jnp.asarray(x) for name, x in arrays.items() if name.startswith(f"{prefix}.")}
+
+    tree = lambda name: jax.tree.map(jnp.asarray, filled_outline(about["outlines"][name], arrays))
+    like = about["outlines"]["q"]
+    rate = lambda name: jax.tree.map(lambda leaf: jnp.asarray(arrays[name + leaf.removeprefix("q")]), like)
+    kinds = {kind.__name__: kind for kind in (StickSlip, Regularised)}
+    (friction,) = (kinds[name](**fields) for name, fields in about["friction"].items())
+    energy, rubbing = part("energy"), part("friction")
+    terms = list(dict.fromkeys(name.rpartition(".")[0] for name in rubbing))
+    return Trajectory(
+        ts=jnp.asarray(arrays["t"]),
+        q=tree("q"),
+        qdot=rate("qdot"),
+        qddot=rate("qddot"),
+        multipliers=tree("multipliers"),
+        result=result_of(arrays["result"]),
+        stats=part("stats"),
+        works=part("works") if about["audit"] else None,
+        friction={term: Rubbing(rubbing[f"{term}.force"], rubbing[f"{term}.sticking"]) for term in terms},
+        stated=Recorded((energy["h"], energy["turned"]), part("slip"), tree("params"), tuple(about["one_sided"]), friction),
+    )

@@ -1,0 +1,55 @@
+"""What a motion was computed from: the system and its params; or what is left of them in a file."""
+
+import equinox as eqx
+import jax
+from jaxtyping import Array, PyTree
+
+from .._mechanics.stick_slip import Regularised, StickSlip
+from .._model.system import System
+
+
+class Stated(eqx.Module):
+    """The system and params of a motion, and how friction was taken. What is no array in params is kept aside, so that batches of
+    motions are arrays alone.
+    """
+
+    numbers: list[Array]
+    system: System = eqx.field(static=True)
+    rest: tuple = eqx.field(static=True)
+    friction: StickSlip | Regularised = eqx.field(static=True)
+
+    @classmethod
+    def of(cls, system: System, params: PyTree, friction: StickSlip | Regularised = StickSlip()) -> "Stated":
+        leaves, structure = jax.tree.flatten(params)
+        numbers = [leaf for leaf in leaves if eqx.is_array(leaf)]
+        return cls(numbers, system, (structure, tuple(None if eqx.is_array(leaf) else leaf for leaf in leaves)), friction)
+
+    @property
+    def params(self) -> PyTree:
+        """The params, put together again."""
+        structure, others = self.rest
+        numbers = iter(self.numbers)
+        return jax.tree.unflatten(structure, [next(numbers) if other is None else other for other in others])
+
+    @property
+    def one_sided(self) -> tuple[str, ...]:
+        """Names of the constraints that cannot pull."""
+        return self.system.one_sided
+
+
+class Recorded(eqx.Module):
+    """What a motion from a file has in place of its system: what was computed by that, at the samples, before it was saved."""
+
+    energies: tuple[Array, Array]
+    slip: dict[str, Array]
+    params: PyTree
+    one_sided: tuple[str, ...] = eqx.field(static=True)
+    friction: StickSlip | Regularised = eqx.field(static=True)
+
+    @property
+    def system(self) -> System:
+        """There is none."""
+        raise ValueError(
+            "a motion that was loaded from a file must do without its system, whose functions are not in the file, but these are needed "
+            "here. Simulate it anew; energies, works and slip velocities are there as they were saved."
+        )

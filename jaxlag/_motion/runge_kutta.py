@@ -1,0 +1,151 @@
+"""Explicit Runge–Kutta schemes for small systems: one short loop over the stages, and dense output of high order."""
+
+from typing import Any, ClassVar
+
+import diffrax as dfx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import PyTree
+
+from .tableaux import DOP853, DOPRI5, Tableau
+
+LARGE = 128  # entries, above which a product by a library is faster than a sum of the compiler's own
+
+
+class Polynomial(dfx.AbstractLocalInterpolation):
+    """Dense output y₀ + s (F₁ + (1 − s) (F₂ + s (F₃ + (1 − s) (F₄ + …)))), s = (t − t₀)/(t₁ − t₀); k holds h ẏ₀, h ẏ₁, F₄, …
+
+    Source: Hairer, Nørsett & Wanner, Solving Ordinary Differential Equations I, section II.6.
+    """
+
+    t0: Any
+    t1: Any
+    y0: PyTree
+    y1: PyTree
+    k: PyTree
+
+    def evaluate(self, t0, t1=None, left=True):
+        if t1 is not None:
+            return jax.tree.map(jnp.subtract, self.evaluate(t1), self.evaluate(t0))
+        length = self.t1 - self.t0
+        s = jnp.where(length == 0, 0, (t0 - self.t0) / jnp.where(length == 0, 1, length))
+
+        def at_s(y0, y1, k):
+            change, (begin, end, *higher) = y1 - y0, k
+            terms, sum_ = [change, begin - change, 2 * change - begin - end, *higher], 0.0
+            for power in reversed(range(len(terms))):
+                sum_ = (sum_ + terms[power]) * (1 - s if power % 2 else s)
+            return y0 + sum_
+
+        return jax.tree.map(at_s, self.y0, self.y1, self.k)
+
+
+class ExplicitRungeKutta(dfx.AbstractAdaptiveSolver):
+    """An explicit Runge–Kutta scheme; the derivative at the end of a step is that at the start of the next."""
+
+    tableau: ClassVar[Tableau]
+    term_structure: ClassVar = dfx.AbstractTerm
+    interpolation_cls: ClassVar = Polynomial
+
+    def order(self, terms):
+        return self.tableau.order
+
+    def init(self, terms, t0, t1, y0, args):
+        return terms.vf(t0, y0, args)
+
+    def func(self, terms, t0, y0, args):
+        return terms.vf(t0, y0, args)
+
+    def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
+        scheme, h = self.tableau, terms.contr(t0, t1)
+        if made_jump is not False:
+            solver_state = jax.lax.cond(made_jump, lambda: terms.vf(t0, y0, args), lambda: solver_state)
+        changes = lambda weights, f: jax.tree.map(lambda f: terms.prod(weighted(weights, f), h), f)
+
+        def stage(f, row):
+            i, c, weights = row
+            t = jnp.where(c == 1, t1, t0 + c * (t1 - t0))  # not rounded beyond t1, where an input may jump
+            new = terms.vf(t, jax.tree.map(jnp.add, y0, changes(weights, f)), args)
+            return jax.tree.map(lambda f, new: jax.lax.dynamic_update_index_in_dim(f, new, i, 0), f, new), None
+
+        # One loop, so that the equations are compiled once. What is not there yet counts as nothing.
+        size, dtype = len(scheme.c), jnp.result_type(*jax.tree.leaves(y0))
+        first = jax.tree.map(lambda x: jnp.concatenate([x[None], jnp.zeros((size - 1, *x.shape), x.dtype)]), solver_state)
+        rows = np.arange(1, size), np.array(scheme.c[1:], dtype), as_rows(scheme.a, size, dtype)
+        f, _ = jax.lax.scan(stage, first, rows)
+
+        last = scheme.stages - 1
+        ends, estimates = np.eye(size)[[0, last]], len(scheme.errors)
+        every = changes(as_rows([*scheme.errors, scheme.a[last - 1], *ends, *scheme.dense], size, dtype), f)
+        error = jax.tree.map(lambda every: combined(*every[:estimates]), every)
+        y1 = jax.tree.map(lambda y0, every: y0 + every[estimates], y0, every)
+        series = jax.tree.map(lambda every: every[estimates + 1 :], every)
+        return y1, error, {"y0": y0, "y1": y1, "k": series}, jax.tree.map(lambda f: f[last], f), dfx.RESULTS.successful
+
+
+def is_explicit(solver: dfx.AbstractSolver) -> bool:
+    """Whether a solver solves no equations for its stages."""
+    return isinstance(solver, (ExplicitRungeKutta, dfx.AbstractERK))
+
+
+def as_rows(rows, size, dtype) -> np.ndarray:
+    """Weights as an array, each row with zeros up to `size`."""
+    return np.array([[*row, *[0.0] * (size - len(row))] for row in rows], dtype)
+
+
+def weighted(weights, f):
+    """Σ wᵢ fᵢ, for one row of weights or several.
+
+    A reduction, or a product: a sum of slices XLA would fuse into what uses it, and compute anew for each use.
+    """
+    if f.size > LARGE * len(f):
+        return jnp.tensordot(weights, f, 1, precision=jax.lax.Precision.HIGHEST)
+    weights = weights.reshape(*weights.shape, *[1] * (f.ndim - 1))
+    return jnp.sum(weights * f.reshape(*[1] * (weights.ndim - f.ndim), *f.shape), axis=weights.ndim - f.ndim)
+
+
+def combined(error, lower=None):
+    """The estimate of an error; of higher order with one of lower beside it, e |e| / √(e² + ℓ²/100), entry by entry."""
+    if lower is None:
+        return error
+    size = jnp.sqrt(error**2 + 0.01 * lower**2)
+    return jnp.where(size > 0, error * jnp.abs(error) / jnp.where(size > 0, size, 1), 0)
+
+
+class Dopri5(ExplicitRungeKutta):
+    r"""Dormand and Prince's scheme of order 5, with dense output of order 4.
+
+    $$ y_1 = y_0 + h \sum_i b_i f_i, \qquad f_i = f\Bigl(t_0 + c_i h,\; y_0 + h \sum_{j<i} a_{ij} f_j\Bigr) $$
+
+    For `simulate(solver=...)`, and for any `diffrax.diffeqsolve`; the state is any pytree. No arguments.
+
+    **Source:** Hairer, Nørsett & Wanner, Solving Ordinary Differential Equations I, table II.5.2 and section II.6.
+
+    ```python
+    import jaxlag as jl
+    fall = jl.System(lambda q, qdot: 0.5 * qdot**2 - 9.81 * q)
+    jl.simulate(fall, 0.0, 0.0, [0.0, 1.0], solver=jl.Dopri5()).q[-1]  # −9.81/2 = −4.905
+    ```
+    """
+
+    tableau: ClassVar = DOPRI5
+
+
+class Dop853(ExplicitRungeKutta):
+    r"""Dormand and Prince's scheme of order 8, its errors of orders 5 and 3, with dense output of order 7.
+
+    $$ y_1 = y_0 + h \sum_i b_i f_i, \qquad f_i = f\Bigl(t_0 + c_i h,\; y_0 + h \sum_{j<i} a_{ij} f_j\Bigr) $$
+
+    For `simulate(solver=...)`, and for any `diffrax.diffeqsolve`; the state is any pytree. No arguments.
+
+    **Source:** Hairer, Nørsett & Wanner, Solving Ordinary Differential Equations I, section II.10.
+
+    ```python
+    import jaxlag as jl
+    fall = jl.System(lambda q, qdot: 0.5 * qdot**2 - 9.81 * q)
+    jl.simulate(fall, 0.0, 0.0, [0.0, 1.0], solver=jl.Dop853()).q[-1]  # −9.81/2 = −4.905
+    ```
+    """
+
+    tableau: ClassVar = DOP853

@@ -1,0 +1,268 @@
+"""Many motions of one system at once."""
+
+import dataclasses
+import functools
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import diffrax as dfx
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.flatten_util import ravel_pytree
+from jax.sharding import Mesh, PartitionSpec
+from jaxtyping import Array, PyTree
+
+from .._mechanics.projection import Baumgarte, NoStabilisation, Projection
+from .._mechanics.stick_slip import Regularised, StickSlip
+from .._model.paths import is_within, leaf_names
+from .._model.signal import is_signal, jump_times, solved
+from .._model.system import System
+from .._model.validation import checked, coordinates, parameters, sample_times, state
+from .._program.jit import jitted
+from .derivative_rule import differentiable_abreast, pushed
+from .first_order import Equations
+from .integrate import How, begun, can_be_varied, judged, raise_failure, states_at, states_varied, tolerances_of
+from .results import RESULTS
+from .simulate import simulate, trajectory_of
+from .trajectory import Trajectory
+
+ABREAST = 64  # members that share their steps: as many as the cache holds the stages of
+
+
+def simulate_many(
+    system: System,
+    q0: PyTree,
+    qdot0: PyTree,
+    ts: Any,
+    params: PyTree = None,
+    *,
+    over: Sequence[str],
+    steps: str | None = None,
+    solver: dfx.AbstractSolver | None = None,
+    rtol: float | Array | None = None,
+    atol: float | Array | None = None,
+    stabilisation: Projection | Baumgarte | NoStabilisation = Projection(),
+    friction: StickSlip | Regularised = StickSlip(),
+    max_steps: int = 100_000,
+    throw: bool = True,
+) -> Trajectory:
+    r"""The motions of many machines that differ in their parameters or in their starts.
+
+    $$ M(q_i; p_i)\,\ddot q_i = f(q_i, \dot q_i; p_i) + G^T\lambda_i, \qquad i = 1 \dots B $$
+
+    What `over` names has the members as its first axis. The result is that of `simulate` for each of them, within the tolerances, with
+    the members as first axis of every field; derivatives are those of `simulate`, with up to 96 numbers of a member differentiated in
+    one pass. With several devices each takes its part of the members.
+
+    **Arguments:**
+
+    - `system`, `q0`, `qdot0`, `ts`, `params`, `solver` to `throw`: as `simulate`; `ts` is the same for all.
+    - `over`: what differs: "q0", "qdot0", entries of them ("q0.phi") or of `params` ("b", "wheel.c").
+    - `steps`: "common" has 64 members at a time take the same steps, short enough for each of them, with the members as the last axis
+      of all arithmetic: many times as fast as one by one. "own" lets each take its own. Default: "common", but "own" where there is
+      dry friction or a measured input that jumps, whose steps end at times that differ. Where one of 64 cannot go on, all stop: "own"
+      then says which.
+
+    **Returns:** a `Trajectory`. **Raises:** as `simulate`; `ValueError` where `over` or `steps` is none of these, or sizes differ.
+
+    **Source:** Hairer, Nørsett & Wanner, Solving Ordinary Differential Equations I, section II.4: a step fits a vector of equations
+    when it fits the worst of them.
+
+    ```python
+    import jax.numpy as jnp
+    import jaxlag as jl
+    oscillator = jl.System(lambda q, qdot, c: 0.5 * qdot**2 - 0.5 * c * q**2)
+    stiffness = jnp.linspace(1.0, 4.0, 1000)
+    motions = jl.simulate_many(oscillator, 1.0, 0.0, jnp.linspace(0, 10, 11), {"c": stiffness}, over=("c",))
+    motions.q[-1, -1]  # cos(2 · 10) = 0.408
+    ```
+    """
+    everything = {"q0": coordinates(q0, "q0"), "qdot0": coordinates(qdot0, "qdot0")}
+    everything["params"] = parameters(params, everything["q0"])
+    own, shared = eqx.partition(everything, _differing(everything, tuple(over)))
+    dtype = jnp.result_type(*jax.tree.leaves((everything["q0"], everything["qdot0"])))
+    how = How.of(solver, stabilisation, friction, max_steps)
+    if steps not in (None, "common", "own"):
+        raise ValueError(f'`steps` must be "common" or "own", but is {steps!r}. Leave it out to have it chosen.')
+    trajectory = _simulate_many(system, how, steps, own, shared, sample_times(ts, dtype), tolerances_of(rtol, atol, dtype))
+    if throw:
+        raise_failure(trajectory)
+    return trajectory
+
+
+def _differing(everything, over):
+    """Which leaves have the members as their first axis."""
+    params, starts = everything["params"], {name: everything[name] for name in ("q0", "qdot0")}
+    names = [*leaf_names(params, ""), *leaf_names(starts)]
+    leaves, sizes = [*jax.tree.leaves(params), *jax.tree.leaves(starts)], {}
+    for name in over:
+        within = [leaf for entry, leaf in zip(names, leaves, strict=True) if is_within(entry, name)]
+        if not within:
+            raise ValueError(f"`over` must name q0, qdot0 or entries of params, but holds {name!r}. There are {', '.join(names)}.")
+        sizes[name] = {np.shape(leaf)[:1] for leaf in within}
+    every = set().union(*sizes.values())
+    if len(every) != 1 or () in every:
+        shown = ", ".join(f"{name}: {sorted(of_name)}" for name, of_name in sizes.items())
+        raise ValueError(f"`over` must name what has all members as its first axis, but first axes are {shown}. Stack them alike.")
+    differs = [any(is_within(entry, name) for name in over) for entry in names]
+    of_params = jax.tree.unflatten(jax.tree.structure(params), differs[: len(jax.tree.leaves(params))])
+    of_starts = jax.tree.unflatten(jax.tree.structure(starts), differs[len(jax.tree.leaves(params)) :])
+    return {"params": of_params, **of_starts}
+
+
+@jitted
+def _simulate_many(system, how, steps, own, shared, ts, tolerances):
+    first = eqx.combine(jax.tree.map(lambda leaf: leaf[0], own), shared)
+    q0, qdot0 = state(first["q0"], first["qdot0"], ("q0", "qdot0"))
+    _, t0, q, v = checked(system, ts[0], q0, qdot0, first["params"])
+    equations = Equations.of(system, q0, how.stabilisation, how.friction, False, t0, q, v, first["params"])
+    members, (numbers, rest) = jax.tree.leaves(own)[0].shape[0], eqx.partition(shared, eqx.is_array)
+    if _common(steps, equations, first["params"], own):
+        batch = lambda own, *given: _side_by_side(system, equations, how, own, eqx.combine(given[0], rest), *given[1:])
+    else:
+        one = lambda own, *given: _alone(system, how, eqx.combine(own, given[0], rest), *given[1:])
+        batch = lambda own, *given: of_each(lambda own: one(own, *given), own)
+    if min(members, jax.device_count()) > 1:
+        devices = Mesh(np.array(jax.devices()), "members")
+        own = jax.tree.map(lambda leaf: filled_up(leaf, devices.size), own)
+        along, all_ = PartitionSpec("members"), PartitionSpec()
+        batch = jax.shard_map(batch, mesh=devices, in_specs=(along, all_, all_, all_), out_specs=along, check_vma=False)
+    return jax.tree.map(lambda leaf: leaf[:members], batch(own, numbers, ts, tolerances))
+
+
+def _common(steps, equations, params, own):
+    signals = [leaf for leaf in jax.tree.leaves(own, is_leaf=is_signal) if is_signal(leaf) and jax.tree.leaves(leaf)]
+    obstacle = equations.rows or signals or jump_times(params, float) is not None
+    if steps == "common" and obstacle:
+        raise ValueError(
+            '`steps` must be "own" where dry friction or a jumping input ends steps at times of its own, or where signals differ, but is '
+            '"common". Leave it out.'
+        )
+    return steps != "own" and not obstacle
+
+
+def of_each(function: Callable, members: PyTree) -> PyTree:
+    """`function` of each member, each with steps of its own.
+
+    In turn on a CPU, where in a batch all would go on until the slowest has ended, and pay for both branches of every choice.
+    """
+    return jax.lax.map(function, members) if jax.default_backend() == "cpu" else jax.vmap(function)(members)
+
+
+def filled_up(leaf, size):
+    """With copies of the last member, to a multiple of a size."""
+    return jnp.concatenate([leaf, jnp.repeat(leaf[-1:], -len(leaf) % size, axis=0)])
+
+
+def _alone(system, how, everything, ts, tolerances):
+    """One member, with steps of its own."""
+    numerics = dict(solver=how.solver, stabilisation=how.stabilisation, friction=how.friction, max_steps=how.max_steps)
+    start = everything["q0"], everything["qdot0"]
+    return simulate(system, *start, ts, everything["params"], rtol=tolerances[0], atol=tolerances[1], **numerics, throw=False)
+
+
+def _side_by_side(system, equations, how, own, shared, ts, tolerances):
+    """Members in groups of those that share their steps."""
+    members = jax.tree.leaves(own)[0].shape[0]
+    size = min(members, ABREAST)
+    groups = jax.tree.map(lambda leaf: (x := filled_up(leaf, size)).reshape(-1, size, *x.shape[1:]), own)
+    found = jax.lax.map(lambda own: _group(system, equations, how, own, shared, ts, tolerances), groups)
+    return jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:])[:members], found)
+
+
+def _group(system, equations, how, own, shared, ts, tolerances):
+    """Members that share their steps."""
+    solve = functools.partial(_motions, equations, how)
+    run = differentiable_abreast(solve, functools.partial(_drift, equations), functools.partial(_varied_motions, equations, how))
+    last = jax.tree.map(lambda leaf: jnp.moveaxis(leaf, 0, -1), own)
+    ys, (result, stats, moved) = run(((ts[0], tolerances, shared), last), ts)
+
+    last_t, last_ys = stats.pop("last")
+
+    def one(ys, last_y, result, moved, own):
+        params = eqx.combine(own, shared)["params"]
+        of_member = stats | {"start_moved": moved, "last": (last_t, last_y)}
+        return trajectory_of(system, equations, ts, ys, params, result, of_member, tolerances)
+
+    return jax.vmap(one, in_axes=(-1, -1, 0, 0, 0))(ys, last_ys, result, moved, own)
+
+
+def _motions(equations, how, inputs, ts):
+    """States at the samples, (T, size, members); and, not differentiated, why each motion ended, the counts, how far starts were off."""
+    (t0, tolerances, shared), own = inputs
+    y0, start = _started(equations, inputs, ts)
+    args = (solved(shared["params"]), own["params"]), None
+    ys, result, stats = states_at(Abreast(equations), how, dfx.ForwardMode(), t0, y0, ts, args, tolerances)
+    return _judged(ys, result, stats, start)
+
+
+def _varied_motions(equations, how, moving, still, directions, ts):
+    """The same with derivatives along directions of what moves, by the variational equations where they hold."""
+    (t0, tolerances, shared), own = eqx.combine(moving, still)
+    if not can_be_varied(equations, how, moving[0][2]["params"], shared["params"]):
+        return pushed(functools.partial(_motions, equations, how))(moving, still, directions, ts)
+    started = lambda moving: _started(equations, eqx.combine(moving, still), ts)
+    args = (solved(shared["params"]), own["params"]), (directions[0][2]["params"], directions[1]["params"])
+    along_all = moving, directions, t0, directions[0][0], ts, args
+    ys, change, *rest = states_varied(Abreast(equations), how, started, *along_all, tolerances)
+    ys, aux = _judged(ys, *rest)
+    return ys, jnp.where(jnp.isfinite(ys)[..., None], change, 0), aux
+
+
+def _started(equations, inputs, ts):
+    """y0; and, not differentiated, how far starts were off and what is wrong with them."""
+    (t0, _, shared), own = inputs
+    shared = shared | {"params": solved(shared["params"])}
+
+    def start(own):
+        member = eqx.combine(own, shared)
+        q, v = (ravel_pytree(member[name])[0] for name in ("q0", "qdot0"))
+        found = begun(equations, t0, q, v, member["params"])
+        return found.y, (found.moved, judged(found.y, RESULTS.successful, found.obstacles, (member, ts))[1])
+
+    y0, start = jax.vmap(start, in_axes=-1, out_axes=(-1, 0))(own)
+    return y0, start
+
+
+def _judged(ys, result, stats, start):
+    moved, started = start
+    result = jax.vmap(lambda started: RESULTS.where(started == RESULTS.successful, result, started))(started)
+    return jnp.where((started == RESULTS.successful)[None, None] & jnp.isfinite(ys), ys, jnp.nan), (result, stats, moved)
+
+
+def _drift(equations, inputs, ts, ys):
+    (_, _, shared), own = inputs
+    args = (shared["params"], own["params"]), None
+    return jax.vmap(lambda t, y: Abreast(equations).rates(t, y, args))(ts, ys)
+
+
+@dataclasses.dataclass(frozen=True)
+class Abreast:
+    """The equations of motion of members that share their steps, as one system: y has them as its last axis."""
+
+    equations: Equations
+    rows = 0
+
+    @property
+    def size(self) -> int:
+        return self.equations.size
+
+    @property
+    def projection(self) -> Projection | None:
+        return self.equations.projection
+
+    def error_norm(self, error):
+        """That of the worst."""
+        return jnp.max(self.equations.error_norm(error))
+
+    def rates(self, t, y, args):
+        return self._each(self.equations.rates, t, y, args)
+
+    def kept(self, t, y, args):
+        return self._each(self.equations.kept, t, y, args)
+
+    def _each(self, function, t, y, args):
+        (shared, own), scales = args
+        return jax.vmap(lambda y, own: function(t, y, (eqx.combine(shared, own), scales)), in_axes=-1, out_axes=-1)(y, own)

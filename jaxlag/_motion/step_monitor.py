@@ -1,0 +1,183 @@
+"""Watching a step, so that no end of a mode and no pulse is missed.
+
+A mode may end and begin again between two looks in two ways. What follows the state is smooth on a step, so a dip shows in the slopes at
+the looks on both sides of it. What follows the time alone, a load that comes as a pulse, need not show at all: bounds of it over the
+whole interval (`_program.time_bounds`) say by how much it may have changed there. Wherever a margin may have been used up, looks are
+closer.
+"""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.flatten_util import ravel_pytree
+from jaxtyping import Array, Float
+
+from .._program.time_bounds import OfTime, of_time
+
+LOOKS = 8  # parts of an interval, at whose ends it is looked at
+NEARER = (1e-2, 1e-4, 1e-7)  # of an interval with an end in it, how close around the root of its chord it is looked at next
+SECTIONS = 60  # of an interval with an end in it; some four do where the margin is smooth, and each halves it where it jumps
+ROUNDS = 256  # of looks, after which the step is too long to be watched
+BRIEF = 1e-7  # of the motion, how long anything lasts that is looked for,
+UNBOUNDED = 2e-4  # where part of the time dependence has no bounds
+PARTS = 64  # of a step, over which bounds are taken
+FAINT = 1e-6  # of its largest value, what a pulse may be and be overlooked
+NEAR = 64  # roundings of time, below which no dip is looked for
+
+
+class Seen(NamedTuple):
+    """Along a step: whether a mode ends, a bound turns negative before, or neither is sure; when; the slopes of the margins there."""
+
+    ended: Any
+    negative: Any
+    unsure: Any
+    time: Any
+    slope: Float[Array, " e"]  # −∞ where a margin jumps
+
+
+class Looks(NamedTuple):
+    """Margins and bounds at some times: values and slopes, and by how much the time alone may have changed them in between."""
+
+    value: Float[Array, "k m"]
+    slope: Float[Array, "k m"]
+    change: Float[Array, "k-1 m"]
+
+
+class _Search(NamedTuple):
+    """The interval looked at; whether an end is in it; how often was looked, and how often since; what was seen at its ends."""
+
+    low: Any
+    high: Any
+    found: Any
+    rounds: Any
+    sections: Any
+    before: Float[Array, " m"]
+    behind: Float[Array, " m"]
+    slope: Float[Array, " m"]
+    largest: Float[Array, " m"]
+
+
+def first_end(margins: Callable, path: Callable, t0, t1, elements: int, scales: Any, exactly: Any = True) -> Seen:
+    """When the first of `margins(t, y)` turns negative along a `path`; the elements' bounds come after their margins, and count as well.
+
+    Not `exactly`: only whether there is one.
+    """
+    parted = of_time(margins, t0, path(t0))
+    look, near = _looking(margins, path, t0, t1, parted), NEAR * scales.rounding
+    brief = jnp.maximum(BRIEF * scales.duration, near)
+    if parted is not None and not parted.is_bounded:
+        brief = jnp.maximum(brief, jnp.minimum(UNBOUNDED * scales.duration, scales.spacing))
+
+    def closer(search):
+        low, high, found, rounds, sections, *_, largest = search
+        ts = jnp.where(found, _around(low, high, *search[5:7]), low + (high - low) / LOOKS * np.arange(LOOKS + 1)).at[-1].set(high)
+        part = jnp.diff(ts)[:, None]
+        value, slope, change = look(ts)
+        largest = jnp.maximum(largest, jnp.max(jnp.abs(value), axis=0))
+        value = value.at[:, elements:].add(1e-9 * largest[None, elements:])  # a bound of zero is none that is negative
+        beyond = jnp.any(value[1:] < 0, axis=1)
+        doubtful = jnp.any(_dips(value, slope, part) & (part > near) | (value[:-1] + value[1:] < change) & (part > brief), axis=1)
+        wanted = beyond | (doubtful & ~found)
+        i = jnp.where(jnp.any(wanted), jnp.argmax(wanted), LOOKS - 1)  # the end itself may be beyond by rounding alone
+        onward = ~found & ~jnp.any(wanted)
+        hit = ~onward & beyond[i]
+        new = lambda now, before: jnp.where(hit, now, before)
+        return _Search(
+            jnp.where(onward, high, ts[i]),
+            jnp.where(onward, t1, ts[i + 1]),
+            found | hit,
+            rounds + 1,
+            sections + (found | hit),
+            *(new(now, before) for now, before in zip((value[i], value[i + 1], slope[i + 1]), search[5:8], strict=True)),
+            largest,
+        )
+
+    def going_on(search):
+        wide = search.high - search.low > jnp.maximum(4 * scales.rounding, 1e-13 * (t1 - t0))
+        narrowing = exactly & wide & (search.sections < SECTIONS)
+        return jnp.where(search.found, narrowing, (search.low < t1) & (search.rounds < ROUNDS))
+
+    nothing, time = jnp.zeros(2 * elements, path(t0).dtype), jnp.asarray(t0, path(t0).dtype)
+    start = _Search(time, jnp.asarray(t1, time.dtype), jnp.array(False), 0, 0, *[nothing] * 4)
+    done = jax.lax.while_loop(going_on, closer, start)
+    steep = 10 * jnp.abs(done.slope) * (done.high - done.low) + 1e-9 * done.largest
+    slope = jnp.where((done.behind < 0) & (done.before - done.behind > steep), -jnp.inf, done.slope)
+    is_margin = jnp.any(done.behind[:elements] < 0)
+    return Seen(done.found & is_margin, done.found & ~is_margin, ~done.found & (done.low < t1), done.high, slope[:elements])
+
+
+def is_hidden(rates: Callable, nodes: np.ndarray, t0, t1, y, scales: Any) -> Any:
+    """Whether some part of `rates(t, y)` that follows the time alone goes, within a step, far beyond what the stages see of it.
+
+    Such a pulse the error of the step does not know of. `nodes` are the times of the stages, from 0 to 1.
+    """
+    parted = of_time(rates, t0, y)
+    if parted is None or not parted.is_bounded:
+        return jnp.array(False)
+    flat = lambda leaves: jnp.concatenate([jnp.ravel(leaf).astype(y.dtype) for leaf in leaves])
+    ends = lambda start, end: [flat(side) for side in zip(*parted.bounds(start, end), strict=True)]
+    seen = jax.vmap(lambda t: flat(parted.phi(t)))(t0 + (t1 - t0) * nodes)
+    least, most = jnp.min(seen, axis=0), jnp.max(seen, axis=0)
+    grid = t0 + (t1 - t0) * np.linspace(0, 1, PARTS + 1)
+    low, high = jax.vmap(ends)(grid[:-1], grid[1:])
+    beyond = jnp.maximum(jnp.max(high, axis=0) - most, least - jnp.min(low, axis=0))
+    largest = jnp.max(jnp.abs(jnp.stack(ends(t0, t0 + scales.duration))), axis=0)
+    found = beyond > (most - least) / 2 + FAINT * largest
+    return jax.lax.stop_gradient(jnp.any(found) & (t1 - t0 > BRIEF * scales.duration))
+
+
+def _around(low, high, before, behind):
+    """Times close to where the first of some chords is zero, and halfway, for a margin that jumps."""
+    share = jnp.where(behind < 0, before / jnp.where(behind < 0, before - behind, 1), 1)
+    root = low + (high - low) * jnp.clip(jnp.min(share), 0, 1)
+    near = (high - low) * np.array([*NEARER, *(-d for d in NEARER)])
+    return jnp.sort(jnp.clip(jnp.stack([low, high, (low + high) / 2, *(root + near)]), low, high))
+
+
+def _dips(value, slope, part):
+    """Where the tangents at both ends of a part meet below zero."""
+    (left, right), (falls, rises) = (value[:-1], value[1:]), (slope[:-1], slope[1:])
+    turns = (falls < 0) & (rises > 0)
+    meeting = (right - left - rises * part) / jnp.where(turns, falls - rises, 1)
+    return turns & (left + falls * meeting < 0)
+
+
+def _looking(margins, path, t0, t1, parted: OfTime | None) -> Callable[..., Looks]:
+    """Looks at some times along a path."""
+
+    def along(t):
+        y, dy = jax.jvp(path, (t,), (jnp.ones_like(t),))
+        return jax.jvp(margins, (t, y), (jnp.ones_like(t), dy))
+
+    if parted is None:
+        changed = lambda ts: jnp.zeros(())
+    else:
+        reach = jnp.max(jax.vmap(lambda t: _reach(parted, t, path(t)))(jnp.linspace(t0, t1, 3)), axis=0)
+        changed = lambda ts: jax.vmap(lambda start, end: _change(parted, reach, start, end))(ts[:-1], ts[1:])
+
+    def looks(ts):
+        value, slope = jax.vmap(along)(ts)
+        return Looks(value, slope, changed(ts))
+
+    return looks
+
+
+def _reach(parted: OfTime, t, y) -> Float[Array, "m p"]:
+    """|∂f/∂φ|."""
+    found = parted.phi(t)
+    phi, unravel = ravel_pytree(eqx.filter(found, eqx.is_inexact_array))
+    return jnp.abs(jax.jacfwd(lambda phi: parted.rest(eqx.combine(unravel(phi), found), y))(phi))
+
+
+def _change(parted: OfTime, reach, start, end):
+    """By how much φ may change f from one time to another, with |∂f/∂φ|; choices may change it altogether."""
+    intervals = parted.bounds(start, end)
+    widths = [high - low for low, high in intervals if jnp.issubdtype(low.dtype, jnp.inexact)]
+    switches = [jnp.any(low != high) for low, high in intervals if not jnp.issubdtype(low.dtype, jnp.inexact)]
+    width = jnp.concatenate([jnp.ravel(width) for width in widths]) if widths else jnp.zeros(0, reach.dtype)
+    change = jnp.sum(jnp.where(reach == 0, 0, reach * width[None]), axis=1)
+    return jnp.where(jnp.any(jnp.stack(switches)), jnp.inf, change) if switches else change

@@ -1,0 +1,312 @@
+"""A motion at sample times: its states, forces, energies and works."""
+
+import dataclasses
+import functools
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.flatten_util import ravel_pytree
+from jaxtyping import Array, Bool, Float, PyTree
+
+from .._mechanics.friction_terms import kinks_of
+from .._mechanics.power import energy_turnover
+from .._mechanics.stick_slip import Regularised
+from .._model.paths import leaf_names
+from .._model.system import bind
+from .._program.jit import compiled, is_concrete
+from .export import arrays_of, frame_of, outline, write_arrays
+from .interpolation import Moving, between
+from .provenance import Recorded, Stated
+from .results import RESULTS, names_of, reason_of
+
+
+class Rubbing(eqx.Module):
+    """Dry friction along a motion: the `force` on each slip velocity, also while it sticks, and whether it is `sticking`."""
+
+    force: Float[Array, "..."]
+    sticking: Bool[Array, "..."]
+
+
+class Instant(eqx.Module):
+    """A motion at one of its samples: `t`, and the state there, e.g. to go on from."""
+
+    t: Float[Array, ""]
+    q: PyTree
+    qdot: PyTree
+    qddot: PyTree
+    multipliers: dict[str, PyTree]
+
+
+class Interpolated(eqx.Module):
+    """A motion at other times `ts`, as `Trajectory.at` gives it.
+
+    - `q`, `qdot`, `qddot`: structured like q0, with the axes of `ts` first. NaN outside the motion.
+    - `q_error`, `qdot_error`: how far they may be off, by what interpolation misses samples by that are left out: where the motion is
+      smooth, some 64 and 18 times too much.
+    """
+
+    ts: Float[Array, "..."]
+    q: PyTree
+    qdot: PyTree
+    qddot: PyTree
+    q_error: PyTree
+    qdot_error: PyTree
+
+
+COUNTED = ("transitions", "time_stuck")  # entries of `stats` that have the samples as first axis, counted from the start
+
+
+class Trajectory(eqx.Module):
+    """A motion at sample times: each field has the samples as its first axis; of many motions, the members.
+
+    `len(motion)` is the number of samples, `motion[-1]` the last one (an `Instant`), `motion[100:200]` and `motion[motion.ts > 1]` are
+    motions again, which start at the first sample they keep: works count from there. Of many motions (`simulate_many`, `vmap`),
+    `motions[3]` is one of them. `motion.at(ts)` is the motion between the samples.
+
+    - `ts`: the times; `q`, `qdot`, `qddot`: structured like q0; `multipliers`: λ by the constraint's name.
+    - `result`: `RESULTS.successful`, or the reason of failure; samples that were not reached are NaN.
+    - `friction`: by the name of the dissipation term, the `force` on its slip velocities and whether they are `sticking`.
+    - `works`: what `work()` returns, where the motion was computed with `audit=True`.
+    - `stats`: `num_steps`, `num_accepted_steps`, `num_rejected_steps`, and `start_moved`, how far the start was projected. With dry
+      friction, at each sample and since the start: `transitions`, how often slip velocities changed between sliding and sticking or
+      reversed; `time_stuck`, for how long each of them has stuck.
+    """
+
+    ts: Float[Array, "*members T"]
+    q: PyTree
+    qdot: PyTree
+    qddot: PyTree
+    multipliers: dict[str, PyTree]
+    result: RESULTS
+    stats: dict[str, Any]
+    works: dict[str, Float[Array, "*members T"]] | None
+    friction: dict[str, Rubbing]
+    stated: Stated | Recorded
+
+    @property
+    def succeeded(self) -> Any:
+        """Whether the motion was computed to its end."""
+        return self.result == RESULTS.successful
+
+    def energy(self) -> Float[Array, " T"]:
+        """The energy h = q̇ · ∂L/∂q̇ − L at the samples; T + V where L = T − V with T quadratic in q̇."""
+        return energies(self)[0]
+
+    def work(self) -> dict[str, Float[Array, " T"]]:
+        """Work since the start of each dissipation term, force and constraint by its name, of explicit time in L (`"time"`), and of the
+        projection (`"projection"`). Integrated along with the motion: needs `simulate(..., audit=True)`.
+        """
+        if self.works is None:
+            raise ValueError(
+                "the motion must be computed with its works, but was computed without. Ask for them by `simulate(..., audit=True)`."
+            )
+        return self.works
+
+    def balance(self) -> Float[Array, " T"]:
+        """Residual of the energy balance, ΔE − ΣW, as a fraction of the energy turned over: the largest q̇ · ∂L/∂q̇ and all works."""
+        energy, turned = energies(self)
+        works = jnp.stack(list(self.work().values()))
+        scale = jnp.nanmax(jnp.abs(turned)) + jnp.nansum(jnp.nanmax(jnp.abs(works), axis=1))
+        return (energy - energy[0] - jnp.sum(works, axis=0)) / jnp.where(scale > 0, scale, 1)
+
+    def slip(self) -> dict[str, Float[Array, "..."]]:
+        """The slip velocities of each dissipation term with dry friction, shaped like `friction[name].force`."""
+        return self.stated.slip if isinstance(self.stated, Recorded) else _slips(self)
+
+    def pulling(self) -> dict[str, PyTree]:
+        """By the name of each constraint that is `one_sided`, at which samples λ < 0: there it would have to pull, and the contact would
+        have opened. What is below the rounding of the largest |λ| is zero. Where redundant rows share a load, λ is that of least norm.
+        """
+        axis = self.ts.ndim - 1
+
+        def below(x):
+            return x < -(jnp.finfo(x.dtype).eps ** 0.5) * jnp.nanmax(jnp.abs(x), axis=axis, keepdims=True)
+
+        return {name: jax.tree.map(below, self.multipliers[name]) for name in self.stated.one_sided}
+
+    def __len__(self) -> int:
+        return self.ts.shape[0]
+
+    def __getitem__(self, which: Any) -> Any:
+        kind = None if isinstance(which, slice) else which.dtype if hasattr(which, "dtype") else np.asarray(which).dtype
+        holds = lambda kinds: kind is not None and jnp.issubdtype(kind, kinds)
+        is_one = holds(jnp.integer) and np.ndim(which) == 0
+        if is_one and is_concrete(which) and not -len(self) <= which < len(self):
+            raise IndexError(f"`motion[{which}]` must be there, but there are {len(self)} {'members' if self.ts.ndim > 1 else 'samples'}.")
+        chosen = functools.partial(jax.tree.map, lambda x: x[which])
+        if self.ts.ndim > 1:
+            return chosen(self)
+        if is_one:
+            return Instant(*chosen((self.ts, self.q, self.qdot, self.qddot, self.multipliers)))
+        is_forward = isinstance(which, slice) and (which.step is None or which.step > 0)
+        if not (is_forward or (holds(jnp.bool_) and np.shape(which) == self.ts.shape)):
+            raise TypeError(
+                f"`motion[...]` must be asked for a sample, a slice forward in time or a mask of the samples, but is for {which!r}. "
+                "Write e.g. `motion[-1]`, `motion[100:200]`, `motion[motion.ts > 1]`."
+            )
+        if not self.ts[which].size:
+            raise ValueError(f"`motion[...]` must keep at least one sample, but keeps none of the {len(self)}.")
+        since = lambda count: chosen(count) - chosen(count)[:1]
+        counts = {name: since(count) if name in COUNTED else count for name, count in self.stats.items()}
+        works = None if self.works is None else jax.tree.map(since, self.works)
+        stated = self.stated
+        if isinstance(stated, Recorded):
+            stated = dataclasses.replace(stated, energies=chosen(stated.energies), slip=chosen(stated.slip))
+        states = chosen((self.ts, self.q, self.qdot, self.qddot, self.multipliers))
+        return Trajectory(*states, self.result, counts, works, chosen(self.friction), stated)
+
+    def at(self, ts: Any) -> Interpolated:
+        r"""The motion at other times, one or an array of them, interpolated between the samples by their q, q̇ and q̈.
+
+        $$ |\delta q| \le \frac{h^6}{46080}\,|q^{(6)}|, \qquad |\delta\dot q| \le \frac{h^4}{384}\,|q^{(5)}|, \qquad
+           |\delta\ddot q| \le \frac{\sqrt3\,h^3}{216}\,|q^{(5)}| $$
+
+        with h from sample to sample, where the motion is smooth; where friction changes or an input jumps between two samples, δq is of
+        the order of h² times the jump of q̈. `q_error` and `qdot_error` are estimates for both cases. λ is not interpolated: it follows
+        from the state by `acceleration`. Differentiable, also in `ts`.
+
+        **Raises:** `ValueError` where a time lies outside the motion (under `jit` the state there is NaN), for many motions at once, and
+        where there are less than two samples.
+
+        **Source:** Hairer, Nørsett & Wanner, Solving Ordinary Differential Equations I, section II.6.
+        """
+        if self.ts.ndim > 1 or len(self) < 2:
+            what = f"{len(self)} motions" if self.ts.ndim > 1 else "one sample"
+            raise ValueError(
+                f"`at` must interpolate between the samples of one motion, but has {what}. Take one with several, e.g. `motions[0].at(ts)`."
+            )
+        ts = jnp.asarray(ts, self.ts.dtype)
+        if is_concrete(ts, self.ts):
+            (first, last), slack = np.asarray(self.ts)[[0, -1]], 4 * np.finfo(ts.dtype).eps * np.max(np.abs(self.ts))
+            outside = np.ravel(ts)[(np.ravel(ts) < first - slack) | (np.ravel(ts) > last + slack)]
+            if outside.size:
+                raise ValueError(
+                    f"`ts` must lie within the motion, from {first:g} to {last:g}, but holds {outside[0]:g}. Simulate further."
+                )
+        shaped = lambda tree: jax.tree.map(lambda x: x.reshape(*ts.shape, *x.shape[1:]), tree)
+        return Interpolated(ts, *map(shaped, _between(self, jnp.ravel(ts))))
+
+    def to_dict(self) -> dict[str, np.ndarray]:
+        """All samples as NumPy arrays by flat names: "t", "q.x", "qdot.x", "qddot.x", "multipliers.rod", "friction.brake.force",
+        "friction.brake.sticking", "works.brake"; "q" where q is one array.
+        """
+        states = dict(q=self.q, qdot=self.qdot, qddot=self.qddot, multipliers=self.multipliers)
+        return arrays_of(t=self.ts, **states, friction=self.friction, works=self.works)
+
+    def to_dataframe(self, frame: Callable | None = None) -> Any:
+        """A table with a row for each sample and the columns of `to_dict`, "r[0]", "r[1]", … of an array; `jl.Experiment.from_dataframe`
+        reads it.
+
+        **Arguments:** `frame`: what makes the table from columns: `pandas.DataFrame`, `polars.DataFrame`. Default: that of pandas where it
+        is installed, else of polars.
+
+        **Raises:** `ValueError` for many motions at once, `ImportError` where there is neither pandas nor polars.
+        """
+        if self.ts.ndim > 1:
+            raise ValueError(f"`to_dataframe` must be of one motion, but there are {len(self)}. Take one of them, e.g. `motions[0]`.")
+        entry = lambda name, at: f"{name}[{', '.join(map(str, at))}]" if at else name
+        arrays = self.to_dict().items()
+        return frame_of({entry(name, at): x[:, *at] for name, x in arrays for at in np.ndindex(x.shape[1:])}, frame)
+
+    def save(self, file: str | Path) -> None:
+        """Writes the motion to a file that NumPy reads (.npz), with its energies and slip velocities; `jl.load` makes a `Trajectory` of it,
+        for which none of the functions of the system are needed. Pickles do need them.
+
+        Of params the numbers are kept. Structures become dicts and lists: of a NamedTuple the dict of its fields.
+        """
+        each = lambda function: functools.reduce(lambda f, _: jax.vmap(f), self.ts.shape[1:], function)
+        kept = Recorded(each(energies)(self), each(Trajectory.slip)(self), self.stated.params, self.stated.one_sided, self.stated.friction)
+        numbers = jax.tree.map(lambda leaf: leaf if eqx.is_array(leaf) else None, kept.params)
+        more = arrays_of(stats=self.stats, energy=dict(zip(("h", "turned"), kept.energies, strict=True)), slip=kept.slip, params=numbers)
+        trees = dict(q=self.q, multipliers=self.multipliers, params=numbers)
+        write_arrays(
+            file,
+            "Trajectory",
+            self.to_dict() | more | {"result": names_of(self.result)},
+            outlines={name: outline(tree, arrays_of(**{name: tree})) for name, tree in trees.items()},
+            audit=self.works is not None,
+            one_sided=kept.one_sided,
+            friction={type(kept.friction).__name__: dataclasses.asdict(kept.friction)},
+        )
+
+    def _vectors(self):
+        return [_ravelled(tree) for tree in (self.q, self.qdot)]
+
+    def _flat(self):
+        return bind(self.stated.system, jax.tree.map(lambda leaf: leaf[0], self.q), self.stated.params)
+
+    def __repr__(self) -> str:
+        if not is_concrete(self):
+            return "Trajectory(traced)"
+        batch = self.ts.shape[:-1]
+        rows = [("coordinates", ", ".join(leaf_names(self.q)))]
+        if self.multipliers:
+            rows.append(("constraints", ", ".join(self.multipliers)))
+        steps, rejected = (np.asarray(self.stats[key]) for key in ("num_steps", "num_rejected_steps"))
+        rows.append(("steps", f"{steps.max()}, {rejected.max()} of them rejected" + (" (the most in the batch)" if batch else "")))
+        if self.multipliers:
+            rows.append(("start moved by", f"{np.max(self.stats['start_moved']):.2g}"))
+        if self.friction:
+            transitions, stuck = (np.nan_to_num(self.stats[name]) for name in COUNTED)  # NaN where the motion has not come to
+            most = " (the most in the batch)" if batch else ""
+            rows.append(("friction", f"{int(transitions.max())} transitions, stuck for {stuck.max():.4g}{most}"))
+        if isinstance(self.stated.friction, Regularised):
+            rows.append(("friction", f"made smooth below a slip velocity of {self.stated.friction.width:g}, where it creeps"))
+        if self.works is not None:
+            residual = self.balance() if not batch else jax.vmap(lambda motion: motion.balance())(self)
+            rows.append(("energy balance", f"off by {np.nanmax(np.abs(residual)):.1e} of the energy turned over"))
+        for name, pulls in self.pulling().items():
+            rows.append(("one-sided", _pulled(name, pulls, self)))
+        rows.append(("result", "successful" if np.all(self.succeeded) else reason_of(self.result)))
+        of = f"{' × '.join(map(str, batch))} motions of " if batch else ""
+        head = f"Trajectory: {of}{self.ts.shape[-1]} samples, t = {np.min(self.ts):g} … {np.max(self.ts):g}"
+        return "\n".join([head, *(f"  {name:<15}{value}" for name, value in rows)])
+
+
+@compiled  # so that parameters are unknown, as they were in the motion: a friction of 0 is one, too
+def _slips(motion: Trajectory) -> dict[str, Float[Array, "..."]]:
+    flat, (q, v) = motion._flat(), motion._vectors()
+    kinks = kinks_of(flat, motion.ts[0], q[0], v[0]) if motion.friction else None
+    if kinks is None:
+        return {}
+    slip = jax.vmap(kinks.slip)(motion.ts, q, v)
+    return {name: slip[:, rows].reshape(motion.friction[name].force.shape) for name, rows in kinks.rows_of_term.items()}
+
+
+def energies(motion: Trajectory) -> tuple[Float[Array, " T"], Float[Array, " T"]]:
+    """The energy h and q̇ · ∂L/∂q̇ at the samples."""
+    return motion.stated.energies if isinstance(motion.stated, Recorded) else _energies(motion)
+
+
+def _ravelled(tree):
+    return jax.vmap(lambda leaf: ravel_pytree(leaf)[0])(tree)
+
+
+@compiled
+def _energies(motion):
+    return jax.vmap(functools.partial(energy_turnover, motion._flat()))(motion.ts, *motion._vectors())
+
+
+@compiled
+def _between(motion, at):
+    unravelled = jax.vmap(ravel_pytree(jax.tree.map(lambda leaf: leaf[0], motion.q))[1])
+    found, error = between(motion.ts, Moving(*map(_ravelled, (motion.q, motion.qdot, motion.qddot))), at)
+    return [unravelled(x) for x in (*found, error.q, error.v)]
+
+
+def _pulled(name, pulls, motion):
+    """What the card says of a constraint that cannot pull."""
+    samples = lambda tree: np.concatenate([np.reshape(x, (*motion.ts.shape, -1)) for x in jax.tree.leaves(tree)], axis=-1)
+    where, multipliers = np.any(samples(pulls), axis=-1), samples(motion.multipliers[name])
+    if not where.any():
+        return f"{name!r} never pulls"
+    several = f"of {int(where.any(axis=-1).sum())} motions " if where.ndim > 1 else ""
+    return (
+        f"{name!r} would have to pull at {where.sum()} of {where.size} samples {several}(first at t = {motion.ts[where].min():g}, "
+        f"λ down to {np.nanmin(multipliers):.3g}): its contact would have opened"
+    )

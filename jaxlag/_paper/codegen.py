@@ -1,0 +1,183 @@
+"""Equations of motion as programs that need nothing of this package: NumPy, C."""
+
+import keyword
+import re
+from typing import NamedTuple
+
+import sympy
+from sympy import Expr, Matrix, Symbol
+from sympy.printing.c import C99CodePrinter, reserved_words
+from sympy.printing.codeprinter import CodePrinter, PrintMethodNotImplementedError
+from sympy.printing.numpy import NumPyPrinter
+
+from .derivation import derivative
+
+
+class Program(NamedTuple):
+    """What is computed from what: q̈ and λ, which make the residuals zero, by formulas where all have one."""
+
+    t: Symbol
+    q: tuple[Symbol, ...]
+    qdot: tuple[Symbol, ...]
+    qddot: tuple[Symbol, ...]
+    params: list[tuple[Symbol, str]]  # and how Python reaches them
+    multipliers: tuple[Symbol, ...]
+    residuals: tuple[Expr, ...]
+    solution: dict[Symbol, Expr]
+
+    @property
+    def unknowns(self) -> tuple[Symbol, ...]:
+        """Accelerations, then multipliers: z."""
+        return (*self.qddot, *self.multipliers)
+
+    def formulas(self) -> list[Expr] | None:
+        """Those of z; None where some have none."""
+        return [self.solution[x] for x in self.unknowns] if all(x in self.solution for x in self.unknowns) else None
+
+    def system(self) -> tuple[Matrix, Matrix]:
+        """A and b of A z = b."""
+        A = Matrix([[derivative(residual, x) for x in self.unknowns] for residual in self.residuals])
+        if not A.free_symbols.isdisjoint(self.unknowns):
+            raise ValueError(
+                "`force` and `dissipation` must be linear in the multipliers where a program is to solve for these, but they are not. "
+                "Say which multipliers are `positive`, or take the second kind of Lagrange's equations."
+            )
+        at_zero = dict.fromkeys(self.unknowns, sympy.Integer(0))
+        return A, Matrix([-residual.xreplace(at_zero) for residual in self.residuals])
+
+
+OWN = re.findall(r"\w+", "t q qdot params qddot multipliers acceleration matrix right size solution solve numpy math functools")
+TAKEN = frozenset((*keyword.kwlist, *OWN))
+IN_C = re.findall(
+    r"\w+", "fabs fmax fmin pow sqrt exp log sin cos tan asin acos atan atan2 sinh cosh tanh asinh acosh atanh erf erfc floor ceil"
+)
+TAKEN_IN_C = frozenset((*reserved_words, *OWN, *IN_C))
+
+
+LEAST_NORM = [
+    "size = numpy.abs(matrix).max(axis=1)",
+    "size[size == 0] = 1",
+    "# constraints may depend on each other: then the multipliers are those of least norm",
+    "solution = numpy.linalg.lstsq(matrix / size[:, None], right / size, rcond=1e-12)[0]",
+]
+
+
+def to_python(program: Program) -> str:
+    """The text of a NumPy function."""
+    writer = _Writer(program, NumPyPrinter({"strict": True}), TAKEN)
+    names = lambda symbols: ", ".join(writer.names[symbol] for symbol in symbols)
+    array = lambda formulas: f"numpy.array([{', '.join(formulas)}], float)"
+    body = [f"{names(part)}{',' * (len(part) == 1)} = {given}" for part, given in ((program.q, "q"), (program.qdot, "qdot"))]
+    body += [f"{writer.names[symbol]} = params{path}" for symbol, path in program.params]
+    body += [f"{name} = {formula}" for name, formula in writer.shared]
+    n = len(program.q)
+    if writer.z:
+        body += [f"return {array(writer.z[:n])}, {array(writer.z[n:])}"]
+    else:
+        rows = [f"    [{', '.join(row)}]," for row in writer.A]
+        body += ["matrix = numpy.array([", *rows, "], float)", f"right = {array(writer.b)}"]
+        body += LEAST_NORM if program.multipliers else ["solution = numpy.linalg.solve(matrix, right)"]
+        body += [f"return solution[:{n}], solution[{n}:]"]
+    needed = [f"import {module}" for module in ("functools", "math") if any(f"{module}." in line for line in body)]
+    head = [*needed, *[""] * bool(needed), "import numpy", "", "", "def acceleration(t, q, qdot, params):"]
+    doc = f'"""Accelerations of {names(program.q)}, and the multipliers {names(program.multipliers) or "(none)"}."""'
+    return "\n".join([*head, *(f"    {line}" for line in (doc, *body)), ""])
+
+
+def to_c(program: Program) -> str:
+    """The text of a function in C99."""
+    writer = _Writer(program, C99CodePrinter({"strict": True, "math_macros": {}}), TAKEN_IN_C)
+    given = [("q", program.q), ("qdot", program.qdot), ("params", tuple(symbol for symbol, _ in program.params))]
+    body = [f"const double {writer.names[symbol]} = {part}[{i}];" for part, symbols in given for i, symbol in enumerate(symbols)]
+    body += [f"const double {name} = {formula};" for name, formula in writer.shared]
+    n, size = len(program.q), len(program.unknowns)
+    targets = [f"qddot[{i}]" if i < n else f"multipliers[{i - n}]" for i in range(size)]
+    z = writer.z or [f"solution[{i}]" for i in range(size)]
+    if not writer.z:
+        rows = ", ".join(f"{{{', '.join(row)}}}" for row in writer.A)
+        body += [f"double matrix[{size}][{size}] = {{{rows}}}, right[{size}] = {{{', '.join(writer.b)}}}, solution[{size}];"]
+        body += [f"solve({size}, matrix, right, solution);"]
+    body += [f"{target} = {formula};" for target, formula in zip(targets, z, strict=True)]
+    order = [*given, ("multipliers", program.multipliers)]
+    comment = "; ".join(f"{part}: {', '.join(writer.names[symbol] for symbol in symbols)}" for part, symbols in order if symbols)
+    head = "void acceleration(double t, const double *q, const double *qdot, const double *params, double *qddot, double *multipliers)"
+    return "\n".join(
+        ["#include <math.h>", "", *([] if writer.z else [SOLVE]), f"/* {comment} */", head, "{", *(f"    {line}" for line in body), "}", ""]
+    )
+
+
+class _Writer:
+    """Formulas in a language: names for the symbols, the steps that several formulas share, and z, or A and b, by them."""
+
+    def __init__(self, program: Program, printer: CodePrinter, taken: frozenset[str]):
+        self.printer = printer
+        self.names: dict[Symbol, str] = {program.t: "t"}
+        for symbol in (*program.q, *program.qdot, *(symbol for symbol, _ in program.params), *program.multipliers):
+            name = re.sub(r"\W", "_", symbol.name)
+            while name in taken or name in self.names.values():
+                name += "_"
+            self.names[symbol] = name
+        z = program.formulas()
+        A, b = program.system() if z is None else (Matrix(0, 0, []), Matrix(0, 1, []))
+        renamed = {symbol: Symbol(name, real=True) for symbol, name in self.names.items()} | CONSTANTS
+        formulas = [formula.xreplace(renamed) for formula in (*(z or []), *A, *b)]
+        fresh = (symbol for symbol in sympy.numbered_symbols("s", real=True) if symbol.name not in self.names.values())
+        shared, final = sympy.cse(formulas, symbols=fresh, order="none")
+        self.shared = [(symbol.name, self._written(formula)) for symbol, formula in shared]
+        written = list(map(self._written, final))
+        columns = len(program.unknowns)
+        self.z = written if z is not None else []
+        self.A = [written[i * columns : (i + 1) * columns] for i in range(A.rows)]
+        self.b = written[A.rows * columns :] if z is None else []
+
+    def _written(self, formula: Expr) -> str:
+        try:
+            return self.printer.doprint(formula)
+        except PrintMethodNotImplementedError as error:
+            unknown = str(error).splitlines()[0].split()[-1]
+            raise ValueError(
+                f"a program must use functions that its language has, but has {unknown}. Write the system by others."
+            ) from None
+
+
+CONSTANTS = {constant: sympy.Float(constant, 17) for constant in (sympy.pi, sympy.E)}
+SOLVE = """/* z of A z = b, by elimination with complete pivoting; of least norm where rows depend on each other. */
+static void solve(int n, double A[n][n], double *b, double *z)
+{
+    int place[n], rank = 0;
+    double free[n][n];
+    for (int i = 0; i < n; i++) {
+        double size = 0;
+        for (int j = 0; j < n; j++) size = fmax(size, fabs(A[i][j]));
+        for (int j = 0; j < n; j++) A[i][j] /= size > 0 ? size : 1;
+        b[i] /= size > 0 ? size : 1;
+        place[i] = i;
+    }
+    for (; rank < n; rank++) {
+        int row = rank, column = rank;
+        for (int i = rank; i < n; i++)
+            for (int j = rank; j < n; j++)
+                if (fabs(A[i][j]) > fabs(A[row][column])) row = i, column = j;
+        if (fabs(A[row][column]) < 1e-12) break;
+        for (int j = 0; j < n; j++) { double x = A[rank][j]; A[rank][j] = A[row][j]; A[row][j] = x; }
+        for (int i = 0; i < n; i++) { double x = A[i][rank]; A[i][rank] = A[i][column]; A[i][column] = x; }
+        double x = b[rank]; b[rank] = b[row]; b[row] = x;
+        int k = place[rank]; place[rank] = place[column]; place[column] = k;
+        for (int i = 0; i < n; i++) {
+            double factor = A[i][rank] / A[rank][rank];
+            if (i == rank) continue;
+            for (int j = rank; j < n; j++) A[i][j] -= factor * A[rank][j];
+            b[i] -= factor * b[rank];
+        }
+    }
+    for (int i = 0; i < n; i++) z[place[i]] = i < rank ? b[i] / A[i][i] : 0;
+    for (int k = rank; k < n; k++) { /* take out what A does not see: its null vectors, one orthogonal to the other */
+        for (int i = 0; i < n; i++) free[k][place[i]] = i < rank ? -A[i][k] / A[i][i] : i == k;
+        for (int l = rank; l <= k; l++) {
+            double *target = l < k ? free[k] : z, *along = l < k ? free[l] : free[k], dot = 0, square = 0;
+            for (int i = 0; i < n; i++) dot += along[i] * target[i], square += along[i] * along[i];
+            for (int i = 0; i < n; i++) target[i] -= dot / square * along[i];
+        }
+    }
+}
+"""

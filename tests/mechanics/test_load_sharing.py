@@ -1,0 +1,124 @@
+"""Plates on legs that hold a load together: how they share it, when they break away, and how they move then. Against SciPy."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+from scipy.linalg import null_space
+from scipy.optimize import minimize
+
+import jaxlag as jl
+from jaxlag._mechanics.friction_terms import Kinks
+from jaxlag._mechanics.load_sharing import shared
+
+LEGS = {
+    2: np.array([[1.0, 0.0], [-1.0, 0.0]]),
+    3: np.array([[1.0, 0.0], [-0.5, 0.8], [-0.5, -0.8]]),
+    4: np.array([[1.0, 1.0], [1.0, -1.0], [-1.0, 1.0], [-1.0, -1.0]]),
+}
+BOUND = 0.5
+
+
+def slips(q, qdot, legs, xp=jnp):
+    c, s = xp.cos(q[2]), xp.sin(q[2])
+    rx, ry = c * legs[:, 0] - s * legs[:, 1], s * legs[:, 0] + c * legs[:, 1]
+    return xp.stack([qdot[0] - qdot[2] * ry, qdot[1] + qdot[2] * rx], axis=1)
+
+
+plate = jl.System(
+    lambda qdot: 0.5 * qdot @ qdot,
+    dissipation={"legs": lambda q, qdot, legs: BOUND * jnp.sum(jnp.linalg.norm(slips(q, qdot, legs), axis=1))},
+    force=lambda t, load: load * t,
+)
+
+
+def jacobians(legs):
+    return np.stack([np.asarray(slips(np.zeros(3), e, legs, np)) for e in np.eye(3)], axis=-1)
+
+
+def limit(legs, load):
+    """The time t at which load · t breaks the plate away: the least power of friction for a power of the load of 1."""
+    J = jacobians(legs)
+    power = lambda d: BOUND * np.sum(np.sqrt(np.sum((J @ d) ** 2, axis=1)))
+    starts = [load, load + 0.1, load - [0.0, 0.1, -0.1]]
+    given = dict(constraints={"type": "eq", "fun": lambda d: load @ d - 1}, options={"ftol": 1e-15, "maxiter": 1000})
+    return min(minimize(power, start / (load @ start), **given).fun for start in starts)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_the_most_loaded_element_is_used_as_little_as_can_be(seed):
+    rng = np.random.default_rng(seed)
+    elements = rng.integers(3, 6)
+    of = np.repeat(np.arange(elements), rng.integers(1, 3, elements))
+    J, given, bound = rng.normal(size=(of.size, 3)), rng.normal(size=of.size), rng.uniform(0.5, 2, elements)
+    kinks = Kinks(lambda t, q, v: J @ v, {}, of, {"all": np.arange(of.size)})
+    left = jax.jit(lambda given: shared(kinks, jnp.asarray(J), given, jnp.asarray(bound), jnp.ones(elements, bool)))
+    share = left(given)
+    np.testing.assert_allclose(J.T @ share.multipliers, J.T @ given, atol=1e-13)
+    N = null_space(J.T)
+    room = lambda x: x[-1] ** 2 - np.bincount(of, (given + N @ x[:-1]) ** 2) / bound**2
+    best = minimize(lambda x: x[-1], np.r_[0 * N[0], 9.0], constraints={"type": "ineq", "fun": room}, options={"ftol": 1e-15})
+    np.testing.assert_allclose(np.max(1 - share.margin / bound), best.fun, atol=1e-8)
+    least = lambda given: jnp.min(left(given).margin / bound)
+    along, h = rng.normal(size=of.size), 1e-6
+    slope = (least(given + h * along) - least(given - h * along)) / (2 * h)
+    np.testing.assert_allclose(jax.grad(least)(given) @ along, slope, atol=1e-6)
+    np.testing.assert_allclose(jax.jvp(least, (given,), (along,))[1], slope, atol=1e-6)
+
+
+def regularised(legs, load, ts, state, width):
+    def rates(t, y):
+        u = slips(y[:3], y[3:], legs, np)
+        pull = BOUND * u / np.sqrt(np.sum(u**2, axis=1, keepdims=True) + width**2)
+        r = slips(y[:3], np.array([0.0, 0.0, 1.0]), legs, np)
+        return np.r_[y[3:], load * t - [*pull.sum(0), np.sum(pull * r)]]
+
+    with np.errstate(over="ignore"):  # of steps that are rejected
+        return solve_ivp(rates, (ts[0], ts[-1]), state, "Radau", ts, rtol=1e-8, atol=1e-11).y.T
+
+
+def off_regularised(motion, legs, load, ts, v0):
+    """How far positions are from those with smooth friction of the widths 1e-4 and 1e-5, which creeps and breaks away gently."""
+    others = (regularised(legs, load, ts, np.r_[np.zeros(3), v0], width) for width in (1e-4, 1e-5))
+    return [np.max(np.abs(motion.q - other[:, :3])) for other in others]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("legs", LEGS)
+def test_a_plate_breaks_away(legs):
+    """It holds as long as some share of the load does. Pulled at its centre, F legs in all, it goes x = (t − t₁)³/6; turned, t₁ = Σ F r.
+
+    Pulled and turned, it goes along as with smooth friction, the closer the smaller its width. All was "minimum step size".
+    """
+    still = np.zeros(3)
+    for load in np.array([[0.6, 0.8, 0.0], [0.0, 0.0, 1.0], [0.9, 0.0, 0.2]]):
+        start = limit(LEGS[legs], load)
+        ts = start + np.array([-0.01, -1e-6, 0.1, 0.5, 1.0])
+        motion = jl.simulate(plate, still, still, ts, {"legs": LEGS[legs], "load": load})
+        np.testing.assert_allclose(motion.qdot[1], 0, atol=1e-30)
+        assert np.all(motion.stats["time_stuck"][-1] < 0.01 + 1e-5)
+        assert np.all(np.linalg.norm(motion.friction["legs"].force.reshape(5, -1, 2), axis=-1) <= BOUND * (1 + 1e-6))
+        if load[2] == 1 and legs != 3:  # three of them not at one distance turn about another point
+            np.testing.assert_allclose(start, BOUND * np.sum(np.linalg.norm(LEGS[legs], axis=1)), rtol=1e-7)
+        if load[2] == 0:
+            np.testing.assert_allclose(start, BOUND * legs, rtol=1e-7)
+            np.testing.assert_allclose(motion.q[-1], load / 6, atol=1e-7)
+        if load[0] == 0.9:
+            wide, narrow = off_regularised(motion, LEGS[legs], load, ts, still)
+            assert narrow < min(4e-4, 0.3 * wide)
+
+
+@pytest.mark.slow
+def test_a_plate_slides_to_rest_on_four_legs():
+    """All legs stop at the same time. The gradient against differences."""
+    load, v0, ts = np.array([0.9, 0.0, 0.2]), np.array([0.3, -0.2, 0.4]), np.linspace(0, 1, 5)
+    params = {"legs": LEGS[4], "load": load}
+    motion = jl.simulate(plate, np.zeros(3), v0, ts, params)
+    wide, narrow = off_regularised(motion, LEGS[4], load, ts, v0)
+    assert narrow < min(5e-5, 0.3 * wide)
+    np.testing.assert_allclose(motion.qdot[-1], 0, atol=1e-30)
+    end = lambda load: jl.simulate(plate, np.zeros(3), v0, ts, params | {"load": load}).q[-1, 0]
+    h = np.array([1e-5, 0.0, 0.0])
+    slope = (end(load + h) - end(load - h)) / 2e-5
+    np.testing.assert_allclose(jax.grad(end)(load)[0], slope, rtol=1e-5)

@@ -1,0 +1,300 @@
+"""The constrained solve: redundant rows, singular mass matrices, published accelerations."""
+
+import jax
+import jax.numpy as jnp
+import lineax as lx
+import numpy as np
+import pytest
+
+import jaxlag as jl
+from jaxlag._mechanics.saddle_point import pseudo_inverse, saddle_point
+from jaxlag.examples import pendulum
+
+
+def random_problem(rng, n, m, rank=None):
+    A = rng.normal(size=(n, n))
+    G = rng.normal(size=(m, rank or m)) @ rng.normal(size=(rank or m, n))
+    return A @ A.T + 0.1 * np.eye(n), G, rng.normal(size=n), G @ rng.normal(size=n)
+
+
+@pytest.mark.parametrize("n, m, rank", [(1, 0, None), (3, 1, None), (5, 3, None), (5, 4, 2), (6, 6, 3), (8, 5, 1)])
+def test_solution_and_least_norm_multipliers(n, m, rank):
+    """Against NumPy: x by the null-space method, λ by lstsq, which gives the least norm."""
+    rng = np.random.default_rng(n + 10 * m)
+    for _ in range(5):
+        M, G, f, c = random_problem(rng, n, m, rank)
+        found = saddle_point(lx.MatrixLinearOperator(jnp.asarray(M)), *map(jnp.asarray, (G, f, c)))
+        u, s, vt = np.linalg.svd(G)
+        N = vt[(s > 1e-10).sum() :].T
+        particular = np.linalg.lstsq(G, c, rcond=1e-10)[0] if m else np.zeros(n)
+        x = particular + N @ np.linalg.solve(N.T @ M @ N, N.T @ (f - M @ particular))
+        multipliers = np.linalg.lstsq(G.T, M @ x - f, rcond=1e-10)[0]
+        np.testing.assert_allclose(found.x, x, rtol=1e-9, atol=1e-9)
+        np.testing.assert_allclose(found.multipliers, multipliers, rtol=1e-8, atol=1e-8)
+        assert found.sound.determined
+
+
+def test_pseudo_inverse_of_rows_in_different_units():
+    rng = np.random.default_rng(3)
+    rows = np.array([1.0, 1e-3, 1e3, 1.0])[:, None] * rng.normal(size=(4, 2)) @ rng.normal(size=(2, 6))
+    S = rows @ rows.T
+    np.testing.assert_allclose(pseudo_inverse(jnp.asarray(S)), np.linalg.pinv(S, rcond=1e-13, hermitian=True), rtol=1e-5)
+
+
+def test_pseudo_inverse_derivatives_at_constant_rank():
+    """Directions within the matrices of rank 2, against central differences of NumPy's pinv; second order too."""
+    rng = np.random.default_rng(4)
+    B, dB = rng.normal(size=(2, 4, 2))
+    curve = lambda s: (B + s * dB) @ (B + s * dB).T
+    P = lambda s: np.linalg.pinv(curve(s), rcond=1e-10, hermitian=True)
+    h = 1e-4
+    first = jax.jvp(lambda s: pseudo_inverse(curve(s)), (0.0,), (1.0,))[1]
+    np.testing.assert_allclose(first, (P(h) - P(-h)) / (2 * h), rtol=1e-5, atol=1e-5)
+    second = jax.jacfwd(jax.jacfwd(lambda s: pseudo_inverse(curve(s))))(0.0)
+    np.testing.assert_allclose(second, (P(h) - 2 * P(0) + P(-h)) / h**2, rtol=1e-3, atol=1e-3)
+
+
+def test_second_derivatives_where_rows_depend_on_each_other():
+    """Along a curve of constant rank, forward over forward and reverse over forward, against central differences of NumPy's solution."""
+    rng = np.random.default_rng(5)
+    M, f = np.diag(rng.uniform(1, 2, 6)), rng.normal(size=6)
+    A, B, dB = rng.normal(size=(4, 2)), *rng.normal(size=(2, 2, 6))
+    rows = lambda s: A @ (B + s * dB)
+
+    def solution(s):
+        x = saddle_point(lx.MatrixLinearOperator(jnp.asarray(M)), rows(s), jnp.asarray(f), jnp.zeros(4))
+        return jnp.concatenate([x.x, x.multipliers])
+
+    def expected(s):
+        G = rows(s)
+        multipliers = -np.linalg.pinv(G @ np.linalg.solve(M, G.T), rcond=1e-10, hermitian=True) @ G @ np.linalg.solve(M, f)
+        return np.r_[np.linalg.solve(M, f + G.T @ multipliers), multipliers]
+
+    h = 1e-3
+    second = (-expected(2 * h) + 16 * expected(h) - 30 * expected(0.0) + 16 * expected(-h) - expected(-2 * h)) / (12 * h**2)
+    for outer in (jax.jacfwd, jax.jacrev):
+        np.testing.assert_allclose(outer(jax.jacfwd(solution))(0.0), second, rtol=1e-5, atol=1e-5)
+
+
+def test_a_constraint_written_twice():
+    state = pendulum.cartesian_state(0.7, 1.3, 1.0)
+    rod = pendulum.cartesian_rod
+    twice = jl.System(pendulum.cartesian_lagrangian, holonomic={"rod": rod, "again": rod, "scaled": lambda q, l: 3 * rod(q, l)})
+    once = jl.acceleration(pendulum.cartesian, *state, pendulum.params)
+    found = jl.acceleration(twice, *state, pendulum.params)
+    for name in ("x", "y"):
+        np.testing.assert_allclose(found.qddot[name], once.qddot[name], rtol=1e-10)
+    forces = jl.constraint_force(twice, *state, pendulum.params)
+    single = jl.constraint_force(pendulum.cartesian, *state, pendulum.params)["rod"]
+    total = {name: sum(force[name] for force in forces.values()) for name in single}
+    for name in single:
+        np.testing.assert_allclose(total[name], single[name], rtol=1e-10)
+    # least norm: λ proportional to the rows, (1, 1, 3) / 11
+    multipliers = [found.multipliers[name] for name in ("rod", "again", "scaled")]
+    np.testing.assert_allclose(multipliers, np.array([1, 1, 3]) / 11 * once.multipliers["rod"], rtol=1e-9)
+
+
+def test_gradients_with_a_constraint_written_twice():
+    rod = pendulum.cartesian_rod
+    twice = jl.System(pendulum.cartesian_lagrangian, holonomic={"rod": rod, "again": rod})
+
+    def outcome(system):
+        def number(m, l, x):
+            q, v = pendulum.cartesian_state(0.7, 1.3, 1.0)
+            out = jl.acceleration(system, {**q, "x": q["x"] + x}, v, {"m": m, "l": l, "g": 9.81})
+            return out.qddot["x"] + sum(out.multipliers.values())
+
+        return number
+
+    expected = jax.grad(outcome(pendulum.cartesian), (0, 1, 2))(1.0, 1.0, 0.0)
+    for derivative in (jax.grad, jax.jacfwd):
+        np.testing.assert_allclose(derivative(outcome(twice), (0, 1, 2))(1.0, 1.0, 0.0), expected, rtol=1e-9, atol=1e-10)
+    bent = jax.hessian(outcome(twice), (0, 1, 2))(1.0, 1.0, 0.0)
+    assert np.all(np.isfinite(bent))
+
+
+def test_coordinates_without_inertia_that_a_constraint_holds():
+    """A massless strut end s = y between spring and body: (m ÿ = −c y − m g)."""
+    system = jl.System(
+        lambda q, qdot, m, c, g: 0.5 * m * qdot["y"] ** 2 - m * g * q["y"] - 0.5 * c * q["s"] ** 2,
+        holonomic={"strut": lambda q: q["s"] - q["y"]},
+    )
+    p = {"m": 2.0, "c": 50.0, "g": 9.81}
+    found = jl.acceleration(system, {"y": 0.3, "s": 0.3}, {"y": 0.0, "s": 0.0}, p)
+    np.testing.assert_allclose(found.qddot["y"], -50 * 0.3 / 2 - 9.81, rtol=1e-13)
+    np.testing.assert_allclose(found.multipliers["strut"], 50 * 0.3, rtol=1e-12)
+
+
+def test_a_direction_without_inertia_is_refused():
+    system = jl.System(lambda q, qdot: 0.5 * (qdot["x"] + qdot["y"]) ** 2 - q["x"])
+    with pytest.raises(ValueError, match="every direction inertia that no constraint holds"):
+        jl.acceleration(system, {"x": 0.0, "y": 0.0}, {"x": 0.0, "y": 0.0})
+    held = jl.System(lambda q, qdot: 0.5 * (qdot["x"] + qdot["y"]) ** 2 - q["x"], holonomic=lambda q: q["x"] - q["y"])
+    np.testing.assert_allclose(jl.acceleration(held, {"x": 0.0, "y": 0.0}, {"x": 0.0, "y": 0.0}).qddot["x"], -0.25, rtol=1e-13)
+
+
+def four_bar_lagrangian(qdot, q, l, rho):
+    """Uniform rods 2, 3, 4 of the chain; rod 1 is the base."""
+    angle, rate = jnp.cumsum(q), jnp.cumsum(qdot)
+    velocity, kinetic = jnp.zeros(2), 0.0
+    for i in range(3):
+        along = jnp.array([-jnp.sin(angle[i]), jnp.cos(angle[i])]) * rate[i] * l[i + 1]
+        centre = velocity + along / 2
+        m = rho * l[i + 1]
+        kinetic += 0.5 * m * centre @ centre + 0.5 * m * l[i + 1] ** 2 / 12 * rate[i] ** 2
+        velocity = velocity + along
+    return kinetic
+
+
+def four_bar_closure(q, l):
+    angle = jnp.cumsum(q)
+    end = jnp.stack([jnp.sum(l[1:] * jnp.cos(angle)), jnp.sum(l[1:] * jnp.sin(angle))])
+    return end + jnp.stack([l[0], 0.0 * l[0]])
+
+
+def test_four_bar_of_sympy():
+    """sympy/physics/mechanics/tests/test_jointsmethod.py (BSD-3), test_four_bar_linkage_with_manual_constraints, at numbers."""
+    system = jl.System(four_bar_lagrangian, holonomic={"closure": four_bar_closure})
+    q = jnp.array([2.1, 0.6655470375077588, 2.527408138024188])
+    v = jnp.array([0.2, -0.17963733938852067, 0.1309060540601612])
+    found = jl.acceleration(system, q, v, {"l": np.array([0.13, 0.24, 0.21, 0.34]), "rho": 997.0})
+    np.testing.assert_allclose(found.qddot, [0.004875813576771052, -0.019901808571750258, 0.012180573114075468], atol=1e-10)
+
+
+def test_cart_pendulum_of_sympy():
+    """sympy/physics/mechanics/tests/test_system_class.py (BSD-3), test_cart_pendulum_lagrange, at numbers; our sign of λ."""
+
+    def lagrangian(q, qdot, mc, mp, l, g, k):
+        cart, pole = qdot["c"], qdot["p"]
+        kinetic = 0.5 * (mc + mp) * cart**2 + mp * l * jnp.cos(q["p"]) * pole * cart + 0.5 * mp * l**2 * pole**2
+        return kinetic + mp * g * l * jnp.cos(q["p"]) + 0.5 * k * q["p"] ** 2
+
+    system = jl.System(lagrangian, force=lambda F: {"c": F}, holonomic={"line": lambda q, l: q["c"] + l * jnp.sin(q["p"])})
+    p = {"g": 9.81, "l": 0.7, "mc": 1.4, "mp": 0.6, "k": 2.3, "F": 0.9}
+    found = jl.acceleration(system, {"p": 0.5, "c": -0.3355978770229421}, {"p": -0.8, "c": 0.49144623465860876}, p)
+    np.testing.assert_allclose(found.qddot["p"], -2.1356831606160864, atol=1e-12)
+    np.testing.assert_allclose(abs(found.multipliers["line"]), 1.237449231302558, atol=1e-12)
+
+
+def disc_spin(q, qdot):
+    """Angular velocity in the lean frame of a disc with yaw q1, lean q2, spin q3 (Z-X-Y)."""
+    yaw, lean, spin = qdot[:3]
+    return jnp.stack([lean, spin + yaw * jnp.sin(q[1]), yaw * jnp.cos(q[1])])
+
+
+def disc_axes(q):
+    """Columns: axes of the lean frame."""
+    (c1, s1), (c2, s2) = (jnp.cos(q[0]), jnp.sin(q[0])), (jnp.cos(q[1]), jnp.sin(q[1]))
+    zero = jnp.zeros_like(c1)
+    return jnp.array([[c1, -s1 * c2, s1 * s2], [s1, c1 * c2, -c1 * s2], [zero, s2, c2]])
+
+
+def disc_centre(q, r):
+    return jnp.array([q[3], q[4], 0.0]) + r * disc_axes(q)[:, 2]
+
+
+def disc_velocity(q, qdot, r):
+    return jax.jvp(lambda q: disc_centre(q, r), (q,), (qdot,))[1]
+
+
+def disc_lagrangian(q, qdot, m, r, g):
+    w, v = disc_spin(q, qdot), disc_velocity(q, qdot, r)
+    inertia = m * r**2 / 4 * jnp.array([1.0, 2.0, 1.0])
+    return 0.5 * m * v @ v + 0.5 * inertia @ w**2 - m * g * r * jnp.cos(q[1])
+
+
+def disc_rolls(q, qdot, r):
+    """Velocity of the centre minus ω × r; its vertical part vanishes identically, which makes a redundant row."""
+    axes = disc_axes(q)
+    return disc_velocity(q, qdot, r) - axes @ jnp.cross(disc_spin(q, qdot), jnp.array([0.0, 0.0, 1.0]) * r)
+
+
+rolling_disc = jl.System(disc_lagrangian, nonholonomic={"rolling": disc_rolls})
+# sympy/physics/mechanics/tests/test_kane5.py (BSD-3), TestKane5: q, qdot, qddot
+KANE5 = [
+    (
+        [0.3, 0.1, 1.97, -0.35, 2.27],
+        [0.126603940595934, 0.21594257160166, 1.28736069604936, 0.319764288376543, 0.0989146857254898],
+        [-0.5587835488228831, 3.2096303049762653, 0.010447606711792075, -0.009927934217545205, 0.041286163482917235],
+    ),
+    (
+        [3.97, -0.28, 8.2, -0.35, 2.27],
+        [0.0259159090798597, 0.668041660387416, -2.19283799213811, 0.385441810852219, 0.420109283790573],
+        [3.0485382524933056, -8.407406775934694, 0.8147496603401003, -0.1540985426321738, -0.14610266441000944],
+    ),
+]
+
+
+@pytest.mark.parametrize("q, qdot, qddot", KANE5)
+def test_rolling_disc_of_sympy(q, qdot, qddot):
+    params = {"g": 9.81, "r": 0.26, "m": 3.43}
+    found = jl.acceleration(rolling_disc, np.array(q), np.array(qdot), params)
+    np.testing.assert_allclose(found.qddot, qddot, atol=1e-10)
+    residual = jl.constraint_residual(rolling_disc, np.array(q), np.array(qdot), params).velocity["rolling"]
+    np.testing.assert_allclose(residual, 0, atol=1e-13)
+
+
+def test_friction_that_depends_on_the_constraint_force():
+    """A block that slides down an incline, N = |λ| of the plane: ẍ = g (sin α − μ cos α)."""
+    system = jl.System(
+        lambda q, qdot, m, g, alpha: 0.5 * m * qdot @ qdot + m * g * (jnp.sin(alpha) * q[0] - jnp.cos(alpha) * q[1]),
+        dissipation=lambda qdot, multipliers, mu: mu * jnp.abs(multipliers["plane"]) * jnp.abs(qdot[0]),
+        holonomic={"plane": lambda q: q[1]},
+    )
+    p = {"m": 3.0, "g": 9.81, "alpha": 0.6, "mu": 0.3}
+    found = jl.acceleration(system, jnp.zeros(2), jnp.array([0.5, 0.0]), p)
+    np.testing.assert_allclose(found.qddot[0], 9.81 * (np.sin(0.6) - 0.3 * np.cos(0.6)), rtol=1e-12)
+    np.testing.assert_allclose(found.multipliers["plane"], 3 * 9.81 * np.cos(0.6), rtol=1e-12)
+
+
+def test_a_reaction_and_the_friction_it_brings_about_push_each_other():
+    """Rod against a rough wall: λ stands in its own equation. m ẍ = λ (1 − μ s), closed form by hand."""
+    system = jl.System(
+        lambda q, qdot, m: 0.5 * m * (qdot["x"] ** 2 + qdot["y"] ** 2),
+        force=lambda multipliers, F, mu: {"x": -F, "y": -mu * multipliers["rail"]},
+        holonomic={"rail": lambda q: q["x"] - q["y"]},
+    )
+    p = {"m": 2.0, "F": 10.0, "mu": 0.4}
+    found = jl.acceleration(system, {"x": 0.0, "y": 0.0}, {"x": 0.0, "y": 0.0}, p)
+    # m a = −F + λ, m a = −μλ − λ  →  λ = F / (2 + μ)
+    np.testing.assert_allclose(found.multipliers["rail"], 10 / 2.4, rtol=1e-12)
+    slope = jax.grad(lambda mu: jl.acceleration(system, {"x": 0.0, "y": 0.0}, {"x": 0.0, "y": 0.0}, {**p, "mu": mu}).multipliers["rail"])(
+        0.4
+    )
+    np.testing.assert_allclose(slope, -10 / 2.4**2, rtol=1e-10)
+
+
+falling = jl.System(
+    lambda q, qdot, s: 0.5 * qdot @ qdot + s * qdot[0] * qdot[1] - 9.81 * q[1], holonomic=lambda q, e: jnp.stack([q[0], q[0] + e * q[1]])
+)
+
+
+@pytest.mark.parametrize("e", [1e-3, 1e-4, 1e-5, 1e-6, 1e-7, 1e-8, 1e-9])
+@pytest.mark.parametrize("s", [0.0, 0.3])
+def test_rows_that_are_nearly_the_same_hold_all_the_same(e, s):
+    """q₀ = 0 and q₀ + e q₁ = 0 hold both coordinates: λ₁ = g / e = −λ₀, whatever the inertia."""
+    found = jl.acceleration(falling, jnp.zeros(2), jnp.zeros(2), {"e": e, "s": s})
+    np.testing.assert_allclose(found.qddot, 0, rtol=0, atol=2e-14 / e + 1e-9)  # rounding of forces of the size of λ
+    np.testing.assert_allclose(found.multipliers["holonomic"], np.array([-9.81, 9.81]) / e, rtol=1e-6)
+
+
+def test_rows_that_are_the_same_to_rounding_count_once():
+    found = jl.acceleration(falling, jnp.zeros(2), jnp.zeros(2), {"e": 1e-14, "s": 0.0})
+    np.testing.assert_allclose(found.qddot, [0, -9.81], rtol=0, atol=1e-12)
+
+
+CONTRADICTORY = {
+    "apart": lambda t, q: jnp.stack([q[0], q[0] - t**2]),
+    "nearly the same": lambda t, q: jnp.stack([q[0] - t**2, q[0] - t**2 + 1e-6 * q[1] - t**3 - t**2]),
+    "of nothing": lambda t, q: jnp.stack([q[0], t**2]),
+}
+
+
+@pytest.mark.parametrize("case", CONTRADICTORY)
+@pytest.mark.parametrize("function", [jl.acceleration, jl.constraint_force])
+def test_constraints_that_contradict_each_other_have_no_acceleration(case, function):
+    system = jl.System(lambda qdot: 0.5 * qdot @ qdot, holonomic=CONTRADICTORY[case])
+    with pytest.raises(ValueError, match="`holonomic` and `nonholonomic` must not contradict each other"):
+        function(system, jnp.zeros(2), jnp.zeros(2))
+    inside = jax.jit(lambda q: function(system, q, jnp.zeros(2)))(jnp.zeros(2))
+    assert all(np.all(np.isnan(leaf)) for leaf in jax.tree.leaves(inside))

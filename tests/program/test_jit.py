@@ -1,0 +1,72 @@
+"""Programs that Python calls are compiled with the CPU's older emitters: the same numbers, and a JAX without them does as well."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxlag as jl
+from jaxlag._program import jit
+from jaxlag.examples import vehicle
+
+TS = np.linspace(0, 2, 41)
+rod = jl.System(
+    lambda q, qdot: 0.5 * qdot @ qdot - 9.81 * q[1],
+    holonomic={"rod": lambda q: q @ q - 1.0},
+    dissipation={"joint": lambda q, qdot: 0.3 * jnp.abs(q[0] * qdot[1] - q[1] * qdot[0])},
+)
+
+
+def ride(b):
+    motion = jl.simulate(vehicle.system, vehicle.q0, vehicle.qdot0, TS, vehicle.params | {"b": b})
+    return jnp.concatenate([motion.q["y"], motion.qddot["phi"]])
+
+
+def swing(x):
+    motion = jl.simulate(rod, jnp.stack([jnp.sin(x), -jnp.cos(x)]), jnp.zeros(2), TS)
+    return jnp.concatenate([motion.q[:, 0], motion.multipliers["rod"], motion.friction["joint"].force])
+
+
+@pytest.mark.skipif(jax.default_backend() != "cpu", reason="the choice is one for CPUs")
+@pytest.mark.parametrize("function, x", [(ride, 3000.0), (swing, 0.7), (jax.jacfwd(ride), 3000.0)], ids=["ride", "swing", "slope"])
+def test_both_emitters_give_the_same(function, x):
+    program = jax.jit(function).lower(x)
+    new, old = (program.compile(compiler_options={"xla_cpu_use_fusion_emitters": on})(x) for on in (True, False))
+    np.testing.assert_allclose(new, old, rtol=0, atol=1e-9 * np.max(np.abs(old)))
+
+
+@pytest.mark.parametrize("known", [True, False])
+def test_it_may_be_called_from_anywhere(known, monkeypatch):
+    """From Python, under transformations, within other programs; and where XLA does not know the options."""
+    if not known:
+        monkeypatch.setattr(jit, "QUICK", {"xla_cpu_no_such_option": False})
+    for cached in (jit._quick, jit._options):
+        cached.cache_clear()
+    traced = []
+
+    def power(x, of):
+        traced.append(of)
+        return x**3 if of == "cube" else x**2
+
+    program = jit.compiled(power)
+    x = jnp.arange(3.0)
+    np.testing.assert_array_equal(program(x, of="cube"), x**3)
+    np.testing.assert_array_equal(program(x, of="cube"), x**3)
+    assert len(traced) == 1  # compiled once
+    np.testing.assert_array_equal(jax.vmap(lambda x: program(x, "cube"))(x), x**3)
+    np.testing.assert_array_equal(jax.jit(lambda: program(x, "square"))(), x**2)
+    np.testing.assert_array_equal(jax.vmap(jax.grad(lambda x: program(x, "cube")))(x), 3 * x**2)
+    assert jax.grad(lambda y: y * program(2.0, "cube"))(1.0) == 8.0
+    assert jax.eval_shape(lambda: program(x, "square")).shape == (3,)
+    for cached in (jit._quick, jit._options):
+        cached.cache_clear()
+
+
+@pytest.mark.skipif(jax.default_backend() != "cpu", reason="the choice is one for CPUs")
+def test_the_choice_reaches_the_compiler_where_python_calls_alone(monkeypatch):
+    """An option that XLA does not know, left in, is refused."""
+    monkeypatch.setattr(jit, "_options", lambda: {"xla_cpu_no_such_option": False})
+    program = jit.compiled(lambda x: 2 * x)
+    with pytest.raises(jax.errors.JaxRuntimeError, match="xla_cpu_no_such_option"):
+        program(1.0)
+    assert jax.jit(program)(1.0) == 2.0
