@@ -1,18 +1,24 @@
-"""Gathers the pages of the site: README, notebooks, and a reference of all public names by topic."""
+"""Gathers the pages of the site: README and its companions, notebooks, and a reference of all public names by topic."""
 
 import shutil
 from pathlib import Path
 
 HERE = Path(__file__).parent
 ROOT, PAGES = HERE.parent, HERE / "pages"
+TEXTS = {
+    "README.md": "index.md",
+    "CONTRIBUTING.md": "contributing.md",
+    "CHANGELOG.md": "changelog.md",
+    "docs/architecture.md": "architecture.md",
+}
 REFERENCE = {
-    "Systems": "System virtual_work rate substitute Signal dissipation.sliding dissipation.viscous dissipation.drag dissipation.power_law "
-    "dissipation.stribeck dissipation.speed",
+    "Systems": "System virtual_work rate substitute Signal ZeroOrderHold Linear Cubic dissipation.sliding dissipation.viscous "
+    "dissipation.drag dissipation.power_law dissipation.stribeck dissipation.speed",
     "At one state": "acceleration Acceleration mass_matrix momentum energy constraint_jacobian constraint_residual constraint_force powers "
-    "consistent_state examine",
-    "Motions": "simulate simulate_many Trajectory Instant Interpolated load Dop853 Dopri5 Projection Baumgarte NoStabilisation "
-    "StickSlip Regularised",
-    "Identification": "Experiment fit fit_each Fit Interval Prediction regress Regression validate Validation compare Comparison "
+    "Residual consistent_state examine Examination",
+    "Motions": "simulate simulate_many Trajectory FrictionState RESULTS Instant Interpolated load Dop853 Dopri5 Projection Baumgarte "
+    "NoStabilisation StickSlip Regularised",
+    "Identification": "Experiment fit fit_each Fit Channel Interval Prediction regress Regression validate Validation compare Comparison "
     "information Information Huber learnt.ConvexDissipation learnt.PassiveDissipation learnt.Potential learnt.ConvexPotential",
     "On paper": "equations Equations to_sympy",
     "Pictures": "plot.motion plot.phase plot.forces plot.energy plot.balance plot.friction plot.fit plot.parameters plot.convergence "
@@ -21,9 +27,11 @@ REFERENCE = {
 
 
 def on_config(config):
-    """Before mkdocs looks for pages."""
+    """Writes the pages before mkdocs looks for them."""
     (PAGES / "notebooks").mkdir(parents=True, exist_ok=True)
-    (PAGES / "index.md").write_text((ROOT / "README.md").read_text())
+    for source, page in TEXTS.items():
+        (PAGES / page).write_text(_relinked((ROOT / source).read_text()))
+    shutil.copy(ROOT / "CITATION.cff", PAGES)
     for picture in (ROOT / "notebooks").glob("*.png"):
         shutil.copy(picture, PAGES / "notebooks" / picture.name)
     titles = []
@@ -34,3 +42,10 @@ def on_config(config):
     topics = (f"## {topic}\n\n" + "\n".join(f"::: jaxlag.{name}\n" for name in names.split()) for topic, names in REFERENCE.items())
     (PAGES / "reference.md").write_text("# Reference\n\n" + "\n".join(topics))
     return config
+
+
+def _relinked(text):
+    """A text of the repository, with links to the pages of the site in place of those to files."""
+    for source, page in TEXTS.items():
+        text = text.replace(f"]({source}", f"]({page}")
+    return text

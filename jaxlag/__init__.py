@@ -1,9 +1,13 @@
 """Differentiable mechanics: from energies, dissipation functions and constraints to motions and identified machines."""
 
+from importlib.metadata import PackageNotFoundError, version
+
 from . import dissipation as dissipation, learnt as learnt, plot as plot
 from ._mechanics.acceleration import Acceleration as Acceleration, acceleration as acceleration, constraint_force as constraint_force
 from ._draw.animate import animate as animate
-from ._paper.equations import Equations as Equations, equations as equations, to_sympy as to_sympy
+from ._paper.equations import equations as equations
+from ._paper.result import Equations as Equations
+from ._paper.to_sympy import to_sympy as to_sympy
 from ._mechanics.examine import Examination as Examination, examine as examine
 from ._mechanics.stick_slip import Regularised as Regularised, StickSlip as StickSlip
 from ._fit.assess import (
@@ -17,8 +21,8 @@ from ._fit.assess import (
 from ._fit.experiment import Experiment as Experiment
 from ._fit.result import Fit as Fit, Interval as Interval, Prediction as Prediction
 from ._fit.fit import fit as fit, fit_each as fit_each
-from ._fit.residuals import Huber as Huber
-from ._fit.identifiability import Channel as Channel
+from ._fit.robust_loss import Huber as Huber
+from ._fit.channels import Channel as Channel
 from ._fit.regress import Regression as Regression, regress as regress
 from ._motion.simulate import simulate as simulate
 from ._motion.load import load as load
@@ -42,10 +46,26 @@ from ._mechanics.power import powers as powers
 from ._motion.runge_kutta import Dop853 as Dop853, Dopri5 as Dopri5
 from ._motion.results import RESULTS as RESULTS
 from ._model.signal import Signal as Signal
+from ._model.signal_interpolation import Cubic as Cubic, Linear as Linear, ZeroOrderHold as ZeroOrderHold
 from ._model.system import System as System
 from ._motion.trajectory import (
     Instant as Instant,
     Interpolated as Interpolated,
-    Rubbing as Rubbing,
+    FrictionState as FrictionState,
     Trajectory as Trajectory,
 )
+
+try:
+    __version__ = version("jaxlag")
+except PackageNotFoundError:  # a source tree that is not installed
+    __version__ = "0+unknown"
+
+
+def __getattr__(name: str) -> object:
+    """Names of the version before."""
+    if name == "Rubbing":
+        from ._model.deprecation import warn_renamed
+
+        warn_renamed("Rubbing", "FrictionState")
+        return FrictionState
+    raise AttributeError(f"module 'jaxlag' has no attribute {name!r}")

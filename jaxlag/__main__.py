@@ -1,4 +1,4 @@
-"""The main job, `python -m jaxlag`: b, c and k of the lecture's vehicle, identified from a recorded drive."""
+"""The demo, `python -m jaxlag`: b, c and k of the lecture's vehicle, identified from a recorded drive."""
 
 import argparse
 import csv
@@ -19,14 +19,19 @@ UNITS = {"b": "N s/m", "c": "N/m", "k": "kg/m", "t": "s", "y": "m", "phi": "rad"
 
 
 def main(argv: list[str] | None = None) -> int:
-    """Identifies, prints the table and writes the picture; returns the exit status: 0, 1 not converged, 2 unusable data."""
+    """Runs the demo: prints the table of estimates and saves the picture.
+
+    **Arguments:** `argv`: the command line; by default that of the process.
+
+    **Returns:** the exit status: 0; 1 where the fit did not converge; 2 where the data cannot be used.
+    """
     begin = time.perf_counter()
     arguments = _parser().parse_args(argv)
     try:
         ts, values = _read(arguments.data or vehicle.recording)
         jax.config.update("jax_enable_x64", True)
         experiment = jl.Experiment(ts, values, vehicle.q0, vehicle.qdot0, observe=vehicle.observe)
-        print(f"{len(ts)} samples read; compiling takes some seconds, then come the steps.", file=sys.stderr, flush=True)
+        print(f"{len(ts)} samples read; compiling takes some seconds before the first step.", file=sys.stderr, flush=True)
         fit = jl.fit(vehicle.system, experiment, vehicle.params | GUESS, free=tuple(GUESS), progress=True)
     except (ValueError, OSError, csv.Error) as error:
         print(error, file=sys.stderr)
@@ -45,13 +50,14 @@ def main(argv: list[str] | None = None) -> int:
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog="python -m jaxlag",
-        description="Identifies damper b, spring c and air drag k of the lecture's vehicle from a recording, starting a factor of two off.",
-        epilog=f"The motion starts at the first sample with q0 = {vehicle.q0} and qdot0 = {vehicle.qdot0}, whatever the file holds; "
+        description="Identifies damping b, stiffness c and air drag k of the lecture's vehicle from a recording. "
+        "The guesses are a factor of two off.",
+        epilog=f"The motion starts at the first sample with q0 = {vehicle.q0} and qdot0 = {vehicle.qdot0}, whatever the file contains; "
         "all other parameters are those of jaxlag.examples.vehicle (SI units). "
         "Exit status: 0; 1 where the fit did not converge; 2 where the data cannot be used.",
     )
-    parser.add_argument("--data", type=Path, help="a recording of your own: CSV with the columns t,y,phi,xdot (s, m, rad, m/s)")
-    parser.add_argument("--picture", type=Path, default="jaxlag_fit.png", help="where the fit is drawn (default %(default)s)")
+    parser.add_argument("--data", type=Path, help="your own recording: a CSV file with the columns t,y,phi,xdot (s, m, rad, m/s)")
+    parser.add_argument("--picture", type=Path, default="jaxlag_fit.png", help="file for the plot of the fit (default %(default)s)")
     return parser
 
 
@@ -65,7 +71,7 @@ def _read(file: Path) -> tuple[np.ndarray, dict[str, np.ndarray]]:
             raise ValueError(f"`{file}` must have the columns {expected}, but has no {', '.join(missing)}. Name them in its first line.")
         table = [[_number(row[name], f"`{file}`, line {rows.line_num}, column {name},") for name in COLUMNS] for row in rows]
     if len(table) < 2:
-        raise ValueError(f"`{file}` must hold at least two samples, but holds {len(table)}. Record a drive of some seconds.")
+        raise ValueError(f"`{file}` must contain at least two samples, but contains {len(table)}. Record a drive of some seconds.")
     t, *channels = np.array(table).T
     return t, dict(zip(COLUMNS[1:], channels, strict=True))
 
@@ -77,11 +83,11 @@ def _number(text: str | None, where: str) -> float:
             return number
     except ValueError:
         pass
-    raise ValueError(f"{where} must be a finite number, but is {text or ''!r}. Correct it or leave the sample out.")
+    raise ValueError(f"{where} must be a finite number, but is {text or ''!r}. Correct it or drop the sample.")
 
 
 def _table(fit: jl.Fit, true: dict[str, float] | None) -> str:
-    """Values with standard errors, and beside the true values, where they are known, how far off they are."""
+    """Estimates with standard errors and, where the true values are known, their errors."""
     rows = [f"{'':3}{'value':>12}{'std. error':>12}" + (f"{'true':>10}{'off by (std. errors)':>22}" if true else "") + "   unit"]
     for name, value in fit.estimates.items():
         error = fit.standard_errors[name]

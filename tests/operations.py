@@ -1,7 +1,7 @@
 """The operations of `jax.lax` that random programs (`programs.py`) are made of, by the names that JAX's documentation lists.
 
 Each is (name, kinds of operands, function). A kind is a letter for the dtype (f, g: double and single precision, c: complex, h, e: half
-precision, i, u: whole numbers, b: truth) and one for the shape (s: the same for all, a: any, v: (3,), m: (2, 3), q: (3, 3), .: a scalar).
+precision, i, u: integers, b: bool) and one for the shape (s: the same for all, a: any, v: (3,), m: (2, 3), q: (3, 3), .: a scalar).
 """
 
 import jax
@@ -14,12 +14,12 @@ ONE = np.array([1])
 
 
 def on(kinds, **functions):
-    """Operations that take the same."""
+    """Operations with the same kinds of operands."""
     return [(name.rstrip("_"), kinds, function) for name, function in functions.items()]
 
 
 def several(names, kinds):
-    """Operations of `jax.lax` as they are, each with operands of several kinds."""
+    """Operations of `jax.lax`, each with operands of several kinds."""
     return [(name, each, getattr(lax, name)) for name in names.split() for each in kinds.split()]
 
 
@@ -35,7 +35,7 @@ def scattering(function, places=(2, 0, 2), **more):
 
 @jax.custom_jvp
 def doubled_slope(x):
-    """sin with twice its derivative, so that a rule that is lost shows."""
+    """sin with twice its derivative, so that a lost rule shows."""
     return jnp.sin(x)
 
 
@@ -62,9 +62,9 @@ def held(a, b):
 
 
 def root(x):
-    """y + y³ = x by Newton's method, its derivative by that of what it solves."""
-    turn = lambda f: lambda _, y: y - f(y) / (1 + 3 * y**2)
-    solve = lambda f, y: lax.fori_loop(0, 30, turn(f), y)
+    """The root of y + y³ = x by Newton's method, differentiated implicitly."""
+    newton_step = lambda f: lambda _, y: y - f(y) / (1 + 3 * y**2)
+    solve = lambda f, y: lax.fori_loop(0, 30, newton_step(f), y)
     return lax.custom_root(lambda y: y + y**3 - x, jnp.zeros_like(x), solve, lambda g, y: y / g(jnp.ones_like(y)))
 
 
@@ -79,7 +79,7 @@ EVERY = "fa fa ga ca ha ea ia"
 REAL = "fa fa ga ha ea"
 
 OPERATIONS = [
-    # of each entry
+    # element-wise
     *several("sin cos tan tanh exp log1p expm1 sqrt rsqrt log sinh cosh asinh atan logistic square", "fa fa ga ca ha ea"),
     *several("asin acos acosh atanh", "fa ga ca"),
     *several("cbrt exp2 floor ceil round sign abs erf erfc erf_inv lgamma digamma bessel_i0e bessel_i1e reciprocal", "fa fa ga"),
@@ -208,7 +208,7 @@ OPERATIONS = [
     *on("fv", scatter_apply=lambda x: lax.stop_gradient(x).at[np.array([1, 2])].apply(jnp.sin) * x),
     *on("fv,fv", stack=lambda x, y: jnp.stack([x, y]), unstack=lambda x, y: jnp.unstack(jnp.stack([x, y], 1))),
     *on("f.", broadcast_to_rank=lambda x: lax.broadcast_to_rank(x, 1) * np.ones(3), full=lambda x: lax.full((3,), 2.0) * x),
-    # reducing
+    # reductions
     *on(
         "fm",
         reduce_sum=lambda x: lax.reduce_sum(x, (0,)),
@@ -329,7 +329,7 @@ OPERATIONS = [
     *on("fv", fft=lambda x: jnp.fft.fft(x), householder_product=lambda x: lax.linalg.householder_product(x[:, None] / 2, x[:1]).ravel()),
     *on("cv", fft=lambda x: jnp.fft.ifft(x)),
     *on("fv", fft=lambda x: jnp.abs(jnp.fft.rfft(x)).sum() * x),
-    # calls, loops, choices
+    # calls, loops, branches
     *on(
         "fv",
         custom_jvp=doubled_slope,
@@ -374,17 +374,17 @@ OPERATIONS = [
 ]
 
 NOT_COVERED = {
-    "they hand over shapes and dtypes, not numbers": (
+    "they return shapes and dtypes, not numbers": (
         "broadcast_shapes conv_dimension_numbers conv_general_permutations conv_general_shape_tuple conv_shape_tuple "
         "conv_transpose_shape_tuple dtype padtype_to_pads reduce_window_shape_tuple shape_as_value"
     ),
-    "they talk to other devices": (
+    "they communicate with other devices": (
         "all_gather all_to_all axis_index axis_size pbroadcast pcast pmax pmean pmin ppermute precv psend pshuffle psum psum_scatter "
         "pswapaxes ragged_all_to_all with_sharding_constraint"
     ),
-    "they have an effect or an order, and no numbers": "after_all create_token dce_sink stage",
-    "they draw at random, which is no function of its operands": "rng_bit_generator rng_uniform",
-    "what they leave in memory is anything": "empty",
+    "they have an effect or an order, but no numbers": "after_all create_token dce_sink stage",
+    "they are random, not a function of their operands": "rng_bit_generator rng_uniform",
+    "their result is uninitialised": "empty",
     "they need shapes or dtypes beyond those of small programs": "ragged_dot_general scaled_dot",
     "it is broadcast_in_dim": "broadcast_like",
 }

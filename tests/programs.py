@@ -1,9 +1,9 @@
-"""Random programs over the operations of `jax.lax`, and their rewritten form beside the plain one.
+"""Random programs over the operations of `jax.lax`, and their rewritten form compared with the plain one.
 
-python tests/programs.py FIRST LAST     compares the programs of these seeds and prints what differs
+python tests/programs.py FIRST LAST     compares the programs of these seeds and prints those that differ
 
-Programs are not compiled, which is what takes time: the plain one is run by JAX, equation by equation, and the rewritten one on NumPy's
-scalars, with what is not taken apart run by JAX.
+Programs are not compiled, which would take most of the time: the plain one is run by JAX, equation by equation, and the rewritten one on
+NumPy's scalars, with equations that stay whole run by JAX.
 """
 
 import functools
@@ -17,27 +17,30 @@ import numpy as np
 from operations import OPERATIONS, SHAPES
 
 from jaxlag._program import scalarise
-from jaxlag._program.constants import KNOWN, folded
-from jaxlag._program.interpreter import Reader, opened
-from jaxlag._program.rules import CALLS, RULED, body, primitives
-from jaxlag._program.scalar_graph import TooLong, UnknownPrimitive, filled
+from jaxlag._program.constants import FOLDABLE, folded
+from jaxlag._program.expressions import TooLong, UnknownPrimitive, filled
+from jaxlag._program.interpreter import Interpreter, traced
+from jaxlag._program.walker import CALLS, CALLS_WITH_DERIVATIVE_RULE, called_program, primitive_names
 
 SIZE = 3  # of x and of v
 LIMIT = 5000
-LARGE = 50.0  # numbers that grow beyond say little about what comes after
+LARGE = 50.0  # larger numbers say little about what comes after
 DTYPES = {"f": "float64", "g": "float32", "c": "complex128", "i": "int32", "u": "uint8", "b": "bool", "h": "bfloat16", "e": "float16"}
 
 
 # The plain program, equation by equation.
 
 
-def plain(program, *operands):
-    """The outputs of a program, as JAX computes its equations one by one; loops turn in Python."""
+def run_plain(program, *operands):
+    """The outputs of a program, as JAX computes its equations one by one, with loops in Python.
+
+    It has a walk of its own, for it is what the package's is compared with.
+    """
     jaxpr, consts = getattr(program, "jaxpr", program), getattr(program, "consts", ())
     env = dict(zip([*jaxpr.constvars, *jaxpr.invars], [*consts, *operands], strict=True))
     read = lambda atom: atom.val if hasattr(atom, "val") else env[atom]
     for equation in jaxpr.eqns:
-        env |= dict(zip(equation.outvars, once(equation, *map(read, equation.invars)), strict=True))
+        env |= dict(zip(equation.outvars, run_equation(equation, *map(read, equation.invars)), strict=True))
     return [read(atom) for atom in jaxpr.outvars]
 
 
@@ -50,7 +53,7 @@ def _elementwise(**functions):
     return {name: lambda p, *operands, function=function: function(*operands) for name, function in functions.items()}
 
 
-# What most equations do, and on arrays of many shapes, each of which JAX would compile; NumPy and JAX agree on double precision.
+# Frequent equations, on arrays of many shapes, each of which JAX would compile; NumPy and JAX agree in double precision.
 BY_NUMPY = {
     **_elementwise(add=np.add, add_any=np.add, sub=np.subtract, mul=np.multiply, div=np.divide, neg=np.negative, sin=np.sin, cos=np.cos),
     **_elementwise(exp=np.exp, log=np.log, sqrt=np.sqrt, tanh=np.tanh, square=np.square, abs=np.abs, sign=np.sign, copy=np.array),
@@ -66,22 +69,22 @@ BY_NUMPY = {
 }
 
 
-def once(equation, *operands):
+def run_equation(equation, *operands):
     """The outputs of one equation."""
     name, p = equation.primitive.name, equation.params
-    if name in (*CALLS, *RULED):
-        return plain(body(equation), *operands)
+    if name in (*CALLS, *CALLS_WITH_DERIVATIVE_RULE):
+        return run_plain(called_program(equation), *operands)
     if name == "custom_linear_solve":
         lengths = p["const_lengths"]
         at = lengths.matvec + lengths.vecmat
-        return plain(p["jaxprs"].solve, *operands[at : at + lengths.solve], *operands[sum(lengths) :])
+        return run_plain(p["jaxprs"].solve, *operands[at : at + lengths.solve], *operands[sum(lengths) :])
     if name == "cond":
-        return plain(p["branches"][min(max(int(operands[0]), 0), len(p["branches"]) - 1)], *operands[1:])
+        return run_plain(p["branches"][min(max(int(operands[0]), 0), len(p["branches"]) - 1)], *operands[1:])
     if name == "while":
         i, j = p["cond_nconsts"], p["cond_nconsts"] + p["body_nconsts"]
         state = operands[j:]
-        while np.any(goes_on := plain(p["cond_jaxpr"], *operands[:i], *state)[0]):  # in a batch, until the last has ended
-            turned = plain(p["body_jaxpr"], *operands[i:j], *state)
+        while np.any(goes_on := run_plain(p["cond_jaxpr"], *operands[:i], *state)[0]):  # in a batch, until the last one ends
+            turned = run_plain(p["body_jaxpr"], *operands[i:j], *state)
             which = [np.reshape(goes_on, np.shape(goes_on) + (1,) * (np.ndim(new) - np.ndim(goes_on))) for new in turned]
             state = [np.where(*parts) for parts in zip(which, turned, state, strict=True)]
         return list(state)
@@ -89,7 +92,7 @@ def once(equation, *operands):
         i, j = p["num_consts"], p["num_consts"] + p["num_carry"]
         carry, rows = operands[i:j], {}
         for k in reversed(range(p["length"])) if p["reverse"] else range(p["length"]):
-            outs = plain(p["jaxpr"], *operands[:i], *carry, *(np.asarray(x)[k] for x in operands[j:]))
+            outs = run_plain(p["jaxpr"], *operands[:i], *carry, *(np.asarray(x)[k] for x in operands[j:]))
             carry, rows[k] = outs[: p["num_carry"]], outs[p["num_carry"] :]
         return [*carry, *(np.stack(column) for column in zip(*(map(np.asarray, rows[k]) for k in sorted(rows)), strict=True))]
     given = [np.asarray(x, atom.aval.dtype) for x, atom in zip(operands, equation.invars, strict=True)]
@@ -100,36 +103,36 @@ def once(equation, *operands):
     return [np.asarray(out) for out in (outs if equation.primitive.multiple_results else [outs])]
 
 
-# The rewritten one.
+# The rewritten program.
 
 
-class OnNumbers(type(scalarise.JAX_ALGEBRA)):
-    """What production takes apart, on NumPy's scalars."""
+class NumPyAlgebra(type(scalarise.JAX_ALGEBRA)):
+    """Scalars are those of NumPy, with the rules of production."""
 
     def function(self, primitive, params, dtype):
         return lambda *numbers: folded(primitive, params, dtype, *numbers)
 
     def block(self, equation):
         def whole(*arrays):
-            given = arrays[-len(equation.invars) :]  # a linear solve hands over its solution before them
+            given = arrays[-len(equation.invars) :]  # a linear solve passes its solution before them
             numbers = [np.array(x.tolist(), atom.aval.dtype).reshape(x.shape) for x, atom in zip(given, equation.invars, strict=True)]
-            return [filled(x.shape, x.reshape(-1)) for x in map(np.asarray, once(equation, *numbers))]
+            return [filled(x.shape, x.reshape(-1)) for x in map(np.asarray, run_equation(equation, *numbers))]
 
         return whole
 
 
-def rewritten(closed, *operands):
-    """The outputs of the rewritten program, and whether it is another one than the plain."""
-    reader = Reader(OnNumbers(), LIMIT)
+def run_rewritten(closed, *operands):
+    """The outputs of the rewritten program, and whether it differs from the plain one."""
+    interpreter = Interpreter(NumPyAlgebra(), LIMIT)
     try:
-        inputs, outputs = opened(closed, reader)
+        inputs, outputs = traced(closed, interpreter)
     except (TooLong, UnknownPrimitive):
-        return plain(closed, *operands), False
+        return run_plain(closed, *operands), False
     arrays = [*closed.consts, *operands]
-    pairs = [(entries, np.asarray(array)) for entries, array in zip(inputs, arrays, strict=True) if entries.dtype == object]
-    given = {entry: x for entries, array in pairs for entry, x in zip(entries.flat, array.flat, strict=True)}
+    pairs = [(nodes, np.asarray(array)) for nodes, array in zip(inputs, arrays, strict=True) if nodes.dtype == object]
+    given = {node: x for nodes, array in pairs for node, x in zip(nodes.flat, array.flat, strict=True)}
     with np.errstate(all="ignore"):
-        found = reader.values(outputs, given)
+        found = interpreter.values(outputs, given)
     return [np.array(x.tolist(), v.aval.dtype).reshape(x.shape) for x, v in zip(found, closed.jaxpr.outvars, strict=True)], True
 
 
@@ -137,46 +140,46 @@ def rewritten(closed, *operands):
 
 
 class Program(NamedTuple):
-    """A function of two vectors: steps that each take earlier values, shared among them."""
+    """A function of two vectors: steps that each take values of earlier ones."""
 
     steps: tuple  # (name, function, where its operands stand)
     constants: tuple
     weights: np.ndarray
 
     def __call__(self, x, v):
-        """All that the last steps give, as real numbers."""
+        """The values of the last steps, as real numbers."""
         values = [x, v, *map(jnp.asarray, self.constants)]
         for _, function, places in self.steps:
             values += function(*(values[k] for k in places))
         return jnp.concatenate([jnp.ravel(real(value)) for value in values[-3:]])
 
     def scalar(self, x, v):
-        """A weighted sum of it."""
+        """A weighted sum of them."""
         parts = self(x, v)
         return jnp.sum(parts * self.weights[: parts.size]) + jnp.sum(parts**2) / 8
 
     @property
     def names(self):
-        """Of its operations."""
+        """The names of its operations."""
         return [name for name, _, _ in self.steps]
 
 
 def real(value):
-    """Its numbers as real ones."""
+    """A value as real numbers."""
     value = jnp.asarray(value)
     if jnp.iscomplexobj(value):
         value = jnp.stack([value.real, value.imag])
     return value.astype(float)
 
 
-def program(seed, longest=60):
+def random_program(seed, longest=60):
     """The program of a seed, with the numbers at which it is run."""
     rng = np.random.default_rng(seed)
     x, v = rng.uniform(-1.5, 1.5, SIZE), rng.uniform(-1.5, 1.5, SIZE)
     constants = [constant(rng, kind, SHAPES[rng.integers(len(SHAPES))]) for kind in rng.choice([*DTYPES, "f", "f", "f"], 3)]
     values, steps = [x, v, *constants], []
-    real_only = rng.random() < 0.6  # one operation of another kind leaves the whole as it is
-    length = 5 + int((longest - 4) * rng.random() ** 3)  # most are short, and tell as much in less time
+    real_only = rng.random() < 0.6  # one operation on other dtypes leaves the whole program plain
+    length = 5 + int((longest - 4) * rng.random() ** 3)  # most are short, which shows as much in less time
     for _ in range(3 * length):
         if len(steps) == length:
             break
@@ -184,15 +187,15 @@ def program(seed, longest=60):
         name, kinds, _ = OPERATIONS[at]
         if real_only and set(kinds) & set("che"):
             continue
-        places = chosen(rng, kinds, values)
+        places = choose_operands(rng, kinds, values)
         if places is None:
             continue
         given = [values[k] for k in places]
         closed = operation(at, *(jax.ShapeDtypeStruct(x.shape, x.dtype) for x in given))
-        outs = plain(closed, *given)
-        if real_only and any(o.dtype not in KNOWN for o in outs):
+        outs = run_plain(closed, *given)
+        if real_only and any(o.dtype not in FOLDABLE for o in outs):
             continue
-        if all(o.size <= 12 and is_tame(o) for o in outs):
+        if all(o.size <= 12 and is_moderate(o) for o in outs):
             steps.append((name, jax.extend.core.jaxpr_as_fun(closed), places))
             values += outs
     return Program(tuple(steps), tuple(constants), rng.uniform(0.5, 1.5, 200)), x, v
@@ -205,15 +208,15 @@ def operation(at, *shapes):
 
 
 def constant(rng, kind, shape):
-    """Numbers of a kind, a zero and equal ones among them."""
+    """Numbers of a dtype, with zeros and equal ones among them."""
     numbers = rng.choice([0.0, 1.0, -1.0, 2.0, 0.5, *rng.uniform(-2, 2, 4)], shape)
     return np.asarray(numbers + 1j * rng.uniform(-1, 1, shape) if kind == "c" else np.abs(numbers) if kind == "u" else numbers).astype(
         jnp.dtype(DTYPES[kind])
     )
 
 
-def chosen(rng, kinds, values):
-    """Where operands of these kinds stand: a letter for the dtype, then one for the shape, where "s" is the same for all."""
+def choose_operands(rng, kinds, values):
+    """The positions of operands of these kinds: a letter for the dtype, then one for the shape, where "s" is the same for all."""
     same, places = None, []
     for kind, shape in kinds.split(","):
         wanted = {"v": (3,), "m": (2, 3), "q": (3, 3), ".": (), "s": same}.get(shape)
@@ -225,7 +228,7 @@ def chosen(rng, kinds, values):
     return tuple(places)
 
 
-def is_tame(array):
+def is_moderate(array):
     return bool(np.all(np.isfinite(array.astype(complex))) and np.all(np.abs(array.astype(complex)) < LARGE))
 
 
@@ -252,22 +255,19 @@ FORMS = {
 NO_DERIVATIVE = ("not implemented", "rule", "differentiat", "Reverse-mode", "forward-mode", "complex", "float0", "NYI")
 
 
-def traced(function, *arguments):
-    """Its program; None where JAX has no derivative of it, or one of a loop that it must know beforehand."""
+def jaxpr_of(function, *arguments):
+    """The program of a function; None where JAX has no derivative of it, or needs the length of a loop."""
     try:
         closed = jax.make_jaxpr(function)(*arguments)
-        return None if "custom_lin" in primitives(closed) else closed
+        return None if "custom_lin" in primitive_names(closed) else closed
     except (NotImplementedError, TypeError, ValueError) as error:
-        if any(
-            part in str(error)
-            for part in ("not implemented", "rule", "differentiat", "Reverse-mode", "complex", "float0", "forward-mode", "NYI")
-        ):
+        if any(part in str(error) for part in NO_DERIVATIVE):
             return None
         raise
 
 
 def differs(found, run, x, v, single):
-    """How far numbers are from those of a plain program, beyond what an error of some roundings in its input makes of them."""
+    """The error with respect to the plain program, or 0 where it is no larger than that from a few roundings in the input."""
     expected = run(x, v)
     rounding = 1e-6 if single else 1e-14
     scale = 1 + max((np.max(np.abs(b)) for b in expected if np.size(b)), default=0)
@@ -283,38 +283,38 @@ def differs(found, run, x, v, single):
 
 
 def compared(seed):
-    """For the program of a seed, and a form of it: the form, whether it was rewritten, the error."""
-    run, x, v = program(seed)
+    """For the program of a seed in one of its forms: the form, whether it was rewritten, the error, the program."""
+    run, x, v = random_program(seed)
     form = list(FORMS)[seed % len(FORMS)]
-    closed = traced(FORMS[form](run), x, v)
+    closed = jaxpr_of(FORMS[form](run), x, v)
     if closed is None:
         form, closed = "value", jax.make_jaxpr(FORMS["value"](run))(x, v)
     single = "f32[" in str(closed)
-    found, other = rewritten(closed, x, v)
-    error = differs(found, functools.partial(plain, closed), x, v, single)
-    if other and not error and seed % 8 == 0:  # derivatives of the rewritten program itself, as production makes it
-        written_out, one = scalarise._written_out(FORMS[form](run), LIMIT), np.ones(SIZE)
+    found, is_rewritten = run_rewritten(closed, x, v)
+    error = differs(found, functools.partial(run_plain, closed), x, v, single)
+    if is_rewritten and not error and seed % 8 == 0:  # derivatives of the rewritten program itself, as in production
+        written_out, one = scalarise._as_scalar_code(FORMS[form](run), LIMIT), np.ones(SIZE)
         along = lambda f: lambda x, v: jax.jvp(f, (x, v), (one, -one))[1]
-        closed = traced(along(FORMS[form](run)), x, v)
+        closed = jaxpr_of(along(FORMS[form](run)), x, v)
         if closed is not None:
-            slope = traced(along(written_out), x, v)
-            error = differs(plain(slope, x, v), functools.partial(plain, closed), x, v, single)
+            slope = jaxpr_of(along(written_out), x, v)
+            error = differs(run_plain(slope, x, v), functools.partial(run_plain, closed), x, v, single)
             form = f"slope of {form}"
-    return form, other, error, run
+    return form, is_rewritten, error, run
 
 
 def main(first, last):
-    """Prints what differs, and how many programs were compared."""
+    """Prints the programs that differ, and how many were compared."""
     jax.config.update("jax_enable_x64", True)
     changed, operations, bad = 0, set(), 0
     for seed in range(first, last):
         try:
-            form, other, error, run = compared(seed)
+            form, is_rewritten, error, run = compared(seed)
         except Exception as problem:  # a hunt goes on
             print(f"seed {seed}: {type(problem).__name__}: {str(problem)[:300]}", flush=True)
             bad += 1
             continue
-        changed += other
+        changed += is_rewritten
         operations |= set(run.names)
         if error:
             bad += 1

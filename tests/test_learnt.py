@@ -1,7 +1,6 @@
 """Learnt potentials: what is built in holds for any weights, and what is left open is learnt."""
 
 import functools
-import inspect
 import re
 import warnings
 from typing import NamedTuple
@@ -237,12 +236,6 @@ def test_a_convex_potential_has_its_minimum_at_rest():
 def test_unusable_sizes_are_refused(make, said):
     with pytest.raises(ValueError, match=re.escape(said)):
         make(jax.random.key(0))
-
-
-@every_class
-def test_docstring_examples_run(cls):
-    (block,) = re.findall(r"```python\n(.*?)```", inspect.getdoc(cls), re.S)
-    exec(block, {})
 
 
 def test_the_shipped_recording_is_what_its_script_makes(tmp_path, monkeypatch):

@@ -1,4 +1,4 @@
-"""The main job: `python -m jaxlag` in a process and a folder of its own."""
+"""The demo: `python -m jaxlag` in a process and a folder of its own."""
 
 import os
 import subprocess
@@ -62,11 +62,11 @@ def test_a_drive_of_ones_own_without_matplotlib(tmp_path):
     ("text", "sentence"),
     [
         (GOOD.replace("phi", "theta"), "must have the columns t,y,phi,xdot, but has no phi. Name them in its first line."),
-        (GOOD.replace("0.4", "n/a"), "line 4, column y, must be a finite number, but is 'n/a'. Correct it or leave the sample out."),
+        (GOOD.replace("0.4", "n/a"), "line 4, column y, must be a finite number, but is 'n/a'. Correct it or drop the sample."),
         (GOOD.replace("0.04", "nan"), "line 3, column phi, must be a finite number, but is 'nan'."),
         (GOOD + "0.3,0.4\n", "line 5, column phi, must be a finite number, but is ''."),
         (GOOD.replace("0.2,0.4", "0.05,0.4"), "`ts` must increase, but ts[1] = 0.1 is followed by ts[2] = 0.05. Sort"),
-        (GOOD[: GOOD.index("0.1,")], "must hold at least two samples, but holds 1. Record a drive"),
+        (GOOD[: GOOD.index("0.1,")], "must contain at least two samples, but contains 1. Record a drive"),
         ("", "must have the columns t,y,phi,xdot, but has no t, y, phi, xdot."),
         (None, "No such file"),
     ],

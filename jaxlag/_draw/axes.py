@@ -1,4 +1,4 @@
-"""What all pictures have in common: axes, colours, labels. Matplotlib is imported when the first one is drawn."""
+"""What all pictures share: axes, colours, labels. Matplotlib is imported when the first one is drawn."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -10,9 +10,10 @@ from jaxtyping import PyTree
 from .._model.paths import labels, leaf_names
 from .._motion.trajectory import Trajectory
 
-# Okabe & Ito, Color Universal Design (2008): told apart with every kind of colour vision. Their yellow is too pale for a thin line.
+# Okabe & Ito, Color Universal Design (2008), distinguishable with any colour vision. Their yellow is too pale for a thin line.
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00", "#000000")
 GREY = "#777777"
+COINCIDENT = 0.01  # of the height of the curves: lines nearer than this over half of their length coincide
 
 Units = Mapping[str, str] | None
 
@@ -31,16 +32,16 @@ def channels(tree: PyTree, bare: str) -> dict[str, dict[str, np.ndarray]]:
 
 
 def one_motion(trajectory: Trajectory) -> Trajectory:
-    """The trajectory, which a batch is refused as."""
+    """The trajectory, if it is not a batch of them."""
     if trajectory.ts.ndim != 1:
         raise ValueError(
-            f"`trajectory` must be one motion, but is a batch of shape {trajectory.ts.shape[:-1]}. Take one of it, e.g. `trajectory[0]`."
+            f"`trajectory` must be one motion, but is a batch of shape {trajectory.ts.shape[:-1]}. Take one of them, e.g. `trajectory[0]`."
         )
     return trajectory
 
 
 def chosen(names: Sequence[str] | None, known: Sequence[str], what: str) -> tuple[str, ...]:
-    """The names that were asked for, or all."""
+    """The requested names, or all."""
     for name in names or ():
         if name not in known:
             raise ValueError(f"`names` must name {what}, but holds {name!r}. There are {', '.join(known)}.")
@@ -48,7 +49,7 @@ def chosen(names: Sequence[str] | None, known: Sequence[str], what: str) -> tupl
 
 
 def panels(axes: Any, shape: tuple[int, int], which: str, *, sharex: Any = True, **layout: Any) -> Any:
-    """The axes that were handed over, or those of a new figure, as an array of that shape."""
+    """The given axes, or those of a new figure, as an array of that shape."""
     if axes is None:
         _, axes = pyplot().subplots(*shape, sharex=sharex, squeeze=False, layout="constrained", **layout)
     if np.size(axes) != np.prod(shape):
@@ -60,12 +61,12 @@ def panels(axes: Any, shape: tuple[int, int], which: str, *, sharex: Any = True,
 
 
 def canvas(ax: Any, **layout: Any) -> Any:
-    """The axes that were handed over, or those of a new figure."""
+    """The given axes, or those of a new figure."""
     return pyplot().subplots(layout="constrained", **layout)[1] if ax is None else ax
 
 
 def pyplot() -> Any:
-    """Matplotlib's, without which there are no pictures."""
+    """Matplotlib's `pyplot`, imported when it is needed."""
     try:
         import matplotlib.pyplot as plt
     except ImportError as error:
@@ -74,46 +75,52 @@ def pyplot() -> Any:
 
 
 def curve(ax: Any, x: Any, y: Any, **style: Any) -> None:
-    """A line; where it lies on lines drawn before it is dashed, so that these are seen between the dashes."""
+    """A line; where it coincides with earlier lines it is dashed, so that these show through."""
     x, y = np.asarray(x), np.asarray(y)
     before = [np.asarray(line.get_ydata()) for line in ax.lines if np.array_equal(line.get_xdata(), x)]
     height = max((float(np.ptp(z[np.isfinite(z)])) for z in (y, *before) if np.isfinite(z).any()), default=0.0)
-    below = sum(np.mean(np.abs(y - z) <= SEEN * height) > 0.5 for z in before)
+    below = sum(np.mean(np.abs(y - z) <= COINCIDENT * height) > 0.5 for z in before)
     ax.plot(x, y, **({"linestyle": (6 * (below - 1), (6, 6 * below))} if below else {}) | style)
 
 
-SEEN = 0.01  # of the height of what is drawn: lines that are nearer to each other over half of their length lie on each other
-
-
 def legend_beside(ax: Any) -> None:
-    """A legend to the right of the panel, where it hides nothing."""
+    """A legend to the right of the panel, where it covers nothing."""
     ax.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), fontsize="small")
 
 
 def legend_above(ax: Any, ncols: int = 3) -> None:
-    """A legend above the panel, where it hides nothing and takes no width."""
+    """A legend above the panel, where it covers nothing and takes no width."""
     ax.legend(loc="lower center", bbox_to_anchor=(0.5, 1.0), fontsize="small", ncols=ncols, frameon=False)
 
 
 def zero_line(ax: Any) -> None:
-    """A thin line at zero, behind what is drawn."""
+    """A thin line at zero, behind the curves."""
     ax.axhline(0.0, color=GREY, linewidth=0.8, zorder=0.5)
 
 
 def label(name: str, units: Units, of: str | None = None) -> str:
-    """A name with the unit of it, or of another quantity."""
+    """A name with its unit, or with that of another quantity."""
     unit = (units or {}).get(of or name)
     return f"{name} ({unit})" if unit else name
 
 
-def over_time(ts: Any, quantities: Mapping[str, dict], titles: Sequence[str], which: str, units: Units, axes: Any) -> Any:
-    """A panel for each quantity, over a common time axis."""
-    drawn = panels(axes, (len(quantities), 1), which, figsize=(6.4, 1.0 + 1.7 * len(quantities)))[:, 0]
-    for ax, (name, entries), title in zip(drawn, quantities.items(), titles, strict=True):
+def over_time(
+    trajectory: Trajectory,
+    quantities: Mapping[str, dict[str, np.ndarray]],
+    names: Sequence[str] | None,
+    what: str,
+    units: Units,
+    axes: Any,
+    prefix: str = "",
+) -> tuple[Any, dict[str, dict[str, np.ndarray]]]:
+    """A panel for each requested quantity, over a common time axis; and these quantities."""
+    shown = {name: quantities[name] for name in chosen(names, tuple(quantities), f"{what}s")}
+    drawn = panels(axes, (len(shown), 1), f"one for each {what}", figsize=(6.4, 1.0 + 1.7 * len(shown)))[:, 0]
+    for ax, (name, entries) in zip(drawn, shown.items(), strict=True):
         for i, (entry, samples) in enumerate(entries.items()):
-            curve(ax, ts, samples, color=colour(i), label=entry)
-        ax.set_ylabel(label(title, units, name))
+            curve(ax, trajectory.ts, samples, color=colour(i), label=entry)
+        ax.set_ylabel(label(f"{prefix}{name}", units, name))
         if len(entries) > 1:
             legend_beside(ax)
     drawn[-1].set_xlabel(label("t", units))
-    return drawn
+    return drawn, shown

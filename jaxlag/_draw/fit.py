@@ -1,4 +1,4 @@
-"""Pictures of an identification: the fit against what was measured, the parameters, and how it converged."""
+"""Pictures of an identification: the fit and the measurements, the parameters, and the convergence."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -7,34 +7,36 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from .._fit.result import Fit, plus_minus
+from .._fit.result import Fit
+from .._fit.rounding import plus_minus
 from .axes import GREY, Units, canvas, channels, chosen, colour, label, legend_above, legend_beside, panels
 
-READABLE = 40  # parameters in one picture
-WRITTEN = 8  # up to which correlations are written out
+MOST_PARAMETERS = 40  # in one picture
+MOST_WITH_NUMBERS = 8  # up to which correlations are written as numbers
 
 
 def fit(fit: Fit, *, number: int = 0, level: float = 0.95, units: Units = None, axes: Any = None) -> Any:
-    r"""What was measured with the fitted motion and its confidence band, and below it what is left: one column for each channel.
+    r"""Measurements with the fitted motion and its confidence band, and the residuals below: one column for each channel.
 
     $$ \hat z_i = h(t_i, q(t_i; \hat\theta), \dot q(t_i; \hat\theta)) \pm t\,\mathrm{se}(\hat z_i), \qquad r_i = z_i - \hat z_i,
        \qquad |r_i| < 2\sigma $$
 
-    The band of the fit says how far its uncertain parameters and starts let the motion be off; it is often thinner than the line.
-    The band of the residuals is ±2σ, with the sigma of the experiment where one was given and the estimated one where not. Of
-    residuals that are noise, 95 % lie in it, without any pattern; a pattern is motion that the model has not.
+    The band of the fit shows the uncertainty of the motion that follows from its parameters and initial states; it is often thinner than
+    the line. The band of the residuals is ±2σ, with the sigma of the experiment if one was given, otherwise the estimated one. If the
+    residuals are noise, 95 % of them lie in it, without any pattern; a pattern is motion that the model lacks.
 
     **Arguments:**
 
-    - `fit`: what `jaxlag.fit` returned.
-    - `number`: which of the experiments of the fit to draw.
-    - `level`: of the confidence band.
-    - `units`: units by name of channel, and of `"t"`, to be written on the axes. A recording that is one array is named `"z"`.
+    - `fit`: the result of `jaxlag.fit`.
+    - `number`: the index of the experiment to draw.
+    - `level`: the level of the confidence band.
+    - `units`: units by name of channel, and of `"t"`, written on the axes. A recording that is one array is named `"z"`.
     - `axes`: matplotlib axes to draw in, 2 × number of channels. Default: a new figure.
 
     **Returns:** the axes, an array of shape (2, channels).
 
-    **Raises:** `ValueError` where `axes` do not fit the channels, `ImportError` without matplotlib.
+    **Raises:** `ValueError` if `axes` do not match the channels, `IndexError` if there is no such experiment; `ImportError` without
+    matplotlib.
 
     **Source:** Ljung, System Identification, 2nd ed., section 16.6 (residual analysis); Seber & Wild, Nonlinear Regression (1989),
     section 5.1 (the band).
@@ -68,9 +70,9 @@ def fit(fit: Fit, *, number: int = 0, level: float = 0.95, units: Units = None, 
             reach = upmost[name][entry] - model
             known = np.isfinite(reach)
             if known.any():
-                reach = np.interp(ts, ts[known], reach[known])  # where a sample is missing, from its neighbours
-                said = None if i else f"{100 * level:g} % confidence"
-                upper.fill_between(ts, model - reach, model + reach, color=colour(i), alpha=0.3, linewidth=0, label=said)
+                reach = np.interp(ts, ts[known], reach[known])  # interpolated where a sample is missing
+                text = None if i else f"{100 * level:g} % confidence"
+                upper.fill_between(ts, model - reach, model + reach, color=colour(i), alpha=0.3, linewidth=0, label=text)
             lower.fill_between(ts, -noise, noise, color=GREY, alpha=0.3 / len(entries), linewidth=0)
             lower.plot(ts, residuals[name][entry], ".", color=colour(i), markersize=3)
         upper.set_ylabel(label(name, units))
@@ -84,23 +86,23 @@ def fit(fit: Fit, *, number: int = 0, level: float = 0.95, units: Units = None, 
 
 
 def parameters(fit: Fit, names: Sequence[str] | None = None, *, axes: Any = None) -> Any:
-    r"""Estimates with their errors in percent of the value, so that all units fit in one picture, and the matrix of correlations.
+    r"""Estimates with their errors in percent, so that all units fit in one picture, and the matrix of correlations.
 
     $$ \frac{\mathrm{se}(\hat\theta_i)}{|\hat\theta_i|}, \qquad
        \rho_{ij} = \frac{\mathrm{cov}_{ij}}{\sqrt{\mathrm{cov}_{ii}\,\mathrm{cov}_{jj}}} $$
 
-    The thick bar is one standard error to either side, the thin one the 95 % interval. Two parameters of correlation near ±1 are
-    told apart by these measurements only badly: blue is +1, red is −1; of many parameters, those of more than ½ have a sign.
+    The thick bar is one standard error to either side, the thin one the 95 % interval. These measurements can hardly distinguish two
+    parameters whose correlation is near ±1. Blue is +1, red is −1; with many parameters, correlations above ½ are marked by their sign.
 
     **Arguments:**
 
-    - `fit`: what `jaxlag.fit` returned.
-    - `names`: the parameters to be drawn, entries of `fit.names`, at most 40. Default: all.
+    - `fit`: the result of `jaxlag.fit`.
+    - `names`: the parameters to draw, entries of `fit.names`, at most 40. Default: all.
     - `axes`: two matplotlib axes to draw in. Default: a new figure.
 
     **Returns:** the axes, an array of shape (2,).
 
-    **Raises:** `ValueError` where `names` name no parameters or too many, or `axes` are not two; `ImportError` without matplotlib.
+    **Raises:** `ValueError` if `names` are unknown, none or too many, or if `axes` are not two; `ImportError` without matplotlib.
 
     **Source:** Seber & Wild, Nonlinear Regression (1989), section 5.1.
 
@@ -114,8 +116,8 @@ def parameters(fit: Fit, names: Sequence[str] | None = None, *, axes: Any = None
     ```
     """
     names = chosen(names, fit.names, "fitted parameters")
-    if not 0 < len(names) <= READABLE:
-        raise ValueError(f"`names` must be between 1 and {READABLE}, to be readable, but are {len(names)}. Choose among `fit.names`.")
+    if not 0 < len(names) <= MOST_PARAMETERS:
+        raise ValueError(f"`names` must be 1 to {MOST_PARAMETERS}, to be readable, but are {len(names)}. Choose among `fit.names`.")
     at = [fit.names.index(name) for name in names]
     values = np.asarray(fit.problem.free.theta(jnp.asarray(fit.x[: len(fit.names)])))[at]
     errors, correlation = np.sqrt(np.diag(fit.covariance))[at], fit.correlation[np.ix_(at, at)]
@@ -126,10 +128,10 @@ def parameters(fit: Fit, names: Sequence[str] | None = None, *, axes: Any = None
     rows = np.arange(len(names))
     percent = np.where(np.isfinite(errors) & (values != 0), 100 * errors / np.abs(np.where(values == 0, 1, values)), np.nan)
     known = np.isfinite(percent)
-    for width, reach in ((1.5, fit._quantile(0.95)), (6.0, 1.0)):
+    for width, reach in ((1.5, fit.quantile(0.95)), (6.0, 1.0)):
         bars.hlines(rows[known], -reach * percent[known], reach * percent[known], color=colour(0), linewidth=width)
     bars.plot(0 * rows[known], rows[known], "o", color="white", markeredgecolor=colour(0), markersize=5)
-    bars.set_yticks(rows, [f"{name}\n{_spoken(*pair)}" for name, *pair in zip(names, values, errors, strict=True)])
+    bars.set_yticks(rows, [f"{name}\n{_in_words(*pair)}" for name, *pair in zip(names, values, errors, strict=True)])
     bars.set_ylim(len(names) - 0.5, -0.5)
     bars.set_xlabel("standard error and 95 % interval (% of the value)")
     bars.grid(axis="x", alpha=0.4)
@@ -140,22 +142,25 @@ def parameters(fit: Fit, names: Sequence[str] | None = None, *, axes: Any = None
     matrix.set_title("correlation", fontsize="medium")
     for (i, j), rho in np.ndenumerate(correlation):
         sign = "+−"[int(rho < 0)] if abs(rho) > 0.5 else ""
-        said = sign if len(names) > WRITTEN else f"{rho:+.2f}" if np.isfinite(rho) else "–"
-        matrix.text(j, i, said, ha="center", va="center", fontsize="small", color="white" if abs(rho) > 0.7 else "black")
-    if len(names) > WRITTEN:
+        text = sign if len(names) > MOST_WITH_NUMBERS else f"{rho:+.2f}" if np.isfinite(rho) else "–"
+        matrix.text(j, i, text, ha="center", va="center", fontsize="small", color="white" if abs(rho) > 0.7 else "black")
+    if len(names) > MOST_WITH_NUMBERS:
         matrix.figure.colorbar(image, ax=matrix)
     return np.array([bars, matrix])
 
 
 def convergence(fit: Fit, *, ax: Any = None) -> Any:
-    r"""The cost of a fit after each of its steps.
+    r"""The cost of a fit after each step.
 
     $$ \tfrac12\sum_i \left(\frac{r_i}{\sigma_i}\right)^2 $$
 
-    The first is that of the start. It can rise where the problem itself is changed on the way: where the weight of gaps between
-    pieces (`pieces=`) grows, and where the scale of a robust loss is estimated anew.
+    The first is that of the initial guess. The cost can rise where the problem itself changes on the way: where the weight of the gaps
+    between segments (`segments=`) grows, and where the scale of a robust loss is estimated again.
 
-    **Arguments:** `fit`: what `jaxlag.fit` returned; `ax`: matplotlib axes to draw in. Default: a new figure.
+    **Arguments:**
+
+    - `fit`: the result of `jaxlag.fit`.
+    - `ax`: matplotlib axes to draw in. Default: a new figure.
 
     **Returns:** the axes.
 
@@ -184,8 +189,8 @@ def convergence(fit: Fit, *, ax: Any = None) -> Any:
     return ax
 
 
-def _spoken(value, error):
-    """The estimate in words."""
+def _in_words(value, error):
+    """The estimate with its error, in words where it has none."""
     if np.isfinite(error):
         return plus_minus(value, error)
     return "not determined" if np.isinf(error) else f"{value:.4g}"

@@ -1,4 +1,4 @@
-"""Pictures of the forces along one motion: those of constraints, and dry friction."""
+"""Pictures of the forces during one motion: those of constraints, and dry friction."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -25,25 +25,26 @@ from .axes import (
 
 
 def forces(trajectory: Trajectory, names: Sequence[str] | None = None, *, units: Units = None, axes: Any = None) -> Any:
-    r"""The multipliers λ over time, one panel for each constraint, with a ring wherever one changes its sign.
+    r"""The multipliers λ over time, one panel for each constraint, with a ring wherever one changes sign.
 
-    Of a constraint that `System` was told to be `one_sided`, the times at which it would have to pull are shaded.
+    For a constraint that is `one_sided` in `System`, the times at which it would have to pull are shaded.
 
     $$ M\ddot q = f + G^T\lambda $$
 
     λ > 0 pushes along +∇g: the tension of a rod or a string with g = r − l is −λ, so it goes slack where λ becomes positive. A multiplier
-    is a force where g is a length, and a moment where g is an angle.
+    is a force if g is a length, and a torque if g is an angle.
 
     **Arguments:**
 
     - `trajectory`: one motion, as `simulate` returns it.
-    - `names`: the constraints to be drawn, in this order. Default: all.
-    - `units`: units by name of constraint, and of `"t"`, to be written on the axes, e.g. `{"t": "s", "rod": "N"}`.
+    - `names`: the constraints to draw, in this order. Default: all.
+    - `units`: units by name of constraint, and of `"t"`, written on the axes, e.g. `{"t": "s", "rod": "N"}`.
     - `axes`: matplotlib axes to draw in, as many as there are constraints. Default: a new figure with a common time axis.
 
-    **Returns:** the axes, an array, one for each constraint.
+    **Returns:** the axes, an array of shape (constraints,).
 
-    **Raises:** `ValueError` where there are no constraints, or `names` or `axes` do not fit them; `ImportError` without matplotlib.
+    **Raises:** `ValueError` if there are no constraints, if `names` or `axes` do not match them, or for a batch of motions; `ImportError`
+    without matplotlib.
 
     **Source:** Goldstein, Classical Mechanics, 3rd ed., section 2.4.
 
@@ -61,12 +62,10 @@ def forces(trajectory: Trajectory, names: Sequence[str] | None = None, *, units:
     multipliers = channels(one_motion(trajectory).multipliers, "λ")
     if not multipliers:
         raise ValueError(
-            "`trajectory` must be of a system with constraints, but it has none. State them by `System(..., holonomic=...)`, "
-            "or draw its coordinates by `plot.motion`."
+            "`trajectory` must be of a system with constraints, but it has none. State them with `System(..., holonomic=...)`, "
+            "or draw its coordinates with `plot.motion`."
         )
-    names = chosen(names, tuple(multipliers), "constraints")
-    shown = {name: multipliers[name] for name in names}
-    drawn = over_time(trajectory.ts, shown, [f"λ {name}" for name in names], "one for each constraint", units, axes)
+    drawn, shown = over_time(trajectory, multipliers, names, "constraint", units, axes, prefix="λ ")
     pulling = channels(trajectory.pulling(), "λ")
     for ax, (name, entries) in zip(drawn, shown.items(), strict=True):
         zero_line(ax)
@@ -75,7 +74,7 @@ def forces(trajectory: Trajectory, names: Sequence[str] | None = None, *, units:
             ax.axvspan(*interval, color=COLOURS[1], alpha=0.25, linewidth=0, label=None if i else "would have to pull")
         crossings = np.concatenate([_sign_changes(np.asarray(trajectory.ts), samples) for samples in entries.values()])
         if crossings.size:
-            ax.plot(crossings, 0 * crossings, "o", markerfacecolor="white", markeredgecolor="black", label="λ changes its sign")
+            ax.plot(crossings, 0 * crossings, "o", markerfacecolor="white", markeredgecolor="black", label="λ changes sign")
         if crossings.size or pulled:
             if len(entries) == 1:
                 ax.lines[0].set_label(None)
@@ -86,20 +85,21 @@ def forces(trajectory: Trajectory, names: Sequence[str] | None = None, *, units:
 
 
 def friction(trajectory: Trajectory, names: Sequence[str] | None = None, *, units: Units = None, axes: Any = None) -> Any:
-    r"""Dry friction over time: the slip velocity and below it the force, one column for each term; where it sticks is shaded.
+    r"""Dry friction over time: the slip velocity, and the force below it, one column for each term; times of sticking are shaded.
 
     $$ F = -\mu N\,\frac{s}{|s|} \ (s \neq 0), \qquad |F| \le \mu N \ (s = 0) $$
 
     **Arguments:**
 
     - `trajectory`: one motion with dry friction, as `simulate` returns it.
-    - `names`: the dissipation terms to be drawn. Default: all that have a kink.
+    - `names`: the dissipation terms to draw. Default: all with dry friction.
     - `units`: units of `"t"`, of `"slip"`, and of the force by the name of the term, e.g. `{"t": "s", "slip": "m/s", "brake": "N"}`.
     - `axes`: matplotlib axes to draw in, 2 × number of terms. Default: a new figure with a common time axis.
 
     **Returns:** the axes, an array of shape (2, terms).
 
-    **Raises:** `ValueError` where there is no dry friction, or `names` or `axes` do not fit it; `ImportError` without matplotlib.
+    **Raises:** `ValueError` if there is no dry friction, if `names` or `axes` do not match it, or for a batch of motions; `ImportError`
+    without matplotlib.
 
     **Source:** Pfeiffer & Glocker, Multibody Dynamics with Unilateral Contacts, chapter 5.
 
@@ -114,8 +114,8 @@ def friction(trajectory: Trajectory, names: Sequence[str] | None = None, *, unit
     """
     if not one_motion(trajectory).friction:
         raise ValueError(
-            "`trajectory` must have dry friction that sticks and slips, but has none. Write it with a kink, e.g. `F * jnp.abs(qdot)`, "
-            "and simulate with `friction=StickSlip()`, which is the default."
+            "`trajectory` must have dry friction that sticks and slips, but has none. Write it as a nonsmooth term, e.g. "
+            "`F * jnp.abs(qdot)`, and simulate with `friction=StickSlip()`, which is the default."
         )
     names = chosen(names, tuple(trajectory.friction), "dissipation terms with dry friction")
     slip = channels(trajectory.slip(), "")
@@ -133,23 +133,23 @@ def friction(trajectory: Trajectory, names: Sequence[str] | None = None, *, unit
         upper.set_ylabel(label(f"slip {name}", units, "slip"))
         lower.set_ylabel(label(f"force {name}", units, name))
         lower.set_xlabel(label("t", units))
-        several = len(slip[name]) > 1
-        if not several:
+        has_several = len(slip[name]) > 1
+        if not has_several:
             upper.lines[-1].set_label(None)
-        if several or intervals:
+        if has_several or intervals:
             legend_above(upper)
     return drawn
 
 
 def _sign_changes(ts, samples):
-    """The times at which the straight lines between samples cross zero."""
+    """The times at which the linear interpolation crosses zero."""
     before, after = samples[:-1], samples[1:]
     at = np.flatnonzero(before * after < 0)
     return ts[at] + (ts[at + 1] - ts[at]) * before[at] / (before[at] - after[at])
 
 
-def _intervals(ts, sticking):
-    """Begin and end of each run of samples that stick, half a sample wider on either side."""
+def _intervals(ts, is_true):
+    """Start and end of each run of true samples, half a sample wider on either side."""
     edges = np.concatenate([ts[:1], (ts[1:] + ts[:-1]) / 2, ts[-1:]])
-    steps = np.diff(np.concatenate([[0], np.asarray(sticking, int), [0]]))
+    steps = np.diff(np.concatenate([[0], np.asarray(is_true, int), [0]]))
     return list(zip(edges[np.flatnonzero(steps == 1)], edges[np.flatnonzero(steps == -1)], strict=True))

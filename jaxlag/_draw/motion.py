@@ -23,7 +23,7 @@ from .axes import (
     zero_line,
 )
 
-THIN = 1e-3  # of the largest area, below which none can be seen
+THIN = 1e-3  # of the largest area, below which an area is invisible
 
 
 def motion(trajectory: Trajectory, names: Sequence[str] | None = None, *, units: Units = None, axes: Any = None) -> Any:
@@ -31,19 +31,19 @@ def motion(trajectory: Trajectory, names: Sequence[str] | None = None, *, units:
 
     $$ q_i(t), \qquad i = 1 \dots n $$
 
-    A coordinate that is an array has one line for each entry, `r[0]`, `r[1]`, …. Samples that were not reached are left out.
+    A coordinate that is an array has one line for each entry, `r[0]`, `r[1]`, …. Samples that were not reached are omitted.
 
     **Arguments:**
 
     - `trajectory`: one motion, as `simulate` returns it.
-    - `names`: the coordinates to be drawn, in this order, by their path in q (`"phi"`, `"body.x"`, `"q"` where q is one array).
+    - `names`: the coordinates to draw, in this order, by their path in q (`"phi"`, `"body.x"`, `"q"` where q is one array).
       Default: all.
-    - `units`: units by name of coordinate, and of `"t"`, to be written on the axes, e.g. `{"t": "s", "phi": "rad"}`.
+    - `units`: units by name of coordinate, and of `"t"`, written on the axes, e.g. `{"t": "s", "phi": "rad"}`.
     - `axes`: matplotlib axes to draw in, as many as there are coordinates. Default: a new figure with a common time axis.
 
     **Returns:** the axes, an array of shape (n,).
 
-    **Raises:** `ValueError` where `names` or `axes` do not fit the motion, `ImportError` without matplotlib.
+    **Raises:** `ValueError` if `names` or `axes` do not match the motion, or for a batch of motions; `ImportError` without matplotlib.
 
     **Source:** the colours are those of Okabe & Ito, Color Universal Design (2008).
 
@@ -58,9 +58,8 @@ def motion(trajectory: Trajectory, names: Sequence[str] | None = None, *, units:
     axes[0].get_ylabel()  # x (m)
     ```
     """
-    coordinates = channels(one_motion(trajectory).q, "q")
-    names = chosen(names, tuple(coordinates), "coordinates")
-    return over_time(trajectory.ts, {name: coordinates[name] for name in names}, names, "one for each coordinate", units, axes)
+    drawn, _ = over_time(trajectory, channels(one_motion(trajectory).q, "q"), names, "coordinate", units, axes)
+    return drawn
 
 
 def phase(trajectory: Trajectory, names: Sequence[str] | None = None, *, units: Units = None, ax: Any = None) -> Any:
@@ -68,19 +67,19 @@ def phase(trajectory: Trajectory, names: Sequence[str] | None = None, *, units: 
 
     $$ (q_i(t), \dot q_i(t)) $$
 
-    Drawn again on the same axes, another motion has the next colour: so a phase portrait is made of many. A coordinate that is an array
+    Drawn on the same axes, another motion gets the next colour, so that a phase portrait can show many. A coordinate that is an array
     has one panel for each entry.
 
     **Arguments:**
 
     - `trajectory`: one motion, as `simulate` returns it.
-    - `names`: the coordinates to be drawn, by their path in q. Default: all.
-    - `units`: units by name of coordinate, and of `"t"`; the velocity has the one divided by the other.
+    - `names`: the coordinates to draw, by their path in q. Default: all.
+    - `units`: units by name of coordinate, and of `"t"`; those of the velocity follow.
     - `ax`: matplotlib axes to draw in: one for each panel, or one that all share. Default: a new figure.
 
-    **Returns:** the axes, where there are several panels an array of them.
+    **Returns:** the axes; an array of them, of shape (panels,), if there are several.
 
-    **Raises:** `ValueError` where `names` or `ax` do not fit the motion, `ImportError` without matplotlib.
+    **Raises:** `ValueError` if `names` or `ax` do not match the motion, or for a batch of motions; `ImportError` without matplotlib.
 
     **Source:** Arnold, Mathematical Methods of Classical Mechanics, 2nd ed., section 4.
 
@@ -119,18 +118,18 @@ def phase(trajectory: Trajectory, names: Sequence[str] | None = None, *, units: 
 
 
 def energy(trajectory: Trajectory, *, units: Units = None, ax: Any = None) -> Any:
-    r"""The energy over time, and beside it the work of each term since the start.
+    r"""The energy over time, with the work of each term since the start.
 
     $$ h(t) = \dot q\cdot\frac{\partial L}{\partial\dot q} - L, \qquad h(t) = h(0) + \sum_i W_i(t) $$
 
-    The dashed line is the right side of that balance: it lies on the energy where the integration is good. Works need
-    `simulate(..., audit=True)`; without, the energy is drawn alone. Terms that do no work to be seen, as constraints at rest, are left out;
-    a curve that lies on another is dashed, so that both are seen.
+    The dashed line is the right side of that balance; it coincides with the energy if the integration is accurate. The work needs
+    `simulate(..., works=True)`; without it, the energy is drawn alone. Terms with no visible work, such as fixed constraints, are omitted;
+    a curve that coincides with another is dashed, so that both are visible.
 
     **Arguments:**
 
     - `trajectory`: one motion, as `simulate` returns it.
-    - `units`: units of `"t"` and `"energy"`, to be written on the axes.
+    - `units`: units of `"t"` and `"energy"`, written on the axes.
     - `ax`: matplotlib axes to draw in. Default: a new figure.
 
     **Returns:** the axes.
@@ -144,9 +143,9 @@ def energy(trajectory: Trajectory, *, units: Units = None, ax: Any = None) -> An
     import jaxlag as jl
     from jaxlag import plot
     from jaxlag.examples import vehicle
-    trajectory = jl.simulate(vehicle.system, vehicle.q0, vehicle.qdot0, jnp.linspace(0.0, 5.0, 101), vehicle.params, audit=True)
+    trajectory = jl.simulate(vehicle.system, vehicle.q0, vehicle.qdot0, jnp.linspace(0.0, 5.0, 101), vehicle.params, works=True)
     ax = plot.energy(trajectory, units={"t": "s", "energy": "J"})
-    [line.get_label() for line in ax.lines]  # energy, work of air, work of dampers, work of drive, energy at the start + works
+    [line.get_label() for line in ax.lines]  # energy, work of air, work of dampers, work of drive, initial energy + work
     ```
     """
     h, ts = np.asarray(one_motion(trajectory).energy()), trajectory.ts
@@ -155,7 +154,7 @@ def energy(trajectory: Trajectory, *, units: Units = None, ax: Any = None) -> An
     if trajectory.works is not None:
         for name, work in _shown_works(trajectory).items():
             curve(ax, ts, work, color=colour(len(ax.lines)), label=f"work of {name}")
-        ax.plot(ts, h[0] + sum(np.asarray(work) for work in trajectory.works.values()), "k--", label="energy at the start + works")
+        ax.plot(ts, h[0] + sum(np.asarray(work) for work in trajectory.works.values()), "k--", label="initial energy + work")
         zero_line(ax)
     ax.set_xlabel(label("t", units))
     ax.set_ylabel(label("energy", units))
@@ -164,23 +163,23 @@ def energy(trajectory: Trajectory, *, units: Units = None, ax: Any = None) -> An
 
 
 def balance(trajectory: Trajectory, *, units: Units = None, ax: Any = None) -> Any:
-    r"""The energy balance as stacked areas that add up to nothing: above the line where energy went to, below it where it came from.
+    r"""The energy balance as stacked areas that sum to zero: above the line where energy went, below it where it came from.
 
     $$ \Delta h(t) - \sum_i W_i(t) = 0 $$
 
-    The change of energy and the work of each term with its sign turned are stacked, the positive ones upwards and the negative ones
-    downwards: at each time both stacks are equally high. What brakes lies above and what drives below; energy that is stored lies
-    above, and energy that the motion has given away since the start below. Terms thinner than 1/1000 of the largest are left out.
+    The change of energy and the negative work of each term are stacked, positive values upwards and negative ones downwards; at each time
+    both stacks have the same height. Terms that brake lie above, terms that drive below; stored energy lies above, energy released since
+    the start below. Terms thinner than 1/1000 of the largest are omitted.
 
     **Arguments:**
 
-    - `trajectory`: one motion, computed by `simulate(..., audit=True)`.
-    - `units`: units of `"t"` and `"energy"`, to be written on the axes.
+    - `trajectory`: one motion, computed by `simulate(..., works=True)`.
+    - `units`: units of `"t"` and `"energy"`, written on the axes.
     - `ax`: matplotlib axes to draw in. Default: a new figure.
 
     **Returns:** the axes.
 
-    **Raises:** `ValueError` where the motion was computed without its works, `ImportError` without matplotlib.
+    **Raises:** `ValueError` if the motion was computed without its work, or for a batch of motions; `ImportError` without matplotlib.
 
     **Source:** Goldstein, Classical Mechanics, 3rd ed., eqs. 2.52 to 2.58.
 
@@ -189,12 +188,12 @@ def balance(trajectory: Trajectory, *, units: Units = None, ax: Any = None) -> A
     import jaxlag as jl
     from jaxlag import plot
     from jaxlag.examples import vehicle
-    trajectory = jl.simulate(vehicle.system, vehicle.q0, vehicle.qdot0, jnp.linspace(0.0, 5.0, 101), vehicle.params, audit=True)
+    trajectory = jl.simulate(vehicle.system, vehicle.q0, vehicle.qdot0, jnp.linspace(0.0, 5.0, 101), vehicle.params, works=True)
     plot.balance(trajectory, units={"t": "s", "energy": "J"})
     ```
     """
-    one_motion(trajectory).work()  # which says what to do where there are none
-    h, turned = map(np.asarray, energies(trajectory))
+    one_motion(trajectory).work()  # raises if there is none
+    h, exchanged = map(np.asarray, energies(trajectory))
     parts = {"change of energy": h - h[0]} | {name: -work for name, work in _shown_works(trajectory).items()}
     ax = canvas(ax, figsize=(6.4, 3.6))
     above = below = np.zeros_like(h)
@@ -204,7 +203,7 @@ def balance(trajectory: Trajectory, *, units: Units = None, ax: Any = None) -> A
         ax.fill_between(trajectory.ts, above, up, label=name, **style)
         ax.fill_between(trajectory.ts, below, down, **style)
         above, below = up, down
-    height = 1.05 * max(np.nanmax(above), -np.nanmin(below), THIN * np.nanmax(np.abs(turned)), np.finfo(h.dtype).tiny)
+    height = 1.05 * max(np.nanmax(above), -np.nanmin(below), THIN * np.nanmax(np.abs(exchanged)), np.finfo(h.dtype).tiny)
     ax.set_ylim(-height, height)
     ax.set_xlim(float(trajectory.ts[0]), float(trajectory.ts[-1]))
     ax.axhline(0.0, color="black", linewidth=0.8)
@@ -215,9 +214,9 @@ def balance(trajectory: Trajectory, *, units: Units = None, ax: Any = None) -> A
 
 
 def _shown_works(trajectory):
-    """The works that can be seen beside the largest change of energy."""
+    """The work of each term where it is visible beside the largest change of energy."""
     works = {name: np.asarray(work) for name, work in trajectory.work().items()}
-    h, turned = map(np.asarray, energies(trajectory))
+    h, exchanged = map(np.asarray, energies(trajectory))
     sizes = {name: np.nanmax(np.abs(work)) for name, work in works.items()}
-    least = THIN * max(*sizes.values(), np.nanmax(np.abs(h - h[0])), THIN * np.nanmax(np.abs(turned)))
+    least = THIN * max(*sizes.values(), np.nanmax(np.abs(h - h[0])), THIN * np.nanmax(np.abs(exchanged)))
     return {name: works[name] for name, size in sizes.items() if size > least}

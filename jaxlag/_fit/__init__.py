@@ -1,1 +1,1 @@
-"""Identification: experiments, residuals, least squares, regression, and what the statistics say of an estimate."""
+"""Identification: experiments, residuals, least squares, regression, statistics of the estimates."""

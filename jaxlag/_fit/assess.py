@@ -1,4 +1,4 @@
-"""Before and after a fit: what an experiment will tell, whether a model holds on other data, which of two models to believe."""
+"""Before and after a fit: the information of a planned experiment, validation on other data, comparison of models."""
 
 import dataclasses
 from collections.abc import Mapping, Sequence
@@ -7,30 +7,43 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import PyTree
+from jaxtyping import Float, PyTree
 
 from .._model.system import System
+from .channels import Channel, channels_of
 from .experiment import Experiment, measured
 from .fit import fit
-from .identifiability import Channel, channels_of, correlation_of, determined_by
+from .fit_card import channel_rows
+from .identifiability import correlation_of, determined_by
 from .parameters import Free
-from .problem import Problem, blank, failure_of, linearise
+from .problem import Problem, failure_of, linearise, with_zero_values
 from .residuals import Model
-from .result import Fit, Prediction, channel_rows
+from .result import Fit, Prediction
 
 
 @dataclasses.dataclass(frozen=True, eq=False, repr=False)
 class Information:
-    """What a planned experiment will tell of the parameters.
+    """What planned experiments will reveal about the parameters, as `information` returns it; prints as a table.
 
-    - `matrix`: Fisher's information JᵀJ, in the flat order of `names`; `covariance`: its inverse; `correlation`.
-    - `standard_errors`: expected of a fit, by the names of `free`; infinite where the experiment determines nothing.
+    - `names`: of the p numbers, in flat order; in this order `matrix` (p, p): Fisher's information JᵀJ; `covariance` (p, p): its inverse;
+      `correlation` (p, p).
+    - `standard_errors`: expected of a fit, by the names of `free`; infinite for a parameter that the experiments do not determine.
+    - `estimates`: the values where the information was computed, by the names of `free`.
+
+    ```python
+    import jax.numpy as jnp
+    import jaxlag as jl
+    oscillator = jl.System(lambda q, qdot, c: 0.5 * qdot**2 - 0.5 * c * q**2)
+    plan = jl.Experiment(jnp.linspace(0.0, 3.0, 50), None, q0=1.0, qdot0=0.0, sigma=1e-3)
+    found = jl.information(oscillator, plan, {"c": 4.0}, free=("c",))
+    found.matrix.shape  # (1, 1)
+    ```
     """
 
     names: tuple[str, ...]
-    matrix: np.ndarray
-    covariance: np.ndarray
-    correlation: np.ndarray
+    matrix: Float[np.ndarray, "p p"]
+    covariance: Float[np.ndarray, "p p"]
+    correlation: Float[np.ndarray, "p p"]
     standard_errors: dict[str, Any]
     estimates: dict[str, Any]
 
@@ -49,17 +62,24 @@ class Information:
 def information(
     system: System, experiments: Experiment | Sequence[Experiment], params: PyTree, free: Sequence[str], **numerics: Any
 ) -> Information:
-    r"""Fisher's information of planned experiments, and the standard errors a fit will have, before anybody measures.
+    r"""Fisher's information of planned experiments, and the standard errors that a fit of them will have.
 
     $$ F = \sum_i \frac{1}{\sigma_i^2} \left(\frac{\partial h_i}{\partial \theta}\right)^T \frac{\partial h_i}{\partial \theta},
        \qquad \mathrm{cov}\,\hat\theta \approx F^{-1} $$
 
-    Unknown starts of the experiments cost information, and are taken into account.
+    Unknown starts of the experiments reduce the information; this is taken into account.
 
-    **Arguments:** as `fit`; `experiments` need no `values`, but their `sigma`: a number, or one like the values. Where there are values,
-    samples missing there are missing here. `params` are where the information is wanted. Any consistent units.
+    **Arguments:**
 
-    **Returns:** an `Information`. **Raises:** `ValueError` where sigma is missing or the motion cannot be computed.
+    - `experiments`: one or several, with `sigma`. Their `values` may be None; samples that are NaN in them do not count.
+    - `params`: where the information is computed, as for `fit`. `free`: names of the p numbers that will be identified.
+    - `**numerics`: passed on to `simulate`.
+
+    Units are any consistent set.
+
+    **Returns:** an `Information`.
+
+    **Raises:** `ValueError` where an experiment has no sigma, or the motion cannot be computed.
 
     **Source:** Walter & Pronzato, Identification of Parametric Models (1997), section 6.1.
 
@@ -74,39 +94,54 @@ def information(
     experiments, params = measured(experiments, params, planned=True)
     for e in experiments:
         if e.sigma is None:
-            raise ValueError("`experiments` must say how well they measure, but one has no `sigma`. Give that of the noise.")
-    named = Free.of(params, free)
+            raise ValueError(
+                "`experiments` must say how well they measure, but one has no `sigma`. Give the standard deviation of the noise."
+            )
+    chosen = Free.of(params, free)
     model = Model(system, tuple(sorted(numerics.items())), None)
-    planned = [_planned(model, named, e) for e in experiments]
-    problem = Problem.of(model, named, planned)
-    rows = linearise(problem, jnp.zeros(problem.size))
-    reason = failure_of(rows)
+    problem = Problem.of(model, chosen, [_with_values(model, chosen, e) for e in experiments])
+    found = linearise(problem, jnp.zeros(problem.size))
+    reason = failure_of(found)
     if reason:
-        raise ValueError(f"`params` must give a motion, but it ended with: {reason} Take other ones.")
-    J, p = np.asarray(rows.jacobian)[named.size :], named.size
-    known, slope = determined_by(J, np.zeros((0, problem.size))), np.asarray(named.slope(jnp.zeros(p)))
+        raise ValueError(f"`params` must give a motion, but it ended with: {reason} Try other values.")
+    J, p = np.asarray(found.jacobian)[chosen.size :], chosen.size
+    known, slope = determined_by(J, np.zeros((0, problem.size))), np.asarray(chosen.slope(jnp.zeros(p)))
     covariance = known.covariance[:p, :p] * np.outer(slope, slope)
     covariance[np.diag_indices(p)] = np.where(known.determined[:p], np.diag(covariance), np.inf)
-    # What the unknown starts leave of the information: the Schur complement.
+    # The information that is left beside the unknown starts: the Schur complement.
     F, own = J.T @ J, slice(p, None)
     F = (F[:p, :p] - F[:p, own] @ np.linalg.pinv(F[own, own], hermitian=True) @ F[own, :p]) / np.outer(slope, slope)
     errors = np.sqrt(np.diag(covariance))
-    by_name = lambda flat: named.by_name(jnp.asarray(flat))
-    return Information(named.entries, F, covariance, correlation_of(covariance), by_name(errors), by_name(named.start))
+    by_name = lambda flat: chosen.by_name(jnp.asarray(flat))
+    return Information(chosen.entries, F, covariance, correlation_of(covariance), by_name(errors), by_name(chosen.start))
 
 
-def _planned(model, free, e):
+def _with_values(model, free, e):
     """The experiment with zeros for values, where it has none."""
     if e.values is not None:
         return e
-    zeros = blank(model, free, e).values
-    bare = jax.tree.map(np.asarray, (e.q0, e.qdot0))
-    return Experiment(e.ts, zeros, *bare, observe=e.observe, sigma=e.sigma, params=e.params, unknown=e.unknown, delay=e.delay)
+    zeros = with_zero_values(model, free, e).values
+    start = jax.tree.map(np.asarray, (e.q0, e.qdot0))
+    return Experiment(e.ts, zeros, *start, observe=e.observe, sigma=e.sigma, params=e.params, unknown=e.unknown, delay=e.delay)
 
 
 @dataclasses.dataclass(frozen=True, eq=False, repr=False)
 class Validation:
-    """How a fitted model does on data it has not seen: `channels`, `residuals`, and the `prediction` with its band."""
+    """How well a fitted model predicts data that were not fitted, as `validate` returns it; prints as a table.
+
+    - `channels`: a `Channel` for each scalar channel. `residuals`: measured minus predicted, structured like the values; leaves (T, ...).
+    - `prediction`: the `Prediction`, with its confidence band.
+
+    ```python
+    import jax.numpy as jnp
+    import jaxlag as jl
+    oscillator = jl.System(lambda q, qdot, c: 0.5 * qdot**2 - 0.5 * c * q**2)
+    ts = jnp.linspace(0.0, 3.0, 50)
+    fit = jl.fit(oscillator, jl.Experiment(ts, jnp.cos(2.0 * ts), 1.0, 0.0), {"c": 3.0}, free=("c",))
+    validation = jl.validate(fit, jl.Experiment(ts, jnp.sin(2.0 * ts), 0.0, 2.0))
+    validation.residuals.shape  # (50,)
+    ```
+    """
 
     channels: list[Channel]
     residuals: Any
@@ -117,10 +152,18 @@ class Validation:
 
 
 def validate(fit: Fit, experiment: Experiment, *, level: float = 0.95) -> Validation:
-    """Predicts another experiment with fitted parameters and compares. What is unknown of the experiment's own, its start for instance,
-    is estimated from it; the fitted parameters are not touched.
+    r"""Predicts another experiment with the fitted parameters, and compares the prediction with its measurements.
 
-    **Arguments:** `level` of the confidence band. **Returns:** a `Validation`. Any consistent units.
+    $$ r_i = z_i - h(t_i, q(t_i; \hat\theta), \dots) $$
+
+    Unknowns of the experiment's own, its start for instance, are estimated from its measurements; the fitted parameters stay fixed.
+
+    **Arguments:** `fit`: what `jaxlag.fit` returned; `experiment`: with T measured samples; `level`: of the confidence band, between 0
+    and 1. Units are any consistent set.
+
+    **Returns:** a `Validation`.
+
+    **Raises:** `ValueError` where the experiment has no values, or its motion cannot be computed.
 
     **Source:** Ljung, System Identification, 2nd ed., section 16.4 (cross validation).
 
@@ -130,30 +173,39 @@ def validate(fit: Fit, experiment: Experiment, *, level: float = 0.95) -> Valida
     oscillator = jl.System(lambda q, qdot, c: 0.5 * qdot**2 - 0.5 * c * q**2)
     ts = jnp.linspace(0.0, 3.0, 50)
     fit = jl.fit(oscillator, jl.Experiment(ts, jnp.cos(2.0 * ts), 1.0, 0.0), {"c": 3.0}, free=("c",))
-    jl.validate(fit, jl.Experiment(ts, jnp.sin(2.0 * ts), 0.0, 2.0)).channels[0].fit_percent  # 100
+    jl.validate(fit, jl.Experiment(ts, jnp.sin(2.0 * ts), 0.0, 2.0)).channels[0].fit_percent  # 100.0
     ```
     """
     if experiment.values is None:
         raise ValueError("`experiment` must have been measured, but has no values. Use `fit.predict` for what it should show.")
     if experiment.unknown:
         model = fit.problem.model
-        own = _settle(model.system, experiment, fit.params, dict(model.numerics))
-        experiment = own.experiments[0]
+        experiment = _with_own_estimates(model.system, experiment, fit.params, dict(model.numerics))
     prediction = fit.predict(experiment, level=level)
     residuals = jax.tree.map(lambda z, p: np.asarray(z - p), experiment.values, prediction.values)
     return Validation(channels_of(0, experiment.values, residuals), residuals, prediction)
 
 
-def _settle(system, experiment, params, numerics):
-    """The experiment's own unknowns, with all parameters held."""
-    return fit(system, experiment, params, free=(), **numerics)
+def _with_own_estimates(system, experiment, params, numerics):
+    """The experiment with its own unknowns estimated, with all parameters fixed."""
+    return fit(system, experiment, params, free=(), **numerics).experiments[0]
 
 
 @dataclasses.dataclass(frozen=True, eq=False, repr=False)
 class Comparison:
-    """Models of the same data, the best first by Schwarz's criterion: `names`, and differences of `aic` and `bic` to the best one.
+    """Models of the same data, as `compare` returns them; prints as a table.
 
-    Both criteria take residuals as independent; `correlated`: over how many samples those of the best model are, 0 where they are white.
+    - `names`: of the models, the best first by Schwarz's criterion.
+    - `aic`, `bic`: by name, the differences to the smallest value of each criterion; dimensionless.
+    - `parameters`: by name, the number of unknowns.
+    - `correlated`: over how many samples the residuals of the best model are correlated, 0 where they are white. Both criteria take
+      residuals as independent, and overstate the evidence where they are not.
+
+    ```python
+    import jaxlag as jl
+    table = jl.Comparison(("a", "b"), {"a": 0.0, "b": 9.0}, {"a": 0.0, "b": 7.0}, {"a": 1, "b": 2}, 0)
+    table.names[0]  # a
+    ```
     """
 
     names: tuple[str, ...]
@@ -170,23 +222,25 @@ class Comparison:
         ]
         best, second = self.names[:2]
         strength = next(word for limit, word in EVIDENCE if self.bic[second] >= limit)
-        said = [f"  evidence for {best!r} against {second!r}: {strength}"]
+        evidence = [f"  evidence for {best!r} against {second!r}: {strength}"]
         if self.correlated:
-            said.append(f"  ! overstated: residuals of {best!r} are correlated over {self.correlated} samples")
-        return "\n".join(["Comparison: the smaller the better", *rows, *said])
+            evidence.append(f"  ! overstated: residuals of {best!r} are correlated over {self.correlated} samples")
+        return "\n".join(["Comparison: smaller is better", *rows, *evidence])
 
 
-EVIDENCE = ((10, "very strong"), (6, "strong"), (2, "positive"), (0, "none worth a mention"))
+EVIDENCE = ((10, "very strong"), (6, "strong"), (2, "positive"), (0, "not worth more than a bare mention"))  # by ΔBIC
 
 
 def compare(fits: Mapping[str, Fit]) -> Comparison:
-    r"""Which of several models of the same data to believe: is there really a k?
+    r"""Compares models of the same data by their misfit and number of parameters: does the machine really have a damper?
 
     $$ \mathrm{AIC} = -2 \ln L + 2 p, \qquad \mathrm{BIC} = -2 \ln L + p \ln N $$
 
+    with the likelihood L, p unknowns and N measurements; all dimensionless.
+
     **Arguments:** `fits`: at least two, by name, of the same measurements. **Returns:** a `Comparison`.
 
-    **Raises:** `ValueError` where the fits are of different data.
+    **Raises:** `ValueError` where there are fewer than two fits, or they are of different data.
 
     **Source:** Burnham & Anderson, Model Selection and Multimodel Inference (2002), section 2.2; the words for ΔBIC: Kass & Raftery,
     J. Am. Stat. Assoc. 90 (1995) 773.
@@ -199,20 +253,20 @@ def compare(fits: Mapping[str, Fit]) -> Comparison:
     record = jl.Experiment(ts, jnp.cos(2.0 * ts) + 0.01 * jnp.sin(999.0 * ts), q0=1.0, qdot0=0.0)
     params = {"c": 3.0, "b": 0.0}
     fits = {"undamped": jl.fit(oscillator, record, params, free=("c",)), "damped": jl.fit(oscillator, record, params, free=("c", "b"))}
-    jl.compare(fits).names[0]
+    jl.compare(fits).names[0]  # undamped
     ```
     """
     if len(fits) < 2:
         raise ValueError(f"`fits` must be at least two, but there are {len(fits)}. Fit another model to the same data.")
-    of = {name: (f.measurements, f.absolute, _fingerprint(f)) for name, f in fits.items()}
-    if len(set(of.values())) > 1:
+    if len({(f.measurements, f.absolute, _fingerprint(f)) for f in fits.values()}) > 1:
         raise ValueError("`fits` must be of the same measurements with the same sigma and loss, but differ. Fit all models to one set.")
     names = tuple(sorted(fits, key=lambda name: fits[name].bic))
     least = {which: min(getattr(f, which) for f in fits.values()) for which in ("aic", "bic")}
-    off = lambda which: {name: getattr(fits[name], which) - least[which] for name in names}
-    return Comparison(names, off("aic"), off("bic"), {name: fits[name].unknown_count for name in names}, fits[names[0]].correlated)
+    above = lambda which: {name: getattr(fits[name], which) - least[which] for name in names}
+    return Comparison(names, above("aic"), above("bic"), {name: fits[name].unknown_count for name in names}, fits[names[0]].correlated)
 
 
 def _fingerprint(f):
+    """Numbers that are equal for fits of the same data."""
     total = lambda which: float(sum(np.nansum(np.asarray(leaf)) for e in f.experiments for leaf in jax.tree.leaves(getattr(e, which))))
     return total("values"), total("sigma"), f.problem.model.loss

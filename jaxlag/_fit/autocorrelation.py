@@ -1,19 +1,19 @@
-"""Residuals that hang together in time: whether they do, over how many samples, and what that makes of a covariance."""
+"""Autocorrelation of residuals: a test for it, its length in samples, and its effect on the covariance of the estimates."""
 
 import numpy as np
 
 LAGS = 20
-COLOURED = 0.01  # the probability below which residuals are not taken as white
-NEGLIGIBLE = 0.1  # a correlation that no longer counts
-ALIKE = 10  # samples in common, from which on two channels are looked at for what they share
+COLOURED = 0.01  # p-value below which residuals are taken as correlated
+NEGLIGIBLE = 0.1  # a smaller correlation is ignored
+COMMON_SAMPLES = 10  # that two channels need for an estimate of their correlation
 
 
 def whiteness(residuals: np.ndarray) -> float:
-    """The probability of autocorrelations this large in white noise.
+    """The p-value of the test of Ljung and Box: the probability of autocorrelations this large in white noise.
 
     **Source:** Ljung & Box, Biometrika 65 (1978) 297.
     """
-    from scipy import special  # comes with JAX; imported where it is needed, for that takes a while
+    from scipy import special  # SciPy is a dependency of JAX; imported here because that takes a while
 
     n = residuals.size
     lags = min(LAGS, n // 5)
@@ -26,9 +26,9 @@ def whiteness(residuals: np.ndarray) -> float:
 
 
 def autoregression(r: np.ndarray) -> np.ndarray:
-    r"""The coefficients a of $r_t = \sum_k a_k r_{t-k} + e_t$, as many as Schwarz's criterion likes best; none where r is white.
+    r"""The coefficients a of $r_t = \sum_k a_k r_{t-k} + e_t$; none where r is white.
 
-    By the equations of Yule and Walker, whose model is stable.
+    From the equations of Yule and Walker, whose model is stable; the order minimises Schwarz's criterion.
 
     **Source:** Brockwell & Davis, Time Series: Theory and Methods, 2nd ed. (1991), sections 5.2 and 8.1.
     """
@@ -51,14 +51,14 @@ def autoregression(r: np.ndarray) -> np.ndarray:
 
 
 def response(a: np.ndarray, count: int) -> np.ndarray:
-    """What one shock e at the beginning makes of r."""
-    from scipy import signal  # comes with JAX, too
+    """The impulse response r of the autoregression, (count,)."""
+    from scipy import signal
 
     return signal.lfilter([1.0], np.append(1.0, -a), np.eye(1, count)[0])
 
 
-def reach(a: np.ndarray, count: int) -> int:
-    """Over how many samples noise with these coefficients is correlated; 0 where it is white."""
+def correlation_length(a: np.ndarray, count: int) -> int:
+    """The number of samples over which noise with these coefficients is correlated; 0 where it is white."""
     if a.size == 0:
         return 0
     spectrum = np.abs(np.fft.rfft(response(a, count), 2 * count)) ** 2
@@ -67,16 +67,16 @@ def reach(a: np.ndarray, count: int) -> int:
 
 
 def coloured_information(J: np.ndarray, r: np.ndarray, sizes: np.ndarray) -> np.ndarray:
-    r"""What correlated residuals make of the information $J^T J$: the middle of the sandwich $(J^T J)^{-1} J^T R J (J^T J)^{-1}$.
+    r"""$J^T R J$ for correlated residuals, the middle of the sandwich $(J^T J)^{-1} J^T R J (J^T J)^{-1}$; (x, x).
 
-    R is that of noise which began long ago, $r = A^{-1} e$ with the autoregression A of each channel, whose shocks e in several
-    channels at one time may be correlated. So $J^T R J = K^T \Sigma K$ with $K = A^{-T} J$, a filter that runs backwards.
+    R is the correlation of stationary noise $r = A^{-1} e$, with the autoregression A of each channel, whose shocks e may be correlated
+    between channels. So $J^T R J = K^T \Sigma K$ with $K = A^{-T} J$, a filter that runs backwards in time.
 
-    **Arguments:** `J` (T, C, x) and `r` (T, C), NaN where nothing was measured: such samples are passed over, and the times are taken as
-    evenly spaced. `sizes`: the standard deviations that the channels have in R.
+    **Arguments:** `J` (T, C, x) and `r` (T, C), NaN where nothing was measured: such samples are left out, and the times are taken as
+    evenly spaced. `sizes` (C,): the standard deviations of the channels in R.
 
     **Source:** Newey & West, Econometrica 55 (1987) 703, with their weighted autocovariances replaced by those of an autoregression whose
-    order Schwarz's criterion chooses: den Haan & Levin, NBER Technical Working Paper 195 (1996). Missing samples passed over: Datta & Du,
+    order Schwarz's criterion chooses: den Haan & Levin, NBER Technical Working Paper 195 (1996). Missing samples left out: Datta & Du,
     International Finance Discussion Papers 1060 (2012). Correlated channels: Parks, J. Am. Stat. Assoc. 62 (1967) 500.
     """
     from scipy import signal
@@ -86,9 +86,9 @@ def coloured_information(J: np.ndarray, r: np.ndarray, sizes: np.ndarray) -> np.
     for c in range(C):
         there = np.flatnonzero(np.isfinite(r[:, c]))
         a = autoregression(r[there, c])
-        at = np.append(np.arange(T), T + there)  # as many samples before the first
+        rows = np.append(np.arange(T), T + there)  # T samples before the first one
         backwards = np.concatenate([np.zeros((T, J.shape[2])), J[there, c]])[::-1]
-        K[at, c] = signal.lfilter([1.0], np.append(1.0, -a), backwards, axis=0)[::-1]
+        K[rows, c] = signal.lfilter([1.0], np.append(1.0, -a), backwards, axis=0)[::-1]
         shocks[there[a.size :], c] = signal.lfilter(np.append(1.0, -a), [1.0], r[there, c])[a.size :]
         deviations[c] = sizes[c] / np.linalg.norm(response(a, 2 * T))
     covariance = _correlations(shocks) * np.outer(deviations, deviations)
@@ -96,14 +96,14 @@ def coloured_information(J: np.ndarray, r: np.ndarray, sizes: np.ndarray) -> np.
 
 
 def _correlations(shocks):
-    """Of the channels, over the samples that two have in common; no direction less than none."""
+    """Correlations of the channels, each over the samples that two have in common; made positive semidefinite."""
     C = shocks.shape[1]
     found = np.eye(C)
     for c in range(C):
         for d in range(c):
             both = shocks[np.all(np.isfinite(shocks[:, [c, d]]), axis=1)][:, [c, d]]
             power = np.prod(np.sum(both**2, axis=0))
-            if len(both) >= ALIKE and power > 0:
+            if len(both) >= COMMON_SAMPLES and power > 0:
                 found[c, d] = found[d, c] = both[:, 0] @ both[:, 1] / np.sqrt(power)
-    values, ways = np.linalg.eigh(found)
-    return ways * np.maximum(values, 0) @ ways.T
+    values, vectors = np.linalg.eigh(found)
+    return vectors * np.maximum(values, 0) @ vectors.T

@@ -1,4 +1,4 @@
-"""Experiments: recordings of a motion, with gaps and noise, as they come from a laboratory."""
+"""Experiments: recordings of a motion with noise and missing samples, and what is known about them."""
 
 import csv
 from collections.abc import Callable, Mapping, Sequence
@@ -25,23 +25,26 @@ class Experiment(eqx.Module):
 
     **Arguments:**
 
-    - `ts`: the T times of the samples, increasing, at any intervals; the motion starts at ts[0].
-    - `values`: what was measured, any pytree of arrays with the samples as first axis, e.g. `{"y": ..., "phi": ...}`. NaN is a
-      missing sample. None for an experiment that is only planned (`jaxlag.information`).
-    - `q0`, `qdot0`: the state at ts[0], as for `simulate`; where it is unknown, a guess.
-    - `observe`: what the sensors see of one state, structured like one sample of `values`; it receives the arguments it names, of
-      `t`, `q`, `qdot`, `qddot`, `multipliers`, `params` and the entries of `params`: so gains and offsets of sensors are parameters
-      like others. Left out: the coordinates that `values` names, or q as a whole. One function for all experiments of a kind: they
-      are computed side by side, and a function made anew is compiled anew.
-    - `sigma`: standard deviation of the noise, a number or a pytree like `values` with one for each channel or sample. Where it is
-      left out, one common sigma is estimated from the residuals.
-    - `params`: parameters of this experiment alone, which override those of the fit: a payload, a measured input (`Signal`).
-    - `unknown`: what is to be estimated of this experiment alone: `"q0"`, `"qdot0"`, coordinates of them (`"qdot0.x"`), or entries of
-      its own `params`. An unknown start is sought on the constraints.
-    - `delay`: how much later than the motion the sensors show it, a number, or a function that names parameters. Until the delay
-      is over they show the state at ts[0].
+    - `ts`: (T,), the times of the samples, increasing, with any intervals; the motion starts at ts[0].
+    - `values`: the measurements z, any pytree of arrays (T, ...), e.g. `{"y": ..., "phi": ...}`. NaN is a missing sample. None for an
+      experiment that is only planned (`jaxlag.information`).
+    - `q0`, `qdot0`: the state at ts[0], structured as for `simulate`; where it is unknown, a guess.
+    - `observe`: the sensors h, which return one sample, structured like one row of `values`. The function receives the arguments it
+      names, of `t`, `q`, `qdot`, `qddot`, `multipliers`, `params` and the entries of `params`; so gains and offsets of sensors are
+      parameters like others. Default: the coordinates named in `values`, or q as a whole. Use one function for all experiments of a
+      kind: they then run as a batch, while each new function is compiled anew.
+    - `sigma`: σ, the standard deviation of the noise: a number, or a pytree like `values` with one for each channel or sample. By
+      default, one common sigma is estimated from the residuals.
+    - `params`: parameters of this experiment only, which override those of the fit: a payload, a measured input (`Signal`).
+    - `unknown`: what is to be estimated of this experiment only: `"q0"`, `"qdot0"`, coordinates of them (`"qdot0.x"`), or entries of
+      its own `params`. An unknown start moves within the constraints.
+    - `delay`: by how much the sensors lag behind the motion, a number, or a function that names parameters. Before the delay is over,
+      they show the state at ts[0].
 
-    Any consistent units. **Raises:** `ValueError` where times, values and sigma do not fit each other.
+    Units are any consistent set.
+
+    **Raises:** `ValueError` or `TypeError` where times, values and sigma are not real numbers or do not fit each other, the start is not
+    finite, `observe` is missing though `values` does not name coordinates, or `unknown` names something else.
 
     **Source:** Ljung, System Identification, 2nd ed., section 7.2.
 
@@ -79,7 +82,7 @@ class Experiment(eqx.Module):
         self.q0, self.qdot0 = state(q0, qdot0, ("q0", "qdot0"))
         for which, tree in (("q0", self.q0), ("qdot0", self.qdot0)):
             if is_concrete(tree) and not all(np.all(np.isfinite(leaf)) for leaf in jax.tree.leaves(tree)):
-                raise ValueError(f"`{which}` must be finite, but has a missing value. Give a guess, and say that it is `unknown`.")
+                raise ValueError(f"`{which}` must be finite, but has a missing value. Give a guess, and name it in `unknown`.")
         dtype = jax.tree.leaves(self.q0)[0].dtype
         self.ts = sample_times(ts, dtype)
         self.values = _measured(values, self.ts, dtype)
@@ -93,7 +96,7 @@ class Experiment(eqx.Module):
         if callable(delay):
             check_function(delay, "`delay`")
         elif delay is not None and is_concrete(delay):
-            delay = float(number(delay, "`delay`", cure="Give the time by which the sensors are late."))
+            delay = float(number(delay, "`delay`", cure="Give the time by which the sensors lag behind the motion."))
         self.delay = delay
         for name in self.unknown:
             self._check_unknown(name)
@@ -110,12 +113,18 @@ class Experiment(eqx.Module):
     def from_csv(
         cls, file: str | Path, q0: PyTree, qdot0: PyTree, *, time: str, channels: Any = None, delimiter: str = ",", **more: Any
     ) -> "Experiment":
-        """An experiment from a table in a text file, whose first line names the columns; an empty cell is a missing sample.
+        """An experiment from a text file with a table, whose first line names the columns; an empty cell is a missing sample.
 
-        **Arguments:** `time`: the column of times; `channels`: names of the columns to be used, or a mapping from channels to columns;
-        left out, all others. The rest as for `Experiment`.
+        **Arguments:**
 
-        **Raises:** `ValueError` where a column does not exist or a cell is no number.
+        - `file`: its path; `delimiter`: between the cells.
+        - `time`: the name of the column of times.
+        - `channels`: names of the columns to be used, or a mapping from channels to columns. Default: all others.
+        - `q0`, `qdot0`, `**more`: as for `Experiment`.
+
+        **Returns:** an `Experiment` with `values` by channel, each of shape (T,).
+
+        **Raises:** `ValueError` where a column does not exist or a cell is not a number.
         """
         with open(file, newline="", encoding="utf-8-sig") as lines:
             reader = csv.DictReader(lines, delimiter=delimiter, skipinitialspace=True)
@@ -126,19 +135,22 @@ class Experiment(eqx.Module):
 
     @classmethod
     def from_dataframe(cls, frame: Any, q0: PyTree, qdot0: PyTree, *, time: str, channels: Any = None, **more: Any) -> "Experiment":
-        """An experiment from a data frame (pandas, polars, or whatever has `columns` and `frame[name].to_numpy()`).
+        """An experiment from a data frame.
 
-        **Arguments, raises:** as `from_csv`.
+        **Arguments:** `frame`: of pandas, polars, or any class with `columns` and `frame[name].to_numpy()`; `q0`, `qdot0`, `time`,
+        `channels` and `**more` as for `from_csv`.
+
+        **Returns:** an `Experiment` with `values` by channel, each of shape (T,). **Raises:** `ValueError` where a column does not exist.
         """
         ts, values = _from_columns(list(frame.columns), lambda name: np.asarray(frame[name].to_numpy()), time, channels)
         return cls(ts, values, q0, qdot0, **more)
 
 
 def measured(experiments: Any, params: PyTree, *, planned: bool = False) -> tuple[tuple[Experiment, ...], PyTree]:
-    """One experiment or several as a tuple, and `params` as arrays, after the checks that all who take them need."""
+    """One experiment or several as a tuple, and `params` as arrays, both checked."""
     experiments = (experiments,) if isinstance(experiments, Experiment) else tuple(experiments)
     if not experiments or not all(isinstance(e, Experiment) for e in experiments):
-        raise ValueError("`experiments` must be an `Experiment` or a list of them, but is not. Make one by `jl.Experiment(...)`.")
+        raise ValueError("`experiments` must be an `Experiment` or a list of them, but is not. Make one with `jl.Experiment(...)`.")
     for i, e in enumerate(experiments):
         if e.values is None and not planned:
             raise ValueError(f"`experiments` must have been measured, but number {i} has no values. Use `information` to plan one.")
@@ -151,13 +163,13 @@ def measured(experiments: Any, params: PyTree, *, planned: bool = False) -> tupl
 
 
 def with_own(params: PyTree, own: Mapping[str, Any]) -> PyTree:
-    """The parameters of the fit with those of an experiment's own over them."""
+    """The parameters of the fit, overridden by those of the experiment."""
     if not own:
         return params
     if not isinstance(params, Mapping):
         raise ValueError(
-            f"`params` must be a mapping where an experiment has params of its own to be put over them, but is a {type(params).__name__}. "
-            "Use a dict, which may hold it as an entry."
+            f"`params` must be a mapping where an experiment has params of its own that override them, but is a {type(params).__name__}. "
+            "Use a dict; the present params may be one of its entries."
         )
     return {**params, **own}
 
@@ -181,12 +193,12 @@ def _measured(values, ts, dtype):
 
 
 def _deviations(sigma, values):
-    spoken = lambda path: f"`sigma{jax.tree_util.keystr(path)}`"
-    sigma = jax.tree_util.tree_map_with_path(lambda path, s: numbers(s, spoken(path)), sigma, is_leaf=is_vector)
+    name = lambda path: f"`sigma{jax.tree_util.keystr(path)}`"
+    sigma = jax.tree_util.tree_map_with_path(lambda path, s: numbers(s, name(path)), sigma, is_leaf=is_vector)
     values = sigma if values is None else values  # of an experiment that is only planned
-    spread = lambda s, v: jnp.broadcast_to(jnp.asarray(s, jnp.result_type(v, float)), jnp.shape(v))
+    for_each_sample = lambda s, v: jnp.broadcast_to(jnp.asarray(s, jnp.result_type(v, float)), jnp.shape(v))
     try:
-        sigma = jax.tree.map(lambda s, v: jax.tree.map(lambda v: spread(s, v), v), sigma, values)
+        sigma = jax.tree.map(lambda s, v: jax.tree.map(lambda v: for_each_sample(s, v), v), sigma, values)
     except ValueError as error:
         raise ValueError(
             f"`sigma` must be a number or structured like `values`, but does not fit: {error}. Give one for each channel."
@@ -195,13 +207,13 @@ def _deviations(sigma, values):
         if is_concrete(s) and not np.all((np.asarray(s) > 0) & np.isfinite(s)):
             raise ValueError(
                 "`sigma` must be positive and finite, but has an entry that is not. Give the standard deviation of the noise; "
-                "mark samples that are not to count by NaN in `values`."
+                "set samples that are to be ignored to NaN in `values`."
             )
     return sigma
 
 
 class _Coordinates(eqx.Module):
-    """Sees the coordinates that the channels are named after."""
+    """Returns the coordinates that the channels are named after."""
 
     names: tuple[str, ...] | None = eqx.field(static=True)
 
@@ -221,7 +233,7 @@ class _Coordinates(eqx.Module):
 
 
 def start_entries(experiment: Experiment) -> tuple[str, ...]:
-    """Names of the coordinates at the start, in the order of the flat (q0, qdot0)."""
+    """Names of the entries of the flat (q0, qdot0)."""
     return tuple(
         which if name == "" else f"{which}{'' if name.startswith('[') else '.'}{name}"
         for which, tree in (("q0", experiment.q0), ("qdot0", experiment.qdot0))

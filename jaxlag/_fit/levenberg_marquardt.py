@@ -1,4 +1,4 @@
-"""Nonlinear least squares, from residuals and Jacobians that come together, one problem or a batch of them."""
+"""Nonlinear least squares within bounds, from residuals and Jacobians that come together; one problem, or a batch of them."""
 
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -11,43 +11,48 @@ import optimistix as optx
 
 from .._program.jit import compiled
 
-RUNNING, CONVERGED, STALLED, MAX_STEPS, INTERRUPTED, FAILED, ASTRAY, APART = range(8)
+RUNNING, CONVERGED, STALLED, STEP_LIMIT, INTERRUPTED, FAILED, UNRELATED, DISCONTINUOUS = range(8)
 REASONS = (
     "still running",
     "converged",
-    "no step lowers the cost any more, though it is not flat",
+    "no step lowers the cost any more, though its gradient is not zero",
     "`max_steps` was reached",
-    "interrupted by the keyboard; these are the best parameters so far",
+    "interrupted (Ctrl-C); these are the best parameters so far",
     "the motion at the start could not be computed",
-    "no step lowers the cost any more, but the predictions have nothing to do with the measurements",
-    "the pieces' ends do not meet, however much it weighs; take more pieces, or start from other parameters",
+    "no step lowers the cost any more, but the predictions are unrelated to the measurements",
+    "the segments do not join, however heavily the gaps are weighted; use more segments, or start from other parameters",
 )
+FIRST_DAMPING = 1e-2
+DAMPING_LIMITS = 1e-14, 1e14
+NEWTON_LIKE = 0.5  # damping below which a step is close to that of Gauss and Newton
+HOPELESS = 1e8  # damping from which on no step is expected to lower the cost
+FLAT = 1e-4  # cosine between the residuals and the columns of the Jacobian, below which the gradient counts as zero
 
 
 class Iterate(NamedTuple):
-    """Where the iteration stands; with a batch, each array has it as its first axis."""
+    """The state of the iteration; in a batch each array has it as its first axis."""
 
     y: Any
     residuals: Any
     jacobian: Any
-    rest: Any
+    aux: Any
     cost: Any  # ½|r|²
     damping: Any
-    scale: Any  # largest norm each column of the Jacobian has had
+    scale: Any  # largest norm that each column of the Jacobian has had
     status: Any
 
 
-class Proposal(NamedTuple):
-    """Where to look next, what is expected of it, and how far one would go if no more bounds were met."""
+class Trial(NamedTuple):
+    """The next y to be tried, and what is expected of it."""
 
     y: Any
     change: Any  # J Δy of the step to y
-    reach: Any  # |J Δy|² of the step that only the bounds hold back which the slope leans on
-    held: Any  # where these are
+    free_change: Any  # |J Δy|² of the step that is held back only by the active bounds
+    active: Any  # bounds at which y lies and towards which the cost falls
 
 
 class Outcome(NamedTuple):
-    """The best iterate, the steps it took, and the cost after each of them."""
+    """The best iterate, the number of steps, and the cost at the start and after each step."""
 
     best: Iterate
     steps: int
@@ -64,32 +69,32 @@ def levenberg_marquardt(
     bounds: tuple[Any, Any] | None = None,
     progress: Callable[[int, float], None] | None = None,
 ) -> Outcome:
-    """Minimises ½|r(y)|² within `bounds`. `linearise(y)` returns r, its Jacobian, and whatever else is wanted of the best y.
+    """Minimises ½|r(y)|² within `bounds`. `linearise(y)` returns r, its Jacobian, and anything else that is wanted at the best y.
 
     Ends where the next step would change no parameter by more than `tolerance` of its standard error: |J Δy| ≤ tolerance · σ̂, with
-    σ̂² = |r|² / `freedom`. Where y has a batch axis, `linearise` and all that is returned have it too.
+    σ̂² = |r|² / `freedom`. Where y has a batch axis, so has all that `linearise` takes and returns.
 
     **Source:** Moré, The Levenberg-Marquardt algorithm, Lecture Notes in Mathematics 630 (1978); Madsen, Nielsen & Tingleff,
     Methods for Non-Linear Least Squares Problems (2004), section 3.2; for the bounds Bertsekas, SIAM J. Control Optim. 20 (1982) 221.
     """
-    begin, advance = ONE if y.ndim == 1 else MANY
+    initialise, update = SINGLE if y.ndim == 1 else BATCHED
     box = [jnp.broadcast_to(jnp.asarray(bound, y.dtype), y.shape) for bound in bounds or (-jnp.inf, jnp.inf)]
-    now, trial = begin(y, linearise(y), box)
+    now, trial = initialise(y, linearise(y), box)
     costs = [now.cost]
     step, limits = 0, (jnp.full(y.shape[:-1], tolerance, y.dtype), jnp.full(y.shape[:-1], freedom, y.dtype))
     try:
         for step in range(1, max_steps + 1):
-            now, trial = advance(now, trial, linearise(trial.y), box, *limits)
+            now, trial = update(now, trial, linearise(trial.y), box, *limits)
             costs.append(now.cost)
             if progress:
                 progress(step, float(np.min(now.cost)))
             if np.all(np.asarray(now.status) != RUNNING):
                 break
-        ended = MAX_STEPS
+        unfinished = STEP_LIMIT
     except KeyboardInterrupt:
-        ended = INTERRUPTED
+        unfinished = INTERRUPTED
     status = np.asarray(now.status)
-    return Outcome(now._replace(status=np.where(status == RUNNING, ended, status)), step, np.array(costs))
+    return Outcome(now._replace(status=np.where(status == RUNNING, unfinished, status)), step, np.array(costs))
 
 
 def _cost(r):
@@ -100,62 +105,66 @@ def _norms(J):
     return jnp.linalg.norm(J, axis=0)
 
 
-def _begin(y, first, bounds):
-    r, J, rest = first
-    now = Iterate(y, r, J, rest, _cost(r), jnp.asarray(1e-2, y.dtype), _norms(J), jnp.asarray(RUNNING))
+def _initialise(y, linearised, bounds):
+    r, J, aux = linearised
+    now = Iterate(y, r, J, aux, _cost(r), jnp.asarray(FIRST_DAMPING, y.dtype), _norms(J), jnp.asarray(RUNNING))
     return now, _propose(now, bounds)
 
 
 def _propose(now, bounds):
-    """The damped Gauss–Newton step, in columns of norm one. What would cross a bound stops at it, and the others step anew."""
+    """The damped Gauss–Newton step, in columns scaled to norm one. Entries that would cross a bound stop there."""
     scale = jnp.where(now.scale > 0, now.scale, 1)
     lower, upper = ((bound - now.y) * scale for bound in bounds)
     J, slope = now.jacobian / scale[None, :], now.residuals @ now.jacobian
-    leaning = ((lower >= 0) & (slope > 0)) | ((upper <= 0) & (slope < 0))
+    active = ((lower >= 0) & (slope > 0)) | ((upper <= 0) & (slope < 0))
     descent = optx.DampedNewtonDescent()
 
-    def step_anew(last):
-        step, held, _, reach = last
-        step = jnp.where(held, step, 0)
-        info = optx.FunctionInfo.ResidualJac(now.residuals + J @ step, lx.MatrixLinearOperator(jnp.where(held[None], 0, J)))
+    def solve_anew(last):
+        step, fixed, _, free_change = last
+        step = jnp.where(fixed, step, 0)
+        info = optx.FunctionInfo.ResidualJac(now.residuals + J @ step, lx.MatrixLinearOperator(jnp.where(fixed[None], 0, J)))
         others, _ = descent.step(1 / now.damping, descent.query(now.y, info, None))  # type: ignore[arg-type]
-        step = jnp.where(held, step, others)
+        step = jnp.where(fixed, step, others)
         crossing = (step < lower) | (step > upper)
-        reach = jnp.where(jnp.isnan(reach), jnp.sum((J @ step) ** 2), reach)  # of the first
-        return jnp.clip(step, lower, upper), held | crossing, jnp.any(crossing), reach
+        free_change = jnp.where(jnp.isnan(free_change), jnp.sum((J @ step) ** 2), free_change)  # of the first solution
+        return jnp.clip(step, lower, upper), fixed | crossing, jnp.any(crossing), free_change
 
-    first = jnp.zeros_like(now.y), leaning, jnp.asarray(True), jnp.full_like(now.cost, jnp.nan)
-    step, _, _, reach = jax.lax.while_loop(lambda last: last[2], step_anew, first)
-    return Proposal(jnp.clip(now.y + step / scale, *bounds), J @ step, reach, leaning)
+    first = jnp.zeros_like(now.y), active, jnp.asarray(True), jnp.full_like(now.cost, jnp.nan)
+    step, _, _, free_change = jax.lax.while_loop(lambda last: last[2], solve_anew, first)
+    return Trial(jnp.clip(now.y + step / scale, *bounds), J @ step, free_change, active)
 
 
-def _advance(now, trial, seen, bounds, tolerance, freedom):
-    """Takes the trial where it is better, sets the damping by how much it is, and proposes the next."""
-    r, J, rest = seen
+def _update(now, trial, linearised, bounds, tolerance, freedom):
+    """Takes the trial where it is better, adapts the damping, and proposes the next."""
+    r, J, aux = linearised
     before, after = now.cost, _cost(r)
-    # What was expected of the step: ½|r|² − ½|r + J step|². Too little to be seen above the rounding of what is integrated, it is trusted.
+    # Expected decrease: ½|r|² − ½|r + J step|². Where it is below the rounding of what is integrated, the step is trusted.
     expected = -trial.change @ now.residuals - 0.5 * trial.change @ trial.change
-    newton_like, unseen = now.damping < 0.5, jnp.finfo(r.dtype).eps ** 0.5 * before
+    newton_like, rounding = now.damping < NEWTON_LIKE, jnp.finfo(r.dtype).eps ** 0.5 * before
     better = after <= before
-    taken = better | (newton_like & (expected <= unseen) & (after - before <= unseen))
-    took = lambda new, old: jax.tree.map(lambda a, b: jnp.where(taken, a, b), new, old)
-    well = (before - after) > 0.25 * expected
-    damping = now.damping * jnp.where(better, jnp.where(well, 0.1, 1.0), 10.0)
-    damping = jnp.clip(damping, 1e-14, 1e14)
-    norms = _norms(now.jacobian)  # here, for those of the start may be larger by many powers of ten
-    least = jnp.finfo(r.dtype).eps ** 0.625 * jnp.max(norms)  # below the rounding of what is integrated
-    short = trial.reach <= jnp.maximum(tolerance**2 * 2 * before / jnp.maximum(freedom, 1), least**2)
-    cosines = jnp.where((norms > 0) & ~trial.held, now.residuals @ now.jacobian / jnp.where(norms > 0, norms, 1), 0)
-    flat = jnp.linalg.norm(cosines) <= 1e-4 * jnp.sqrt(2 * before)
-    status = jnp.where((short & newton_like) | (before == 0), CONVERGED, RUNNING)
-    status = jnp.where(~taken & (now.damping >= 1e8), jnp.where(flat, CONVERGED, STALLED), status)
-    status = jnp.where(jnp.isfinite(before), status, FAILED)
-    status = jnp.where(now.status == RUNNING, status, now.status)
-    done = now.status != RUNNING
-    chosen = Iterate(*took((trial.y, r, J, rest, after), now[:5]), damping, jnp.maximum(now.scale, _norms(jnp.where(taken, J, 0))), status)
-    now = jax.tree.map(lambda a, b: jnp.where(done, b, a), chosen, now)
+    taken = better | (newton_like & (expected <= rounding) & (after - before <= rounding))
+    take = lambda new, old: jax.tree.map(lambda a, b: jnp.where(taken, a, b), new, old)
+    as_expected = (before - after) > 0.25 * expected
+    damping = now.damping * jnp.where(better, jnp.where(as_expected, 0.1, 1.0), 10.0)
+    damping = jnp.clip(damping, *DAMPING_LIMITS)
+    status = _status(now, trial, taken, newton_like, tolerance, freedom)
+    chosen = Iterate(*take((trial.y, r, J, aux, after), now[:5]), damping, jnp.maximum(now.scale, _norms(jnp.where(taken, J, 0))), status)
+    now = jax.tree.map(lambda a, b: jnp.where(now.status != RUNNING, b, a), chosen, now)
     return now, _propose(now, bounds)
 
 
-ONE = tuple(compiled(f) for f in (_begin, _advance))
-MANY = tuple(compiled(jax.vmap(f)) for f in (_begin, _advance))
+def _status(now, trial, taken, newton_like, tolerance, freedom):
+    """Whether the iteration goes on, judged by the step that was tried from `now`."""
+    norms = _norms(now.jacobian)  # the present ones: those at the start may be larger by many powers of ten
+    least = jnp.finfo(now.residuals.dtype).eps ** 0.625 * jnp.max(norms)  # below the rounding of what is integrated
+    short = trial.free_change <= jnp.maximum(tolerance**2 * 2 * now.cost / jnp.maximum(freedom, 1), least**2)
+    cosines = jnp.where((norms > 0) & ~trial.active, now.residuals @ now.jacobian / jnp.where(norms > 0, norms, 1), 0)
+    flat = jnp.linalg.norm(cosines) <= FLAT * jnp.sqrt(2 * now.cost)
+    status = jnp.where((short & newton_like) | (now.cost == 0), CONVERGED, RUNNING)
+    status = jnp.where(~taken & (now.damping >= HOPELESS), jnp.where(flat, CONVERGED, STALLED), status)
+    status = jnp.where(jnp.isfinite(now.cost), status, FAILED)
+    return jnp.where(now.status == RUNNING, status, now.status)
+
+
+SINGLE = tuple(compiled(f) for f in (_initialise, _update))
+BATCHED = tuple(compiled(jax.vmap(f)) for f in (_initialise, _update))

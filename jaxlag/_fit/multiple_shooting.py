@@ -1,4 +1,4 @@
-"""Multiple shooting: a long record in pieces, each with a start of its own, whose ends must meet."""
+"""Multiple shooting: a long record is cut into segments, each with a start of its own, and the gaps between them are closed."""
 
 import dataclasses
 import itertools
@@ -12,69 +12,67 @@ from jax.flatten_util import ravel_pytree
 
 from .._mechanics.projection import consistent_state
 from .experiment import Experiment, with_own
-from .levenberg_marquardt import APART, INTERRUPTED, MAX_STEPS, Outcome, levenberg_marquardt
-from .problem import Links, Problem, linearise
+from .levenberg_marquardt import DISCONTINUOUS, INTERRUPTED, STEP_LIMIT, Outcome, levenberg_marquardt
+from .problem import Continuity, Problem, linearise
 from .smoothing_spline import smooth
 
-FIRST = 0.1  # of what the residuals weigh, the gaps do when they are first looked at
-TIGHTER = 10.0  # the weight of the gaps from one round to the next
-ROUGH = 0.1  # of a standard error, the tolerance until the gaps are closed
-LOST = 0.5  # of its misfit that a piece has to gain to begin where the one before ends
-CLOSED = 1e-9  # gaps that are left, in units of the motion,
-ROUNDINGS = 300  # or so many units in the last place, in single precision,
-CLOSE = 1e-5  # or these, or rtol, where more weight does not make them smaller: they are the integration's error
-FALLING = 0.5  # of the gaps before, or less, are gaps that fall
-PATIENCE = 3  # rounds in which they do not, until it is given up
+FIRST_WEIGHT = 0.1  # of the gaps in the first round, relative to the residuals
+GROWTH = 10.0  # of the weight from one round to the next
+ROUGH = 0.1  # tolerance in standard errors, until the gaps are closed
+LOST = 0.5  # a segment whose sum of squares falls below this part of it is restarted from the end of the one before
+CLOSED = 1e-9  # gaps, relative to the size of the motion, that count as closed,
+CLOSED_ULPS = 300  # or this many units in the last place, in single precision,
+NEARLY_CLOSED = 1e-5  # or these, or rtol, where more weight does not reduce them: they are the error of the integration
+FALLING = 0.5  # gaps are falling where they are at most this part of the gaps before
+PATIENCE = 3  # rounds without falling gaps, after which the iteration stops
 
 
-class Pieces(NamedTuple):
-    """The pieces of some experiments: the `problem` of them all; of which experiment each is; how many samples are its own."""
+class Segments(NamedTuple):
+    """Experiments cut into segments: the `problem` of all segments; the experiment of each; how many samples are its own."""
 
     problem: Problem
     of: tuple[int, ...]
     samples: tuple[int, ...]
 
 
-def cut(problem: Problem, experiments: Sequence[Experiment], count: int) -> Pieces:
-    """Each experiment in `count` pieces, that start where splines through the measurements are."""
-    pieces: list[Experiment] = []
-    of, samples, pairs, states = [], [], [], []
+def cut(problem: Problem, experiments: Sequence[Experiment], count: int) -> Segments:
+    """Each experiment in `count` segments, which start on splines through the measurements."""
+    segments: list[Experiment] = []
+    of, samples, pairs, starts = [], [], [], []
     for i, e in enumerate(experiments):
-        if set(e.unknown) & set(e.params) or e.delay is not None:
-            raise ValueError(
-                "`pieces` must be 1 where an experiment has unknown parameters of its own or a delay, but is more. Free them in `params`."
-            )
-        if count > e.ts.size // 3:
-            raise ValueError(f"`pieces` must leave three samples to each piece, but there are {count} for {e.ts.size} samples. Take fewer.")
+        _check(e, count)
         motion = smooth(e, problem.free.params)
         cuts = np.linspace(0, e.ts.size, count + 1).astype(int)
         for k, (a, b) in enumerate(itertools.pairwise(cuts)):
             if k:
-                pairs.append((len(pieces) - 1, len(pieces)))
-            states.append(np.concatenate([motion.q[a], motion.v[a]]))
-            pieces.append(_piece(problem, e, motion, a, b))
+                pairs.append((len(segments) - 1, len(segments)))
+            starts.append(np.concatenate([motion.q[a], motion.v[a]]))
+            segments.append(_segment(problem, e, motion, a, b))
             of.append(i)
-            samples.append(b - a)
-    spread = np.std(np.array(states), axis=0)
-    size = jnp.asarray(np.where(spread > 0, spread, 1.0))
-    apart = Problem.of(problem.model, problem.free, pieces)
-    apart = dataclasses.replace(apart, scale=problem.scale)
-    rows = sum(apart.stacks[k].ways.shape[-1] for k, row in _places(apart, [b for _, b in pairs]))
-    links = Links(jnp.asarray(0.0), jnp.zeros(rows), size, tuple(pairs))
-    return Pieces(dataclasses.replace(apart, links=links), tuple(of), tuple(samples))
+            samples.append(int(b - a))
+    deviation = np.std(np.array(starts), axis=0)
+    size = jnp.asarray(np.where(deviation > 0, deviation, 1.0))
+    of_segments = Problem.of(problem.model, problem.free, segments)
+    gaps = sum(of_segments.batches[of_segments.places[b][0]].tangent_basis.shape[-1] for _, b in pairs)
+    continuity = Continuity(jnp.asarray(0.0), jnp.zeros(gaps), size, tuple(pairs))
+    return Segments(dataclasses.replace(of_segments, scale=problem.scale, continuity=continuity), tuple(of), tuple(samples))
 
 
-def _places(problem, which):
-    place = {i: (k, row) for k, stack in enumerate(problem.stacks) for row, i in enumerate(stack.members)}
-    return [place[i] for i in which]
+def _check(e, count):
+    if set(e.unknown) & set(e.params) or e.delay is not None:
+        raise ValueError(
+            "`segments` must be 1 where an experiment has unknown parameters of its own or a delay, but is more. Free them in `params`."
+        )
+    if count > e.ts.size // 3:
+        raise ValueError(f"`segments` must leave three samples to each segment, but there are {count} for {e.ts.size} samples. Use fewer.")
 
 
-def _piece(problem, e, motion, a, b):
-    """Samples a … b − 1 of an experiment, and the time of the next, where nothing is measured any more."""
+def _segment(problem, e, motion, a, b):
+    """Samples a … b − 1 of an experiment, and the time of sample b without its measurements."""
     end = min(b + 1, e.ts.size)
     own = jnp.arange(a, end) < b
     within = lambda x: x[a:end]
-    missing = lambda v: jnp.where(jnp.expand_dims(own, tuple(range(1, v.ndim))), within(v), jnp.nan)
+    masked = lambda v: jnp.where(jnp.expand_dims(own, tuple(range(1, v.ndim))), within(v), jnp.nan)
     q0, qdot0, unknown = e.q0, e.qdot0, e.unknown
     if a or unknown:
         _, unravel = ravel_pytree((e.q0, e.qdot0))
@@ -85,7 +83,7 @@ def _piece(problem, e, motion, a, b):
         unknown = ("q0", "qdot0")
     return Experiment(
         e.ts[a:end],
-        jax.tree.map(missing, e.values),
+        jax.tree.map(masked, e.values),
         q0,
         qdot0,
         observe=e.observe,
@@ -96,67 +94,79 @@ def _piece(problem, e, motion, a, b):
 
 
 def join(problem: Problem, x: Any, *, max_steps: int, tolerance: float, freedom: int, progress: Any) -> tuple[Outcome, Problem]:
-    """First the pieces each by itself, with the parameters in common; then the gaps are closed, in rounds of growing weight."""
+    """Fits the segments without continuity, then closes the gaps in rounds of growing weight; the outcome, and the last problem."""
     if not jnp.all(jnp.isfinite(linearise(problem, x).residuals)):
         raise ValueError(
-            "`params` must give a motion in each piece, but one could not be computed. Start from others, or take more pieces."
+            "`params` must give a motion in each segment, but one could not be computed. Start from others, or use more segments."
         )
-    links = problem.links
-    assert links is not None
-    steps, costs, weight, bounds = 0, np.zeros(0), 0.0, problem.bounds
-    closed, gap, rounds, last = False, np.inf, 0, None
-    close = max(CLOSE, float(dict(problem.model.numerics).get("rtol") or 0))
+    continuity = problem.continuity
+    assert continuity is not None
+    steps, costs, weight = 0, np.zeros(0), 0.0
+    closed, gap, stalled, last = False, np.inf, 0, None
     while True:
-        problem = dataclasses.replace(problem, links=links)
-
-        def seen(x, problem=problem):
-            rows = linearise(problem, x)
-            return rows.residuals, rows.jacobian, rows
-
-        more = None if progress is None else lambda step, cost, done=steps: progress(done + step, cost)
-        exactness = tolerance if closed else ROUGH
-        outcome = levenberg_marquardt(
-            seen, x, bounds=bounds, freedom=freedom, max_steps=max_steps - steps, tolerance=exactness, progress=more
-        )
+        problem = dataclasses.replace(problem, continuity=continuity)
+        limits = {"freedom": freedom, "max_steps": max_steps - steps, "tolerance": tolerance if closed else ROUGH}
+        outcome = _minimised(problem, x, limits, progress, steps)
         x, steps, costs = outcome.best.y, steps + outcome.steps, np.append(costs, outcome.costs)
-        rows, status = outcome.best.rest, int(outcome.best.status)
-        apart = rounds >= PATIENCE
-        if status == INTERRUPTED or steps >= max_steps or closed or apart:
-            ended = status if closed or status == INTERRUPTED else MAX_STEPS if steps >= max_steps else APART
+        found, status = outcome.best.aux, int(outcome.best.status)
+        if status == INTERRUPTED or steps >= max_steps or closed or stalled >= PATIENCE:
+            ended = status if closed or status == INTERRUPTED else STEP_LIMIT if steps >= max_steps else DISCONTINUOUS
             return Outcome(outcome.best._replace(status=jnp.asarray(ended)), steps, costs), problem
         if weight == 0.0:
-            x, lost = _begun_anew(problem, x, rows)
-            if lost:
+            x, restarted = _lost_segments_restarted(problem, x, found)
+            if restarted:
                 continue
-        before, left = gap, float(jnp.max(jnp.abs(rows.gaps)))
-        gap, rounds = min(left, before), rounds + 1 if left > FALLING * before else 0
-        if rounds and left < close and last is not None:  # the integration cannot do better: back to the last weight that helped
-            (x, links), closed = last, True
+        before, left = gap, float(jnp.max(jnp.abs(found.gaps)))
+        gap, stalled = min(left, before), stalled + 1 if left > FALLING * before else 0
+        if stalled and left < _nearly_closed(problem) and last is not None:  # the integration cannot do better: back to the last weight
+            (x, continuity), closed = last, True
             continue
-        last = (x, links) if weight else None
-        closed = left < max(CLOSED, ROUNDINGS * float(jnp.finfo(x.dtype).eps))
-        before, weight = weight, weight * TIGHTER or FIRST * float(jnp.linalg.norm(rows.residuals) / jnp.linalg.norm(rows.gaps))
-        weight = before if closed and before else weight
-        dual = (links.dual + rows.gaps) * (before / weight) ** 2  # weight² dual are the multipliers of the gaps, which go on
-        links = dataclasses.replace(links, weight=jnp.asarray(weight), dual=dual)
+        last = (x, continuity) if weight else None
+        closed = left < max(CLOSED, CLOSED_ULPS * float(jnp.finfo(x.dtype).eps))
+        weight, continuity = _next_round(continuity, found, weight, closed)
 
 
-def _begun_anew(problem, x, rows):
-    """x with pieces that have lost their measurements begun where the piece before ends; and whether there were such."""
-    misfits = lambda rows: np.concatenate([np.sum(np.asarray(part.residuals) ** 2, axis=1) for part in rows.of_stacks])
-    order = [i for stack in problem.stacks for i in stack.members]
-    places = {i: (k, row) for k, stack in enumerate(problem.stacks) for row, i in enumerate(stack.members)}
-    half = problem.links.size.size
+def _minimised(problem, x, limits, progress, done):
+    """One round; `done` steps were taken before."""
+
+    def residuals(x):
+        found = linearise(problem, x)
+        return found.residuals, found.jacobian, found
+
+    shown = None if progress is None else lambda step, cost: progress(done + step, cost)
+    return levenberg_marquardt(residuals, x, bounds=problem.bounds, progress=shown, **limits)
+
+
+def _nearly_closed(problem):
+    return max(NEARLY_CLOSED, float(dict(problem.model.numerics).get("rtol") or 0))
+
+
+def _next_round(continuity, found, before, closed):
+    """The weight of the next round, and the continuity with the multipliers weight² · dual carried over to it."""
+    weight = before * GROWTH or FIRST_WEIGHT * float(jnp.linalg.norm(found.residuals) / jnp.linalg.norm(found.gaps))
+    weight = before if closed and before else weight
+    dual = (continuity.dual + found.gaps) * (before / weight) ** 2
+    return weight, dataclasses.replace(continuity, weight=jnp.asarray(weight), dual=dual)
+
+
+def _lost_segments_restarted(problem, x, found):
+    """x with segments that lost their measurements restarted where the one before ends; and whether there were any."""
+    misfits = lambda found: np.concatenate([np.sum(np.asarray(part.residuals) ** 2, axis=1) for part in found.batches])
+    order = [i for batch in problem.batches for i in batch.members]
+    places = problem.places
+    half = problem.continuity.size.size
     tried = np.array(x)
-    for a, b in problem.links.pairs:
-        (ka, ra), (kb, rb) = places[a], places[b]
-        start, _ = ravel_pytree(jax.tree.map(lambda leaf, rb=rb: leaf[rb], (problem.stacks[kb].q0, problem.stacks[kb].qdot0)))
-        way = np.asarray(problem.stacks[kb].ways[rb])
-        tried[problem.own_columns(kb, np.array([rb]))[0]] = way.T @ (np.asarray(rows.of_stacks[ka].ends[ra, half:]) - np.asarray(start))
-    now, then = misfits(rows), misfits(linearise(problem, jnp.asarray(tried)))
+    for a, b in problem.continuity.pairs:
+        (batch_a, row_a), (batch_b, row_b) = places[a], places[b]
+        batch = problem.batches[batch_b]
+        start, _ = ravel_pytree(jax.tree.map(lambda leaf, row=row_b: leaf[row], (batch.q0, batch.qdot0)))
+        basis, end = np.asarray(batch.tangent_basis[row_b]), np.asarray(found.batches[batch_a].ends[row_a, half:])
+        tried[problem.own_columns(batch_b, np.array([row_b]))[0]] = basis.T @ (end - np.asarray(start))
+    now, then = misfits(found), misfits(linearise(problem, jnp.asarray(tried)))
     better = {order[j] for j in np.flatnonzero(then < LOST * now)}
     x = np.array(x)
     for i in better:
-        columns = problem.own_columns(places[i][0], np.array([places[i][1]]))[0]
+        k, row = places[i]
+        columns = problem.own_columns(k, np.array([row]))[0]
         x[columns] = tried[columns]
     return jnp.asarray(x), bool(better)

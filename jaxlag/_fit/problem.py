@@ -1,4 +1,4 @@
-"""The whole least-squares problem: all experiments, what is known beforehand, and pieces of motion that must join."""
+"""The least-squares problem as a whole: all experiments, the priors, and the continuity of motions that are cut into segments."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -8,129 +8,139 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array
+from jaxtyping import Array, Float
 
 from .._motion.results import reason_of
 from .._motion.simulate_many import of_each
 from .._program.jit import compiled
 from .experiment import Experiment
+from .experiment_batch import ExperimentBatch, batches_of, map_batch
 from .parameters import Free
-from .residuals import Linearised, Model, Stack, linearised, members, side_by_side, stacked
+from .residuals import Linearised, Model, evaluate_batch, linearise_batch
 
 
-class Links(eqx.Module):
-    """Where one piece of a motion ends the next has to begin: c = Wᵀ (end − start) = 0, kept by an augmented Lagrangian.
+class Continuity(eqx.Module):
+    """Where one segment of a motion ends the next has to start: c = Wᵀ (end − start) = 0, enforced by an augmented Lagrangian.
+
+    W is the tangent basis of the start of the next segment, over the typical size of the state.
 
     **Source:** Bock, Recent advances in parameter identification techniques for o.d.e. (1983); Nocedal & Wright, Numerical
     Optimization, section 17.3.
     """
 
     weight: Array
-    dual: Array  # one for each row of c
-    size: Array  # (2n,) of the state, typical
-    pairs: tuple[tuple[int, int], ...] = eqx.field(static=True)
+    dual: Array  # one for each entry of c
+    size: Array  # (2n,), typical size of the state
+    pairs: tuple[tuple[int, int], ...] = eqx.field(static=True)  # of segments that follow each other
 
 
-class Rows(NamedTuple):
-    """What a `Problem` says of its unknowns: all residuals and their Jacobian; the experiments apart; the gaps at links."""
+class Linearisation(NamedTuple):
+    """A `Problem` at one point: all residuals and their Jacobian, the same for each batch of experiments, and the gaps c of segments."""
 
     residuals: Any
     jacobian: Any
-    of_stacks: tuple[Linearised, ...]
+    batches: tuple[Linearised, ...]
     gaps: Any
     gaps_jacobian: Any
 
 
 class Problem(eqx.Module):
-    """Residuals as a function of all unknowns, y of the free parameters and then z of each experiment, in one flat vector."""
+    """Residuals as a function of all unknowns x: y of the free parameters, then z of each experiment, in one flat vector."""
 
     model: Model
     free: Free
-    stacks: tuple[Stack, ...]
-    scale: Array  # of the noise, in units of sigma, for losses that need it
-    links: Links | None = None
+    batches: tuple[ExperimentBatch, ...]
+    scale: Array  # of the noise, in units of sigma, for robust losses
+    continuity: Continuity | None = None
 
     @classmethod
     def of(cls, model: Model, free: Free, experiments: Sequence[Experiment]) -> "Problem":
-        """The problem at its start, y = z = 0."""
-        return cls(model, free, stacked(model.system, free.params, experiments), jnp.ones((), free.start.dtype))
+        """The problem of these experiments; its start is x = 0."""
+        return cls(model, free, batches_of(model.system, free.params, experiments), jnp.ones((), free.start.dtype))
 
     @property
     def size(self) -> int:
         """The number of unknowns."""
-        return self.free.size + sum(len(stack.members) * stack.unknowns for stack in self.stacks)
+        return self.free.size + sum(len(batch.members) * batch.unknowns for batch in self.batches)
 
     @property
     def bounds(self) -> tuple[Array, Array]:
-        """Of all unknowns."""
+        """Lower and upper bounds of all unknowns."""
         lower, upper = self.free.bounds
         others = jnp.full(self.size - self.free.size, jnp.inf, lower.dtype)
         return jnp.concatenate([lower, -others]), jnp.concatenate([upper, others])
 
-    def split(self, x: Array) -> tuple[Array, list[Array]]:
-        """y, and for each stack z of its experiments."""
-        sizes = [self.free.size, *(len(stack.members) * stack.unknowns for stack in self.stacks)]
+    @property
+    def places(self) -> dict[int, tuple[int, int]]:
+        """For each experiment its batch and its row in the batch."""
+        return {i: (k, row) for k, batch in enumerate(self.batches) for row, i in enumerate(batch.members)}
+
+    def own_columns(self, k: int, rows: np.ndarray) -> np.ndarray:
+        """Indices in x of the own unknowns of some experiments of batch k, (experiments, unknowns)."""
+        begin = self.free.size + sum(len(batch.members) * batch.unknowns for batch in self.batches[:k])
+        return begin + rows[:, None] * self.batches[k].unknowns + np.arange(self.batches[k].unknowns)
+
+    def split(self, x: Float[Array, " x"]) -> tuple[Array, list[Array]]:
+        """y, and for each batch z of its experiments."""
+        sizes = [self.free.size, *(len(batch.members) * batch.unknowns for batch in self.batches)]
         y, *zs = jnp.split(x, np.cumsum(sizes)[:-1])
-        return y, [z.reshape(len(stack.members), stack.unknowns) for stack, z in zip(self.stacks, zs, strict=True)]
+        return y, [z.reshape(len(batch.members), batch.unknowns) for batch, z in zip(self.batches, zs, strict=True)]
 
-    def linearise(self, x: Array) -> Rows:
-        """All residuals and their Jacobian."""
+    def linearise(self, x: Float[Array, " x"]) -> Linearisation:
+        """All residuals and their Jacobian: those of the priors, of the experiments, of the gaps."""
         y, zs = self.split(x)
-        parts = tuple(linearised(self.model, self.free, stack, y, z, self.scale) for stack, z in zip(self.stacks, zs, strict=True))
-        prior = jnp.zeros((self.free.size, self.size), x.dtype).at[:, : self.free.size].set(jnp.diag(self.free.slope(y) / self.free.spread))
-        blocks = [(self.free.surprise(y), prior)]
+        parts = tuple(linearise_batch(self.model, self.free, batch, y, z, self.scale) for batch, z in zip(self.batches, zs, strict=True))
+        slope = jnp.diag(self.free.slope(y) / self.free.prior_deviation)
+        prior = jnp.zeros((self.free.size, self.size), x.dtype).at[:, : self.free.size].set(slope)
+        blocks = [(self.free.prior_residual(y), prior)]
         for k, part in enumerate(parts):
-            blocks.append((part.residuals, self._over_all(k, np.arange(len(part.residuals)), part.jacobian)))
+            blocks.append((part.residuals, self._over_all_unknowns(k, np.arange(len(part.residuals)), part.jacobian)))
         gaps, gaps_J = jnp.zeros(0), jnp.zeros((0, self.size))
-        if self.links is not None:
+        if self.continuity is not None:
             gaps, gaps_J = self._gaps(parts)
-            blocks.append((self.links.weight * (gaps + self.links.dual), self.links.weight * gaps_J))
+            blocks.append((self.continuity.weight * (gaps + self.continuity.dual), self.continuity.weight * gaps_J))
         residuals, jacobians = zip(*((r.ravel(), J.reshape(-1, self.size)) for r, J in blocks), strict=True)
-        return Rows(jnp.concatenate(residuals), jnp.concatenate(jacobians), parts, gaps, gaps_J)
+        return Linearisation(jnp.concatenate(residuals), jnp.concatenate(jacobians), parts, gaps, gaps_J)
 
-    def cost(self, x: Array) -> Array:
-        """Half the sum of squares, without its Jacobian: for a reverse pass."""
+    def cost(self, x: Float[Array, " x"]) -> Array:
+        """Half the sum of squares, without the Jacobian of the residuals: for reverse-mode differentiation."""
         y, zs = self.split(x)
-        total = jnp.sum(self.free.surprise(y) ** 2)
-        for stack, z in zip(self.stacks, zs, strict=True):
-            total = total + jnp.sum(members(self.model, self.free, stack, y, z, self.scale).residuals ** 2)
+        total = jnp.sum(self.free.prior_residual(y) ** 2)
+        for batch, z in zip(self.batches, zs, strict=True):
+            total = total + jnp.sum(evaluate_batch(self.model, self.free, batch, y, z, self.scale).residuals ** 2)
         return total / 2
 
-    def _over_all(self, k, members, J):
-        """Rows of some experiments of stack k, over (y, z), as rows over all unknowns."""
+    def _over_all_unknowns(self, k, rows, J):
+        """Jacobians of some experiments of batch k with respect to (y, z), with a column for every unknown."""
         p = self.free.size
         wide = jnp.zeros((*J.shape[:2], self.size), J.dtype).at[:, :, :p].set(J[:, :, :p])
-        at = np.arange(len(members))[:, None, None], np.arange(J.shape[1])[:, None], self.own_columns(k, members)[:, None]
+        at = np.arange(len(rows))[:, None, None], np.arange(J.shape[1])[:, None], self.own_columns(k, rows)[:, None]
         return wide.at[at].set(J[:, :, p:])
 
     def _gaps(self, parts):
-        """c and its Jacobian; the links between one pair of stacks together."""
-        place = {i: (k, row) for k, stack in enumerate(self.stacks) for row, i in enumerate(stack.members)}
+        """c and its Jacobian; all pairs between the same two batches are computed together."""
+        places = self.places
         kinds: dict[tuple[int, int], list[tuple[int, int]]] = {}
-        for a, b in self.links.pairs:
-            kinds.setdefault((place[a][0], place[b][0]), []).append((place[a][1], place[b][1]))
+        for a, b in self.continuity.pairs:
+            (batch_a, row_a), (batch_b, row_b) = places[a], places[b]
+            kinds.setdefault((batch_a, batch_b), []).append((row_a, row_b))
         gaps, jacobians = zip(*(self._gaps_between(parts, *kind, np.array(rows).T) for kind, rows in kinds.items()), strict=True)
         return jnp.concatenate(gaps), jnp.concatenate(jacobians)
 
     def _gaps_between(self, parts, a, b, rows):
-        of_a, of_b = rows
-        ends = self.links.size.size
-        W = self.stacks[b].ways[of_b].swapaxes(1, 2) / self.links.size[None, None, :]
-        gap = parts[a].ends[of_a, ends:] - parts[b].ends[of_b, :ends]
-        end, start = W @ parts[a].ends_jacobian[of_a, ends:], W @ parts[b].ends_jacobian[of_b, :ends]
-        J = self._over_all(a, of_a, end) - self._over_all(b, of_b, start)
+        rows_a, rows_b = rows
+        ends = self.continuity.size.size
+        W = self.batches[b].tangent_basis[rows_b].swapaxes(1, 2) / self.continuity.size[None, None, :]
+        gap = parts[a].ends[rows_a, ends:] - parts[b].ends[rows_b, :ends]
+        end, start = W @ parts[a].ends_jacobian[rows_a, ends:], W @ parts[b].ends_jacobian[rows_b, :ends]
+        J = self._over_all_unknowns(a, rows_a, end) - self._over_all_unknowns(b, rows_b, start)
         return jnp.einsum("lij,lj->li", W, gap).ravel(), J.reshape(-1, self.size)
 
-    def own_columns(self, k: int, rows: np.ndarray) -> np.ndarray:
-        """Where the own unknowns of some experiments of stack k are among all."""
-        begin = self.free.size + sum(len(stack.members) * stack.unknowns for stack in self.stacks[:k])
-        return begin + rows[:, None] * self.stacks[k].unknowns + np.arange(self.stacks[k].unknowns)
 
-
-def linearise(problem: Problem, x: Array) -> Rows:
-    """`Problem.linearise`, compiled; what several devices computed is brought together."""
-    rows = _linearise(problem, x)
-    return rows if all(stack.mesh is None for stack in problem.stacks) else jax.tree.map(np.asarray, rows)
+def linearise(problem: Problem, x: Float[Array, " x"]) -> Linearisation:
+    """`Problem.linearise`, compiled; results of several devices are gathered."""
+    found = _linearise(problem, x)
+    return found if all(batch.mesh is None for batch in problem.batches) else jax.tree.map(np.asarray, found)
 
 
 @compiled
@@ -139,53 +149,53 @@ def _linearise(problem, x):
 
 
 @compiled
-def look(problem: Problem, x: Array) -> Rows:
+def without_jacobian(problem: Problem, x: Float[Array, " x"]) -> Linearisation:
     """The residuals alone, where there are too many unknowns for a Jacobian."""
     y, zs = problem.split(x)
     parts = []
-    for stack, z in zip(problem.stacks, zs, strict=True):
-        m = members(problem.model, problem.free, stack, y, z, problem.scale)
-        parts.append(Linearised(m.residuals, None, m.ends, None, m.channels, m.result))
-    r = jnp.concatenate([problem.free.surprise(y), *(part.residuals.ravel() for part in parts)])
-    return Rows(r, None, tuple(parts), jnp.zeros(0), jnp.zeros((0, problem.size)))
+    for batch, z in zip(problem.batches, zs, strict=True):
+        found = evaluate_batch(problem.model, problem.free, batch, y, z, problem.scale)
+        parts.append(Linearised(found.residuals, None, found.ends, None, found.channels, found.result))
+    r = jnp.concatenate([problem.free.prior_residual(y), *(part.residuals.ravel() for part in parts)])
+    return Linearisation(r, None, tuple(parts), jnp.zeros(0), jnp.zeros((0, problem.size)))
 
 
 @compiled
-def linearise_starts(problem: Problem, xs: Array) -> Rows:
-    """One problem at many places."""
+def linearise_starts(problem: Problem, xs: Float[Array, "starts x"]) -> Linearisation:
+    """One problem at many points."""
     return of_each(problem.linearise, xs)
 
 
-def linearise_each(problem: Problem, xs: Array) -> Rows:
-    """Each experiment of a problem with one stack as a problem of its own."""
-    rows = _linearise_each(problem, xs)
-    return rows if problem.stacks[0].mesh is None else jax.tree.map(np.asarray, rows)
+def linearise_each(problem: Problem, xs: Float[Array, "experiments x"]) -> Linearisation:
+    """Each experiment of a problem with one batch as a problem by itself."""
+    found = _linearise_each(problem, xs)
+    return found if problem.batches[0].mesh is None else jax.tree.map(np.asarray, found)
 
 
 @compiled
 def _linearise_each(problem, xs):
-    (stack,) = problem.stacks
+    (batch,) = problem.batches
 
-    def alone(e, x, common):
+    def of_one(e, x, common):
         one = dataclasses.replace(jax.tree.map(lambda leaf: leaf[None] if eqx.is_array(leaf) else leaf, e), members=(0,), mesh=None)
-        return dataclasses.replace(common, stacks=(one,)).linearise(x)
+        return dataclasses.replace(common, batches=(one,)).linearise(x)
 
-    return side_by_side(alone, stack, xs, dataclasses.replace(problem, stacks=()))
+    return map_batch(of_one, batch, xs, dataclasses.replace(problem, batches=()))
 
 
-def blank(model: Model, free: Free, experiment: Experiment) -> Experiment:
-    """The experiment with zeros measured by sensors of unit noise: its residuals are what its sensors see."""
+def with_zero_values(model: Model, free: Free, experiment: Experiment) -> Experiment:
+    """The experiment with measurements of zero and a sigma of one: its residuals are what its sensors see."""
     bare = eqx.tree_at(lambda e: (e.values, e.sigma), experiment, (None, None), is_leaf=lambda x: x is None)
-    (stack,) = stacked(model.system, free.params, [bare])
-    one = jax.tree.map(lambda x: x[0] if eqx.is_array(x) else x, stack)
-    seen = eqx.filter_eval_shape(lambda e: model.predicted(free.params, e, jnp.zeros(stack.unknowns))[0], one)
+    (batch,) = batches_of(model.system, free.params, [bare])
+    one = jax.tree.map(lambda x: x[0] if eqx.is_array(x) else x, batch)
+    seen = eqx.filter_eval_shape(lambda e: model.predicted(free.params, e, jnp.zeros(batch.unknowns))[0], one)
     zeros = jax.tree.map(lambda s: jnp.zeros(s.shape, s.dtype), seen)
     return eqx.tree_at(lambda e: e.values, bare, zeros, is_leaf=lambda x: x is None)
 
 
-def failure_of(rows: Rows) -> str | None:
-    """Why a motion could not be computed, if one could not."""
-    for part in rows.of_stacks:
+def failure_of(found: Linearisation) -> str | None:
+    """Why a motion could not be computed, or None."""
+    for part in found.batches:
         if not np.all(np.isfinite(np.asarray(part.residuals))):
             return reason_of(part.result)
     return None

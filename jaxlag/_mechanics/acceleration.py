@@ -1,4 +1,4 @@
-"""What holds at one state: acceleration, multipliers, and the forces of the constraints."""
+"""At one state: acceleration, multipliers, and constraint forces."""
 
 import dataclasses
 from collections.abc import Callable
@@ -9,19 +9,21 @@ import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
 from jaxtyping import PyTree
 
+from .._model.flat import Flat, rows_by_name
 from .._model.injection import check_function
-from .._model.system import Flat, System, rows_by_name
+from .._model.system import System
 from .._model.validation import at_state
 from .._program.jit import is_concrete
 from .._program.scalarise import scalarised
 from .lagrange import constraint_rows
-from .saddle_point import CONTRADICTION, NO_INERTIA, Sound, constrained_acceleration, pseudo_inverse
-from .singular_directions import because
-from .stick_slip import settled
+from .pseudo_inverse import pseudo_inverse
+from .saddle_point import CONTRADICTION, NO_INERTIA, Sound, constrained_acceleration
+from .singular_directions import explained
+from .stick_slip import in_current_mode
 
 
 class Acceleration(NamedTuple):
-    """q̈, structured like q, and the multipliers λ by the constraint's name."""
+    """`qddot`: q̈, structured like q; `multipliers`: λ by the name of the constraint, structured like what g or a returns."""
 
     qddot: PyTree
     multipliers: dict[str, PyTree]
@@ -35,7 +37,7 @@ def acceleration(system: System, q: PyTree, qdot: PyTree, params: PyTree = None,
     λ > 0 pushes along +∇g. With redundant constraints q̈ and Gᵀλ are still unique, and λ is the one of least norm;
     M may be singular where the constraints hold what it leaves free.
 
-    **Arguments:** the state `q`, `qdot` (one pytree structure), `params`, the time `t`. Any consistent units.
+    **Arguments:** the state `q`, `qdot` (one pytree structure, n numbers in all), `params`, the time `t`. Any consistent units.
 
     **Returns:** `Acceleration(qddot, multipliers)`: q̈ structured like q; λ by the constraint's name, structured like what g or a returns.
 
@@ -61,15 +63,15 @@ def acceleration(system: System, q: PyTree, qdot: PyTree, params: PyTree = None,
 
 
 def _refuse(sound: Sound, *given) -> None:
-    """Raises what a solve lacks; under `jit` its result is NaN."""
+    """Raises where a solve has no unique solution; under `jit` its result is NaN."""
     if is_concrete(sound) and not sound.determined:
-        raise ValueError(because(NO_INERTIA, *given))
+        raise ValueError(explained(NO_INERTIA, *given))
     if is_concrete(sound) and not sound.satisfied:
         raise ValueError(CONTRADICTION)
 
 
 def _acceleration(flat, t, q, v):
-    mode = settled(flat, t, q, v)
+    mode = in_current_mode(flat, t, q, v)
 
     def known(t, q, v):
         qddot, multipliers, sound = constrained_acceleration(mode, t, q, v)
@@ -115,12 +117,12 @@ def constraint_force(
 
 @dataclasses.dataclass(frozen=True)
 class _ConstraintForce:
-    """The forces over flat vectors; compared by the point, so that it compiles once."""
+    """The forces over flat vectors; compared by the point, so that it is compiled once."""
 
     at: Callable | None
 
     def __call__(self, flat: Flat, t, q, v):
-        _, multipliers, sound = constrained_acceleration(settled(flat, t, q, v), t, q, v)
+        _, multipliers, sound = constrained_acceleration(in_current_mode(flat, t, q, v), t, q, v)
         _, G, _ = constraint_rows(flat, t, q, v)
         forces = {name: multipliers[rows] @ G[rows] for name, rows in rows_by_name(flat).items()}
         shown = flat.unravel if self.at is None else _force_on_point(flat, self.at, t, q)

@@ -1,4 +1,4 @@
-"""A check-up of a system at one state, before it is run: findings in words, with the cure."""
+"""A pre-flight check of a system at one state: findings in words, with the cure."""
 
 import dataclasses
 from typing import Any
@@ -8,25 +8,29 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import PyTree
 
+from .._model.flat import Flat, bind, rows_by_name
 from .._model.paths import entry_names, leaf_names
-from .._model.system import Flat, System, bind, rows_by_name
+from .._model.system import System
 from .._model.validation import at_state, coordinates
 from .._program.scalarise import scalarised
-from .friction_terms import unread_friction
+from .friction_elements import unread_friction
 from .lagrange import applied_force, constraint_rows, inertia, position_residual, velocity_residual
 from .saddle_point import augmented, constrained_acceleration
-from .singular_directions import UNDEFINED, allowed, bends, is_defined, weightless
-from .stick_slip import settled
+from .singular_directions import UNDEFINED, is_defined, massless_coordinates, not_affine_in, tangent_basis
+from .stick_slip import in_current_mode
 
 
 @dataclasses.dataclass(frozen=True)
 class Examination:
     """What `examine` found; printed, a report.
 
-    - `coordinates`, `degrees_of_freedom`, `rank` of G, `redundant`: rows of G that depend on rows before them, by constraint.
-    - `off_position`, `off_velocity`: the largest residual of each constraint. `smallest_inertia`: the least eigenvalue of M on the
-      motions the constraints allow. `dissipated`: the least of q̇·∂D/∂q̇ near the state, by term.
-    - `time_constants`: 1/|eigenvalue| of the linearised motion, the fastest and the slowest. `findings`: sentences with the cure.
+    - `coordinates`: their names. `degrees_of_freedom`: n − rank G.
+    - `rows`, `rank`: of G. `redundant`: how many rows depend on rows before them, by constraint.
+    - `off_position`, `off_velocity`: the largest residual of each constraint, in its own units.
+    - `smallest_inertia`: the least eigenvalue of M on the motions that the constraints allow.
+    - `dissipated`: the least of q̇·∂D/∂q̇ near the state, a power, by term.
+    - `time_constants`: 1/|eigenvalue| of the linearised motion, the fastest and the slowest.
+    - `findings`: sentences with the cure.
     """
 
     coordinates: tuple[str, ...]
@@ -51,21 +55,23 @@ class Examination:
             ("time constants", f"{fastest:.3g} … {slowest:.3g}"),
         ]
         lines = [f"  {name:<20}{value}" for name, value in rows]
-        return "\n".join(["Examination", *lines, *(f"  - {finding}" for finding in self.findings or ("nothing to mend",))])
+        return "\n".join(["Examination", *lines, *(f"  - {finding}" for finding in self.findings or ("no issues found",))])
 
 
 def examine(system: System, q: PyTree, qdot: PyTree, params: PyTree = None, *, t: Any = 0.0) -> Examination:
-    r"""A check-up of a system at one state: rank, redundancy, inertia, dissipation, stiffness, in numbers and in words.
+    r"""A pre-flight check of a system at one state: rank, redundancy, inertia, dissipation, stiffness, in numbers and in words.
 
     $$ \text{degrees of freedom} = n - \mathrm{rank}\,G, \qquad N^T M N > 0, \qquad \dot q\cdot\frac{\partial D}{\partial\dot q} \ge 0,
        \qquad \tau = 1/|\lambda_i| \text{ of the linearised motion} $$
 
     N spans the null space of G: the motions that the constraints allow.
 
-    **Arguments:** as `acceleration`. Any consistent units. **Returns:** an `Examination`; print it.
+    **Arguments:** as `acceleration`. Any consistent units.
 
-    **Raises:** `TypeError` or `ValueError` where an argument or a function of the system is of the wrong kind, or gives no finite
-    numbers at this state.
+    **Returns:** an `Examination`; print it.
+
+    **Raises:** `TypeError` or `ValueError` where an argument or a function of the system is of the wrong kind, or returns numbers
+    that are not finite at this state.
 
     **Source:** Hairer & Wanner, Solving Ordinary Differential Equations II, sections IV.1 (stiffness) and VII.1.
 
@@ -82,7 +88,7 @@ def examine(system: System, q: PyTree, qdot: PyTree, params: PyTree = None, *, t
     eps = float(jnp.finfo(found["M"].dtype).eps)
     G, M = found["G"], found["M"]
     rows = {name: found["rows"][name] for name in system.constraints}  # in the order of the rows of G
-    N = allowed(G, eps)
+    N = tangent_basis(G, eps)
     rank = G.shape[1] - N.shape[1]
     inertia_on_N = np.linalg.eigvalsh(N.T @ M @ N) if N.shape[1] else np.zeros(0)
     smallest = float(inertia_on_N[0]) if inertia_on_N.size else float("inf")
@@ -106,17 +112,17 @@ def examine(system: System, q: PyTree, qdot: PyTree, params: PyTree = None, *, t
     names = entry_names(q, "q")
     findings = [
         *_without_inertia(names, M, G),
-        *_not_affine(names, found["bends"]),
+        *_not_affine(names, found["not_affine_in"]),
         *_pushes(names, M, G, rows, system),
         *_findings(numbers, defect, found["M"].dtype),
         *_pulling(system, found["multipliers"]),
-        *_of_friction(system, q, qdot, params, t),
+        *_unread_friction(system, q, qdot, params, t),
     ]
     return Examination(**numbers, findings=tuple(findings))
 
 
-def _of_friction(system, q, qdot, params, t):
-    """Dry friction that is written in a way that is not read as such."""
+def _unread_friction(system, q, qdot, params, t):
+    """Dry friction that is written in a way that is not recognised."""
     q = coordinates(q, "q")
     v = jax.flatten_util.ravel_pytree(coordinates(qdot, "qdot"))[0]
     return unread_friction(bind(system, q, params), jnp.asarray(t, v.dtype), jax.flatten_util.ravel_pytree(q)[0], v)
@@ -129,12 +135,12 @@ def _pulling(system, multipliers):
         if least < -np.sqrt(np.finfo(multipliers[name].dtype).eps) * size:
             yield (
                 f"the one-sided constraint {name!r} would have to pull here (λ = {least:.3g}), so its contact would open: "
-                "the motion keeps it all the same, until the contact is stated as one"
+                "the motion enforces it all the same, as an equality"
             )
 
 
 def _without_inertia(names, M, G):
-    free = [names[i] for i in weightless(M, G)]
+    free = [names[i] for i in massless_coordinates(M, G)]
     if free:
         yield (
             f"a direction that no constraint holds has no inertia: {', '.join(map(repr, free))}; add the missing mass (a small one with "
@@ -142,15 +148,14 @@ def _without_inertia(names, M, G):
         )
 
 
-def _not_affine(names, bends):
-    bent = [names[i] for i in np.flatnonzero(bends)]
-    if bent:
-        listed = ", ".join(map(repr, bent))
+def _not_affine(names, where):
+    listed = ", ".join(repr(names[i]) for i in np.flatnonzero(where))
+    if listed:
         yield f"a nonholonomic constraint is not affine in the velocity of {listed}: write its derivative, or a root of it"
 
 
 def _pushes(names, M, G, rows, system):
-    """Rows of velocities that tie a coordinate without inertia to others: their λ acts on these too, as a law of first order would not."""
+    """Velocity constraints that tie a coordinate without inertia to others: their λ acts on these too, unlike a first-order law."""
     size = np.max(np.abs(M), axis=1)
     massless = size <= 100 * len(M) * np.finfo(M.dtype).eps * np.max(size, initial=0.0)
     for name in (name for name, _ in system.nonholonomic):
@@ -161,7 +166,7 @@ def _pushes(names, M, G, rows, system):
                 yield (
                     f"constraint {name!r} ties {', '.join(map(repr, driven))}, without inertia, to {', '.join(map(repr, pushed))}, and its "
                     "λ pushes these too: right for a rod or a gear, wrong for a law such as that of a spring and damper in series, "
-                    "which is to push by a force or an energy alone"
+                    "which must push by a force or an energy alone"
                 )
 
 
@@ -176,30 +181,30 @@ def _findings(numbers, defect, dtype):
     for name, count in numbers["redundant"].items():
         yield (
             f"of constraint {name!r} {count} of the rows follow from those before: the motion is unique, λ is the one of least norm; "
-            "leave the rows out where each reaction matters"
+            "leave these rows out where each reaction matters"
         )
     tolerance = float(jnp.finfo(dtype).eps) ** 0.5
     for what, off in (("position", numbers["off_position"]), ("velocity", numbers["off_velocity"])):
         for name, value in off.items():
             if value > tolerance:
-                yield f"the {what} is off constraint {name!r} by {value:.2g}: `consistent_state` puts it right, `simulate` does by itself"
+                yield f"the {what} is off constraint {name!r} by {value:.2g}: `consistent_state` corrects it, `simulate` does so by itself"
     for name, least in numbers["dissipated"].items():
         if least < 0:
             yield (
-                f"dissipation {name!r} feeds energy in near this state (q̇·∂D/∂q̇ = {least:.2g}): "
-                "right for wind or a moving belt, else look at its sign"
+                f"dissipation {name!r} adds energy near this state (q̇·∂D/∂q̇ = {least:.2g}): "
+                "right for wind or a moving belt, otherwise check its sign"
             )
     fastest, slowest = numbers["time_constants"]
     if np.isfinite(slowest) and slowest > 1e4 * fastest:
-        yield f"the motion is stiff (time constants from {fastest:.2g} to {slowest:.2g}): take `solver=diffrax.Kvaerno5()`"
+        yield f"the motion is stiff (time constants from {fastest:.2g} to {slowest:.2g}): use `solver=diffrax.Kvaerno5()`"
     if jnp.finfo(dtype).bits < 64:
-        yield 'single precision: `jax.config.update("jax_enable_x64", True)` gives twice the digits'
+        yield 'single precision: `jax.config.update("jax_enable_x64", True)` gives twice as many digits'
 
 
 def _measure(flat: Flat, t, q, v):
-    """All that needs derivatives, in one compiled program."""
+    """Everything that needs derivatives, in one compiled program."""
     _, G, _ = constraint_rows(flat, t, q, v)
-    mode = settled(flat, t, q, v)
+    mode = in_current_mode(flat, t, q, v)
     beside = jnp.linspace(-0.1, 0.1, q.size, dtype=q.dtype)
     around = jnp.stack([jnp.zeros_like(beside), beside, -beside[::-1]])
     multipliers, defects = jax.vmap(lambda near: _defects(mode, t, q + near, v + near))(around)
@@ -215,7 +220,7 @@ def _measure(flat: Flat, t, q, v):
         "M": inertia(flat, t, q, v)[0].as_matrix(),
         "G": G,
         "A": jax.jacfwd(rates)(jnp.concatenate([q, v])),
-        "bends": bends(flat, t, q, v),
+        "not_affine_in": not_affine_in(flat, t, q, v),
         "rows": {name: jnp.asarray(rows) for name, rows in split.items()},
         "position": {name: g[split[name]] for name in flat.holonomic_names},
         "velocity": {name: psi[rows] for name, rows in split.items()},
@@ -226,9 +231,9 @@ def _measure(flat: Flat, t, q, v):
 
 
 def _defects(mode, t, q, v):
-    """λ; and how far q̈ and λ, by the program as it is rewritten, are from the equations as JAX alone differentiates them.
+    """λ; and how far q̈ and λ, computed by the rewritten program, are from the equations as JAX alone differentiates them.
 
-    Of M q̈ − f − Gᵀλ and of G q̈ + γ: what is left, and beside it the largest term; zeros where inertia is missing.
+    Of M q̈ − f − Gᵀλ and of G q̈ + γ: what is left, and with the largest term; zeros where inertia is missing.
     """
     qddot, multipliers, sound = scalarised(lambda t, q, v: constrained_acceleration(mode, t, q, v))(t, q, v)
     one, L, psi = jnp.ones_like(t), mode.lagrangian, lambda t, q, v: velocity_residual(mode, t, q, v)
@@ -249,7 +254,7 @@ def _redundant_rows(G, rows, eps):
     redundant, before = {}, np.zeros((0, G.shape[1]))
     for name, indices in rows.items():
         of_name = np.concatenate([before, G[indices]])
-        dependent = len(indices) - (allowed(before, eps).shape[1] - allowed(of_name, eps).shape[1])
+        dependent = len(indices) - (tangent_basis(before, eps).shape[1] - tangent_basis(of_name, eps).shape[1])
         if dependent:
             redundant[name] = dependent
         before = of_name
@@ -257,7 +262,7 @@ def _redundant_rows(G, rows, eps):
 
 
 def _time_constants(found, N):
-    """Of the motion linearised on what the constraints allow: 1/|λ| of the nonzero eigenvalues, the fastest and the slowest."""
+    """1/|λ| of the nonzero eigenvalues of the motion linearised on the constraints, the fastest and the slowest."""
     n = N.shape[0]
     A = found["A"]
     reduced = np.block([[np.zeros((N.shape[1],) * 2), np.eye(N.shape[1])], [N.T @ A[n:, :n] @ N, N.T @ A[n:, n:] @ N]])

@@ -11,7 +11,8 @@ import jax.numpy as jnp
 import lineax as lx
 from jaxtyping import Array, Float, PyTree
 
-from .._model.system import Flat, System
+from .._model.flat import Flat
+from .._model.system import System
 from .._model.validation import at_state
 from .._program.sparse_jacobian import jacobian
 

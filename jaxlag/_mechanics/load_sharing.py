@@ -1,11 +1,11 @@
-"""How elements of friction that stick share a load that they hold together, as the legs of a plate do.
+"""How sticking friction elements share a load that they hold together, as the legs of a plate do.
 
 Of all multipliers with the same effect, those that use the most loaded element least:
 
     min ρ   such that  ‖μ_i‖ ≤ ρ F_i,   μ = μ₀ + N z,   N a basis of {μ : Jᵀμ = 0}
 
-ρ < 1 while some share is possible. At ρ = 1 none is any more, and the forces are along slips that go together: the limit theorem of
-plasticity. Solved by a barrier, along whose path the slips go together already.
+ρ < 1 while some share is possible. At ρ = 1 none is any more, and the forces are along compatible slips: the limit theorem of
+plasticity. Solved by a barrier method, along whose path the slips are compatible already.
 Source: Moreau, Application of convex analysis to some problems of dry friction (1979); Boyd & Vandenberghe, Convex Optimization, ch. 11.
 """
 
@@ -16,8 +16,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from .friction_terms import Kinks
-from .saddle_point import everywhere
+from .friction_elements import FrictionElements
+from .pseudo_inverse import everywhere
 
 STEPS = 4  # of Newton's method, each time that the barrier is made four times as steep
 
@@ -30,23 +30,23 @@ class Share(NamedTuple):
 
 
 def shared(
-    kinks: Kinks, J: Float[Array, "r n"], multipliers: Float[Array, " r"], bound: Float[Array, " e"], stuck: Bool[Array, " e"]
+    elements: FrictionElements, J: Float[Array, "r n"], multipliers: Float[Array, " r"], bound: Float[Array, " e"], stuck: Bool[Array, " e"]
 ) -> Share:
     """The best share of those `stuck`, and how much of its bound each has left. The share itself is not differentiated, its ρ is."""
-    of, eps, fixed = kinks.element_of_row, jnp.finfo(bound.dtype).eps, jax.lax.stop_gradient
+    of, eps, fixed = elements.element_of_row, jnp.finfo(bound.dtype).eps, jax.lax.stop_gradient
     largest = jnp.max(jnp.where(stuck, bound, 0), initial=0)
     scale = jnp.where(stuck & (largest > 0), jnp.maximum(bound, eps * largest), 1)
     basis, free = _without_effect(fixed(J), stuck[of])
     N, given = basis / fixed(scale)[of][:, None], fixed(jnp.where(stuck[of], multipliers, 0) / scale[of])
 
     def best():
-        z, weight = _centre(kinks, given, N, free, stuck)
+        z, weight = _centre(elements, given, N, free, stuck)
         return fixed(scale)[of] * (N @ z), weight
 
     none = lambda: (jnp.zeros_like(given), jnp.zeros_like(scale))
     change, weight = jax.lax.cond(everywhere(~jnp.any(free)), none, best)
     multipliers = multipliers + fixed(change)
-    use = kinks.norms(multipliers)
+    use = elements.norms(multipliers)
     alone, together = bound - use, bound * (1 - weight @ (use / scale))
     left = jnp.where(weight > 1e-3, together, alone)
     return Share(multipliers, fixed(alone) + left - fixed(left))
@@ -62,13 +62,13 @@ def _without_effect(J, stuck):
     return jnp.where(free[None, :], U / jnp.where(length > 0, length, 1)[:, None], 0), free
 
 
-def _centre(kinks, given, N, free, stuck):
+def _centre(elements, given, N, free, stuck):
     """z of the least ρ with ‖u_i‖ ≤ ρ, u = given + N z; and the weight of each element in it, the derivative of ρ by ‖u_i‖.
 
     The minimum of t ρ − Σ log(ρ² − ‖u_i‖²) for an ever larger t, by Newton's method with steps that keep within.
     """
-    of, sums = kinks.element_of_row, kinks.sums
-    mine = of[:, None] == np.arange(kinks.elements)[None, :]
+    of, sums = elements.element_of_row, elements.sums
+    mine = of[:, None] == np.arange(elements.size)[None, :]
 
     def newton(k, state):
         z, rho = state

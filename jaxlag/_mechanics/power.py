@@ -6,11 +6,12 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PyTree
 
-from .._model.system import EXPLICIT_TIME, Flat, System, rows_by_name
+from .._model.flat import Flat, rows_by_name
+from .._model.system import EXPLICIT_TIME, System
 from .._model.validation import at_state
 from .lagrange import constraint_rows
 from .saddle_point import constrained_acceleration
-from .stick_slip import settled
+from .stick_slip import in_current_mode
 
 
 def powers(system: System, q: PyTree, qdot: PyTree, params: PyTree = None, *, t: Any = 0.0) -> dict[str, Float[Array, ""]]:
@@ -19,10 +20,12 @@ def powers(system: System, q: PyTree, qdot: PyTree, params: PyTree = None, *, t:
     $$ \frac{dh}{dt} = -\sum_D \dot q\cdot\frac{\partial D}{\partial\dot q} + \sum_Q Q\cdot\dot q
        + \sum_\lambda \dot q\cdot G^T\lambda - \frac{\partial L}{\partial t}, \qquad h = \dot q\cdot\frac{\partial L}{\partial\dot q} - L $$
 
-    A constraint at rest does no work; a moving one does −λ ∂g/∂t (it pushes along +∇g where λ > 0). The last term, energy that explicit
-    time in L brings in, goes by the name `"time"`.
+    A constraint at rest does no work; a moving one does −λ ∂g/∂t (it pushes along +∇g where λ > 0). The last term, energy supplied by
+    explicit time in L, has the name `"time"`.
 
-    **Arguments, raises:** as `acceleration`. **Returns:** a dict of numbers: dissipation terms, forces, constraints, `"time"`.
+    **Arguments, raises:** as `acceleration`. Any consistent units.
+
+    **Returns:** a dict of scalars: dissipation terms, forces, constraints, `"time"`.
 
     **Source:** Goldstein, Classical Mechanics, 3rd ed., eqs. 2.52 to 2.58; Lurie, Analytical Mechanics, section 7.6.
 
@@ -36,7 +39,7 @@ def powers(system: System, q: PyTree, qdot: PyTree, params: PyTree = None, *, t:
 
 
 def _powers(flat, t, q, v):
-    return powers_of(settled(flat, t, q, v), t, q, v)
+    return powers_of(in_current_mode(flat, t, q, v), t, q, v)
 
 
 def powers_of(flat: Flat, t, q, v) -> dict[str, Float[Array, ""]]:
@@ -44,15 +47,15 @@ def powers_of(flat: Flat, t, q, v) -> dict[str, Float[Array, ""]]:
     _, multipliers, _ = constrained_acceleration(flat, t, q, v)
     _, G, _ = constraint_rows(flat, t, q, v)
     does = lambda rows: multipliers[rows] @ (G[rows] @ v)
-    stuck = {name: does(rows) for name, rows in flat.held.items()}  # friction that holds on to something that moves
+    stuck = {name: does(rows) for name, rows in flat.held.items()}  # friction that sticks to something that moves
     damped = {name: stuck.get(name, 0) - v @ jax.grad(D, argnums=2)(t, q, v, multipliers) for name, D in flat.dissipations.items()}
     forced = {name: v @ Q(t, q, v, multipliers) for name, Q in flat.forces.items()}
     held = {name: does(rows) for name, rows in rows_by_name(flat).items()}
     return damped | forced | held | {EXPLICIT_TIME: -jax.grad(flat.lagrangian, argnums=0)(t, q, v)}
 
 
-def energy_turnover(flat: Flat, t, q, v) -> tuple[Float[Array, ""], Float[Array, ""]]:
-    """The energy h = q̇·p − L, and q̇·p, twice the kinetic energy where T is quadratic: a scale for what is turned over."""
+def energy_exchange(flat: Flat, t, q, v) -> tuple[Float[Array, ""], Float[Array, ""]]:
+    """The energy h = q̇·p − L, and q̇·p, twice the kinetic energy where T is quadratic: a scale for the energy exchanged."""
     L, p = jax.value_and_grad(flat.lagrangian, argnums=2)(t, q, v)
     return v @ p - L, v @ p
 

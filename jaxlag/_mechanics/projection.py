@@ -1,7 +1,7 @@
-"""How the constraints are kept: projection of positions and velocities, or feedback, or nothing."""
+"""Stabilisation of the constraints: projection of positions and velocities, feedback, or nothing."""
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -10,14 +10,15 @@ import lineax as lx
 import numpy as np
 from jaxtyping import Array, Bool, Float, PyTree
 
+from .._model.flat import Flat
 from .._model.numbers import count, number
-from .._model.system import Flat, System
+from .._model.system import System
 from .._model.validation import at_state, coordinates
 from .._program.jit import is_concrete
 from .._program.sparse_jacobian import jacobian
 from .lagrange import constraint_rows, inertia, position_residual, velocity_residual
 from .saddle_point import NO_INERTIA, Near, augmented, is_determined, saddle_point
-from .singular_directions import NOT_AFFINE, UNDEFINED, because, bends
+from .singular_directions import NOT_AFFINE, UNDEFINED, explained, not_affine_in
 
 
 @dataclasses.dataclass(frozen=True)
@@ -25,9 +26,11 @@ class Projection:
     """Puts positions and velocities back on the constraints after each step, and at each sample.
 
     Newton's steps of  min ½ δqᵀM δq  with  g(t, q + δq) = 0,  then  min ½ δvᵀM δv  with  ψ(t, q, v + δv) = 0:
-    the nearest state in the metric of M, so that nothing moves that need not.
+    the nearest state in the metric of M, so that nothing moves without need.
 
     **Arguments:** `iterations`: Newton steps for the position, each of which squares the residual.
+
+    **Raises:** `TypeError` or `ValueError` where `iterations` is not a whole number of 1 or more.
 
     **Source:** Hairer, Lubich & Wanner, Geometric Numerical Integration, section IV.4; Eich, SIAM J. Numer. Anal. 30 (1993).
 
@@ -40,35 +43,36 @@ class Projection:
     iterations: int = 2
 
     def __post_init__(self):
-        count(self.iterations, "`iterations`", cure="Two suffice nearly always.")
+        count(self.iterations, "`iterations`", cure="Two nearly always suffice.")
 
-    def feedback(self):
-        """None: the accelerations stay as they are."""
-        return None
+    def projection(self) -> "Projection":
+        """Itself: states are put back on the constraints."""
+        return self
+
+    def feedback(self) -> None:
+        """None: the accelerations remain unchanged."""
 
     def project(self, flat: Flat, t, q, v):
         """The state on the constraints that is nearest to this one, which is near already."""
-        M = inertia(flat, t, q, v)[0]  # at the start serves throughout: what is put right is small
+        M = inertia(flat, t, q, v)[0]  # at the start serves throughout: corrections are small
         if flat.holonomic_names:
             metric = _metric_of_positions(flat, M, t, q, v)
             for _ in range(self.iterations):
                 g, G = position_residual(flat, t, q)
                 q = q + saddle_point(metric, G, jnp.zeros_like(q), -g, Near(q)).x
         psi, G, _ = constraint_rows(flat, t, q, v)
-        return q, _put_right(v, saddle_point(M, G, jnp.zeros_like(v), -psi, Near(v)).x)
+        return q, _corrected(v, saddle_point(M, G, jnp.zeros_like(v), -psi, Near(v)).x)
 
 
-def _put_right(v, dv):
-    """v + dv, and zero where that is rounding alone: what comes to rest is at rest."""
+def _corrected(v, dv):
+    """v + dv, and zero where that is only rounding: what comes to rest is at rest."""
     left = v + dv
     nothing = jnp.abs(left) <= 4 * jnp.finfo(v.dtype).eps * jnp.abs(v)
     return jnp.where(nothing, left - jax.lax.stop_gradient(left), left)
 
 
 def _metric_of_positions(flat, M, t, q, v):
-    """M; and where velocities are constrained beyond it, what these forbid weighs too, for they may be all that holds a coordinate
-    without inertia.
-    """
+    """M, with a weight on what nonholonomic constraints forbid: they may be all that holds a coordinate without inertia."""
     psi, G = jacobian(lambda v: flat.nonholonomic(t, q, v), v)
     return lx.MatrixLinearOperator(augmented(M.as_matrix(), G.as_matrix())[0]) if psi.size else M
 
@@ -78,6 +82,8 @@ class Baumgarte:
     """Feeds the residuals back into the accelerations:  ψ̇ + 2α ψ + β² g = 0  (ψ̇ + 2α a = 0 for nonholonomic a).
 
     **Arguments:** `alpha`, `beta`: in 1/time; α = β is critical damping. Large values make the equations stiff.
+
+    **Raises:** `TypeError` or `ValueError` where one of them is not a number of 0 or more.
 
     **Source:** Baumgarte, Comput. Methods Appl. Mech. Eng. 1 (1972) 1-16.
 
@@ -92,10 +98,13 @@ class Baumgarte:
 
     def __post_init__(self):
         for name in ("alpha", "beta"):
-            gain = number(getattr(self, name), f"`{name}`", least=0.0, cure="Take some tenths of 1/(time of a step).")
+            gain = number(getattr(self, name), f"`{name}`", least=0.0, cure="Use some tenths of 1/(time of a step).")
             object.__setattr__(self, name, float(gain))
 
-    def feedback(self):
+    def projection(self) -> None:
+        """None: states are not projected."""
+
+    def feedback(self) -> Callable:
         """2α ψ + β² g, added to γ."""
 
         def residual(flat, t, q, v):
@@ -107,7 +116,7 @@ class Baumgarte:
 
 @dataclasses.dataclass(frozen=True)
 class NoStabilisation:
-    """Leaves the constraints to the accelerations, G q̈ = −γ: the residual grows with time, as does what it spoils.
+    """Enforces the constraints on the accelerations alone, G q̈ = −γ: the residual grows with time, and so does the error it causes.
 
     ```python
     import jaxlag as jl
@@ -115,17 +124,19 @@ class NoStabilisation:
     ```
     """
 
-    def feedback(self):
-        """None: the accelerations stay as they are."""
-        return None
+    def projection(self) -> None:
+        """None: states are not projected."""
+
+    def feedback(self) -> None:
+        """None: the accelerations remain unchanged."""
 
 
-NEWTON_STEPS = 16  # a fixed number is one loop to compile; near the constraints four do
+CONSISTENCY_ITERATIONS = 16  # a fixed number is one loop to compile; near the constraints four suffice
 
 
 class Consistent(NamedTuple):
     """A state on the constraints; `reached` is false where the iteration found none, `determined` where inertia is missing, `affine`
-    where a nonholonomic constraint is not so in q̇, `defined` where M or a constraint gives no finite numbers at the state given.
+    where a nonholonomic constraint is not affine in q̇, `defined` where M or a constraint is not finite at the state given.
     """
 
     q: Float[Array, " n"]
@@ -148,7 +159,7 @@ def nearest_state(flat: Flat, t, q0, v0, free: Sequence[int] | None = None) -> C
     tolerance = jnp.finfo(q0.dtype).eps ** 0.5
     given = jnp.concatenate([flat.holonomic(t, q0), velocity_residual(flat, t, q0, v0)])
     positions = flat.holonomic(t, q0).size
-    if given.size == 0:  # nothing to satisfy: spares the compilation of the search
+    if given.size == 0:  # nothing to satisfy: saves the compilation of the search
         yes = jnp.array(True)
         return Consistent(q0, v0, yes, is_determined(M, jnp.zeros((0, moving.size), M.dtype)), yes, jnp.all(jnp.isfinite(M)))
 
@@ -163,10 +174,10 @@ def nearest_state(flat: Flat, t, q0, v0, free: Sequence[int] | None = None) -> C
 
     q = q0
     if positions:
-        if given.size > 2 * positions:  # velocities beside may be all that holds a coordinate
+        if given.size > 2 * positions:  # velocity constraints may be all that holds a coordinate
             held = is_determined(M, position_residual(flat, t, q0)[1][:, moving])
             M = jnp.where(held, M, _metric_of_positions(flat, full, t, q0, v0).as_matrix()[both])
-        (q, _), _ = jax.lax.scan(newton, (q0, jnp.zeros(positions, q0.dtype)), length=NEWTON_STEPS)
+        (q, _), _ = jax.lax.scan(newton, (q0, jnp.zeros(positions, q0.dtype)), length=CONSISTENCY_ITERATIONS)
 
     psi, G, _ = constraint_rows(flat, t, q, v0)
     M = inertia(flat, t, q, v0)[0].as_matrix()[both]
@@ -176,7 +187,7 @@ def nearest_state(flat: Flat, t, q0, v0, free: Sequence[int] | None = None) -> C
     off = jnp.maximum(_off(*position_residual(flat, t, q), q), _off(velocity_residual(flat, t, q, v), G, v))
     reached = (off < tolerance) & jnp.all(jnp.isfinite(q))
     defined = jnp.all(jnp.isfinite(given)) & jnp.all(jnp.isfinite(M))
-    return Consistent(q, v, reached, nearest.sound.determined, ~jnp.any(bends(flat, t, q0, v0)), defined)
+    return Consistent(q, v, reached, nearest.sound.determined, ~jnp.any(not_affine_in(flat, t, q0, v0)), defined)
 
 
 def off_constraints(flat: Flat, t, q, v) -> Float[Array, ""]:
@@ -186,7 +197,7 @@ def off_constraints(flat: Flat, t, q, v) -> Float[Array, ""]:
 
 
 def _off(residual, rows, x):
-    """Largest residual, measured in the units of its row: what rounding makes of it is some eps."""
+    """Largest residual, in the units of its row: rounding makes some eps of it."""
     size = jnp.sum(jnp.abs(rows), axis=1) * (1 + jnp.max(jnp.abs(x)))
     return jnp.max(jnp.abs(residual) / jnp.where(size > 0, size, 1), initial=0.0)
 
@@ -194,7 +205,7 @@ def _off(residual, rows, x):
 def consistent_state(
     system: System, q: PyTree, qdot: PyTree, params: PyTree = None, *, t: Any = 0.0, fixed: Sequence[Any] = ()
 ) -> tuple[PyTree, PyTree]:
-    r"""State on the constraints that is nearest to the one given, in the metric of M.
+    r"""The state on the constraints that is nearest to the given one, in the metric of M.
 
     $$ \min \tfrac12 (q - q_0)^T M (q - q_0) \text{ with } g(t, q) = 0, \qquad
        \min \tfrac12 (\dot q - \dot q_0)^T M (\dot q - \dot q_0) \text{ with } \dot g = 0,\ a = 0 $$
@@ -221,7 +232,7 @@ def consistent_state(
     if is_concrete(reached):
         for passed, reason in ((defined, UNDEFINED), (determined, NO_INERTIA), (affine, NOT_AFFINE), (reached, IMPOSSIBLE)):
             if not passed:
-                raise ValueError(because(reason, system, q, qdot, params, t))
+                raise ValueError(explained(reason, system, q, qdot, params, t))
     return new_q, new_qdot
 
 
@@ -233,7 +244,7 @@ IMPOSSIBLE = (
 
 @dataclasses.dataclass(frozen=True)
 class _StateOn:
-    """`nearest_state` with some coordinates held; compared by them, so that it compiles once."""
+    """`nearest_state` with some coordinates fixed; compared by these, so that it is compiled once."""
 
     held: tuple[int, ...]
 

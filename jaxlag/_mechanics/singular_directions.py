@@ -1,4 +1,4 @@
-"""Which coordinate it is that a system cannot be solved for: what a failure says of the state that brought it about."""
+"""Directions for which a system cannot be solved, and how a failure names the coordinates concerned."""
 
 from typing import Any
 
@@ -8,26 +8,27 @@ import numpy as np
 from jax.interpreters import partial_eval as pe
 from jaxtyping import Array, Bool, PyTree
 
+from .._model.flat import Flat
 from .._model.paths import entry_names
-from .._model.system import Flat, System
+from .._model.system import System
 from .._model.validation import at_state, coordinates
 from .._program.jit import is_concrete
 from .lagrange import constraint_rows, inertia
 from .saddle_point import NO_INERTIA
 
 UNDEFINED = (
-    "the functions of the system must give finite numbers, but one gives a NaN or an infinity there. Look for what is not defined, as the "
-    "root of a negative number or 0/0, for missing values, and for a motion that grows beyond all bounds."
+    "the functions of the system must return finite numbers, but one returns a NaN or an infinity there. Look for what is undefined, such "
+    "as the root of a negative number or 0/0, for missing values, and for a motion that grows without bounds."
 )
 NOT_AFFINE = (
-    "`nonholonomic` must be affine in qdot, but one is not. Write it as a sum of velocities with factors of t and q: its derivative "
-    "with respect to time, or a root of it."
+    "`nonholonomic` must be affine in qdot, but one is not. Write it as a sum of velocities with coefficients that depend on t and q: its "
+    "derivative with respect to time, or a root of it."
 )
 
 
-def because(reason: str, system: System, q: PyTree, qdot: PyTree, params: PyTree, t: Any) -> str:
-    """The reason, and the coordinates it is about, where there are any and the numbers are at hand; or that there are no numbers."""
-    about = {NO_INERTIA: _unheld, NOT_AFFINE: _bent}.get(reason)
+def explained(reason: str, system: System, q: PyTree, qdot: PyTree, params: PyTree, t: Any) -> str:
+    """The reason, and the coordinates concerned, where there are any and the numbers are known; or that numbers are undefined."""
+    about = {NO_INERTIA: _without_inertia, NOT_AFFINE: _nonaffine}.get(reason)
     if about is None or not is_concrete(q, qdot, params, t):
         return reason
     found = jax.tree.map(np.asarray, at_state(_matrices, system, q, qdot, params, t))
@@ -35,12 +36,12 @@ def because(reason: str, system: System, q: PyTree, qdot: PyTree, params: PyTree
         return UNDEFINED
     names = entry_names(coordinates(q, "q"), "q")
     listed = [repr(names[i]) for i in about(found)]
-    says = {NO_INERTIA: "What has none here and is not held: ", NOT_AFFINE: "The velocity of it that is not: "}[reason]
+    says = {NO_INERTIA: "Without inertia and unconstrained here: ", NOT_AFFINE: "It is not affine in the velocity of: "}[reason]
     return f"{reason} {says}{', '.join(listed)}." if listed else reason
 
 
-def allowed(G: np.ndarray, eps: float) -> np.ndarray:
-    """Columns that span the motions the constraints allow, with rows of G scaled to unit length."""
+def tangent_basis(G: np.ndarray, eps: float) -> np.ndarray:
+    """A basis of the motions that the constraints allow, as columns: the null space of G, its rows scaled to unit length."""
     size = np.linalg.norm(G, axis=1, keepdims=True)
     if not G.shape[0]:
         return np.eye(G.shape[1])
@@ -48,51 +49,55 @@ def allowed(G: np.ndarray, eps: float) -> np.ndarray:
     return Vt[int(np.sum(s > eps**0.3125 * max(s[0], eps))) :].T
 
 
-def weightless(M: np.ndarray, G: np.ndarray) -> list[int]:
-    """Coordinates that move in a direction which G allows and M gives no inertia."""
+def massless_coordinates(M: np.ndarray, G: np.ndarray) -> list[int]:
+    """Coordinates that take part in a direction that G allows and to which M gives no inertia."""
     eps = float(np.finfo(M.dtype).eps)
-    N = allowed(G, eps)
+    N = tangent_basis(G, eps)
     if not N.size:
         return []
-    inertias, ways = np.linalg.eigh(N.T @ M @ N)
-    free = np.abs(N @ ways[:, inertias <= 100 * len(M) * eps * np.max(np.abs(M), initial=0.0)])
+    inertias, directions = np.linalg.eigh(N.T @ M @ N)
+    free = np.abs(N @ directions[:, inertias <= 100 * len(M) * eps * np.max(np.abs(M), initial=0.0)])
     return [i for i, moves in enumerate(free) if np.any(moves > 1e-6)]
 
 
 def is_defined(found: dict) -> bool:
-    """Whether M, G and, where they are there, the residuals of the constraints are finite."""
+    """Whether M, G and, where present, the residuals of the constraints are finite."""
     named = [found["M"], found["G"], *found.get("position", {}).values(), *found.get("velocity", {}).values()]
     return all(np.all(np.isfinite(x)) for x in named)
 
 
-def _unheld(found):
-    return weightless(found["M"], found["G"])
+def _without_inertia(found):
+    return massless_coordinates(found["M"], found["G"])
 
 
-def _bent(found):
-    return np.flatnonzero(found["bends"])
+def _nonaffine(found):
+    return np.flatnonzero(found["not_affine_in"])
 
 
 def _matrices(flat: Flat, t, q, v):
-    return {"M": inertia(flat, t, q, v)[0].as_matrix(), "G": constraint_rows(flat, t, q, v)[1], "bends": bends(flat, t, q, v)}
+    return {
+        "M": inertia(flat, t, q, v)[0].as_matrix(),
+        "G": constraint_rows(flat, t, q, v)[1],
+        "not_affine_in": not_affine_in(flat, t, q, v),
+    }
 
 
-def bends(flat: Flat, t, q, v) -> Bool[Array, " n"]:
-    """In which velocities a nonholonomic constraint is not affine: at two of them, its ∂a/∂q̇ must be the same.
+def not_affine_in(flat: Flat, t, q, v) -> Bool[Array, " n"]:
+    """In which velocities a nonholonomic constraint is not affine: ∂a/∂q̇ must be the same at two of them.
 
-    Costs nothing where the program of ∂a/∂q̇ does not ask for q̇, as it does not of what is written as sums and products.
+    Costs nothing where the program of ∂a/∂q̇ does not use q̇, as where a is written in sums and products.
     """
     slope = jax.jacfwd(flat.nonholonomic, argnums=2)
     t, q, v = jax.lax.stop_gradient((t, q, v))
-    if flat.nonholonomic(t, q, v).size == 0 or not _asks_for_velocity(slope, t, q, v):
+    if flat.nonholonomic(t, q, v).size == 0 or not _uses_velocity(slope, t, q, v):
         return jnp.zeros(v.size, bool)
     here, there = slope(t, q, v), slope(t, q, v + (1 + jnp.abs(v)) * (1 + np.arange(v.size, dtype=v.dtype) / v.size))
     uneven = jnp.abs(here - there) > jnp.finfo(v.dtype).eps ** 0.5 * jnp.max(jnp.abs(here) + jnp.abs(there))
     return jnp.any(uneven, axis=0)
 
 
-def _asks_for_velocity(function, t, q, v) -> bool:
-    """Whether v has a part in any operation of the program of a function of (t, q, v)."""
+def _uses_velocity(function, t, q, v) -> bool:
+    """Whether any operation of the program of a function of (t, q, v) uses v."""
     closed = jax.make_jaxpr(function)(t, q, v)
     _, used = pe.dce_jaxpr(closed.jaxpr, [True] * len(closed.jaxpr.outvars))
     return used[2]

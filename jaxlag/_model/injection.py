@@ -1,4 +1,4 @@
-"""The one rule for functions: a function receives exactly the arguments it names, and what it returns becomes floating arrays."""
+"""Arguments by name: a user's function receives exactly the arguments it names, and what it returns becomes floating arrays."""
 
 import difflib
 import inspect
@@ -9,13 +9,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from .user_errors import told_by_line
+from .user_errors import explain_tracing_errors
 
 STATE_NAMES = ("t", "q", "qdot", "qddot", "multipliers", "params")
 
 
-def parameters(function: Callable) -> tuple[inspect.Parameter, ...]:
-    """The parameters a user's function declares; variadic ones are refused, for they name nothing."""
+def declared_parameters(function: Callable) -> tuple[inspect.Parameter, ...]:
+    """The parameters that a user's function declares; variadic ones are refused, because they name nothing."""
     try:
         declared = tuple(inspect.signature(function).parameters.values())
     except (TypeError, ValueError):
@@ -27,52 +27,52 @@ def parameters(function: Callable) -> tuple[inspect.Parameter, ...]:
         if p.kind in (p.VAR_POSITIONAL, p.VAR_KEYWORD):
             raise TypeError(
                 f"a function must name each of its arguments, but {function!r} takes `{p}`. "
-                "Name them, or keep the signature of a wrapped function by `functools.wraps`."
+                "Name them, or keep the signature of a wrapped function with `functools.wraps`."
             )
     return declared
 
 
-def check_function(function: Any, spoken: str) -> None:
-    """Refuses what cannot be called, and what compiled programs could not be told apart by."""
+def check_function(function: Any, label: str) -> None:
+    """Refuses what cannot be called or hashed: compiled programs are found again by the hash of their functions."""
     if not callable(function):
-        raise TypeError(f"{spoken} must be a function, but is {function!r}. Hand over the function itself, not its value.")
+        raise TypeError(f"{label} must be a function, but is {function!r}. Pass the function itself, not its value.")
     try:
         hash(function)
     except TypeError:
         kind = type(function).__name__
-        cure = "Put its arrays into params and let the function name them."
+        cure = "Put its arrays into params and let the function name them as arguments."
         if type(function).__hash__ is None:
             cure = "Make it immutable, `@dataclass(frozen=True)`, or a plain function, and put what changes into params."
-        raise TypeError(f"{spoken} must be a hashable function, but is a {kind} that cannot be hashed. {cure}") from None
+        raise TypeError(f"{label} must be a hashable function, but is a {kind} that cannot be hashed. {cure}") from None
 
 
-def names(function: Callable, name: str) -> bool:
+def asks_for(function: Callable, name: str) -> bool:
     """Whether a user's function asks for the argument `name`."""
-    return any(p.name == name for p in parameters(function))
+    return any(p.name == name for p in declared_parameters(function))
 
 
 def call(function: Callable, role: str, params: Any, /, **state: Any) -> Any:
-    """Calls `function` with exactly the arguments it names, out of the state, `params` and the entries of `params`.
+    """Calls `function` with exactly the arguments it names, taken from the state, `params` and the entries of `params`.
 
-    `role` is how messages speak of the function, e.g. "`dissipation` 'dampers'". What it returns becomes floating arrays here.
+    `role` names the function in messages, e.g. "`dissipation` 'dampers'". What it returns becomes floating arrays.
     """
     entries = params if isinstance(params, Mapping) else {}
     available = {**entries, **state, "params": params}
     positional, keywords = [], {}
-    for p in parameters(function):
+    for p in declared_parameters(function):
         if p.name not in available and p.default is p.empty:
             raise TypeError(_unknown(role, p.name, state, params))
-        if p.kind is p.POSITIONAL_ONLY:  # one left out would leave its place to the next
+        if p.kind is p.POSITIONAL_ONLY:  # one left out would shift the next into its place
             positional.append(available.get(p.name, p.default))
         elif p.name in available:
             keywords[p.name] = available[p.name]
-    with told_by_line(role):
+    with explain_tracing_errors(role):
         returned = function(*positional, **keywords)
     return floating(returned, role, jnp.result_type(float, *filter(_is_floating, jax.tree.leaves(state))))
 
 
 def floating(returned: Any, role: str, dtype: Any) -> Any:
-    """What a function returned, with plain numbers and integers as floating arrays; plain ones stay where Python can read them."""
+    """What a function returned, as floating arrays: plain numbers as NumPy arrays, whose values Python can still read."""
 
     def leaf(path, x):
         if isinstance(x, (int, float, np.generic, np.ndarray)) and np.asarray(x).dtype.kind in "iuf" and not isinstance(x, bool):
@@ -81,14 +81,14 @@ def floating(returned: Any, role: str, dtype: Any) -> Any:
             return x.astype(dtype)
         if not _is_floating(x):
             at = f" at {jax.tree_util.keystr(path)}" if path else ""
-            raise TypeError(f"{role} must return real numbers, but returned {told(x)}{at}. Return numbers or arrays of them.")
+            raise TypeError(f"{role} must return real numbers, but returned {described(x)}{at}. Return numbers or arrays of them.")
         return x
 
     return jax.tree_util.tree_map_with_path(leaf, returned, is_leaf=lambda node: node is None)
 
 
-def told(x: Any) -> str:
-    """How messages speak of what a function returned."""
+def described(x: Any) -> str:
+    """What a function returned, in words for messages."""
     if isinstance(x, np.ndarray) and x.shape == ():
         return f"the number {x:g}"
     if isinstance(x, (jax.Array, np.ndarray, jax.ShapeDtypeStruct)):
@@ -101,20 +101,20 @@ def _is_floating(x: Any) -> bool:
 
 
 def check_entries(params: Any) -> None:
-    """Refuses entries of `params` that a name of the state would hide."""
+    """Refuses entries of `params` that the name of a state variable would hide."""
     if isinstance(params, Mapping):
         for hidden in set(params) & set(STATE_NAMES):
             raise ValueError(
-                f"`params` must not have an entry named {hidden!r}, but it has; that name stands for the state. Rename the entry."
+                f"`params` must not have an entry named {hidden!r}, but has one; that name stands for the state. Rename the entry."
             )
 
 
 def missing(role: str, key: Any, q: Any, params: Any) -> str:
-    """What to say where a function asks for an entry of q or params that is not there."""
+    """The message for a function that asks for an entry missing from q and params."""
     entries = {"q": q, "params": params}
     there = {name: sorted(map(str, tree)) for name, tree in entries.items() if isinstance(tree, Mapping)}
     close = difflib.get_close_matches(str(key), [entry for keys in there.values() for entry in keys], n=1)
-    cure = f"Did you mean {close[0]!r}?" if close else f"Add {key!r} where it belongs."
+    cure = f"Did you mean {close[0]!r}?" if close else f"Add {key!r} to q or params."
     have = "; ".join(f"{name} has {', '.join(keys) or 'none'}" for name, keys in there.items())
     return f"{role} must ask for entries that exist, but asks for {key!r}. {have}. {cure}"
 

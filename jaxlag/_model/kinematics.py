@@ -1,4 +1,4 @@
-"""Kinematics: velocities and generalized forces of points and angles, from their position maps alone; new coordinates."""
+"""Kinematics: velocities and generalized forces of points and angles, from their position maps alone; changes of coordinates."""
 
 import dataclasses
 import inspect
@@ -11,9 +11,10 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 
 from .._program.jit import is_concrete
-from .injection import call, check_function, names
+from .flat import flat_like
+from .injection import asks_for, call, check_function
 from .numbers import numbers
-from .system import System, Terms, flat_like, role
+from .system import System, Terms, role
 
 
 def rate(coordinate: Callable) -> Callable:
@@ -21,10 +22,12 @@ def rate(coordinate: Callable) -> Callable:
 
     $$ \dot x = \frac{\partial x}{\partial q}\,\dot q + \frac{\partial x}{\partial t} $$
 
-    **Arguments:** `coordinate`: the position x(t, q), a number, a vector or any pytree; it receives the arguments it names, of
+    **Arguments:** `coordinate`: the position x(t, q), a number, a vector or any pytree; it receives the arguments it names, out of
     `t`, `q`, `params` and the entries of `params`.
 
-    **Returns:** a function of `(t, q, qdot, params)`, structured like x. Any consistent units.
+    **Returns:** a function of `(t, q, qdot, params)`, whose value has the structure and shapes of x. Any consistent units.
+
+    **Raises:** `TypeError` where `coordinate` is no hashable function; when the rate is called, `TypeError` where t, q or qdot is missing.
 
     **Source:** Goldstein, Classical Mechanics, 3rd ed., eq. 1.46.
 
@@ -40,25 +43,26 @@ def rate(coordinate: Callable) -> Callable:
 
 
 def virtual_work(coordinate: Callable, effort: Any) -> Callable:
-    r"""Generalized force of a force on a point, or of a moment on an angle, to hand to `System(force=...)`.
+    r"""Generalized force of a force on a point, or of a moment on an angle, for `System(force=...)`.
 
     $$ \delta W = F \cdot \delta x, \qquad Q_j = F \cdot \frac{\partial x}{\partial q_j} $$
 
     **Arguments:**
 
     - `coordinate`: the position x(t, q) of the point, or the angle; a number, a vector or any pytree.
-    - `effort`: the force or moment that does work on x, structured like it: a number, a sequence of numbers, or a function, which
-      receives the arguments it names (`t`, `q`, `qdot`, `multipliers`, `params` and its entries).
+    - `effort`: the force or moment that does work on x, with the structure and shapes of x: a number, a sequence of numbers, or a
+      function, which receives the arguments it names, out of `t`, `q`, `qdot`, `multipliers`, `params` and the entries of `params`.
 
     **Returns:** a function for `System(force=...)`; its value is structured like q. Any consistent units.
 
-    **Raises:** `ValueError`, when first used, where the effort is not structured like the coordinate.
+    **Raises:** `TypeError` where `coordinate` or `effort` is of a wrong kind; when the force is first computed, `ValueError` where the
+    effort is not structured like the coordinate.
 
     **Source:** Goldstein, Classical Mechanics, 3rd ed., eq. 1.49.
 
     ```python
     import jaxlag as jl
-    # a wheel of radius r that rolls turns by φ = −x/r; a moment −M0 on φ drives the car by M0/r
+    # a wheel of radius r that rolls without slip turns by φ = −x/r; a moment −M0 on φ pushes the car with M0/r
     drive = jl.virtual_work(lambda q, r: -q["x"] / r, lambda M0: -M0)
     car = jl.System(lambda qdot, m: 0.5 * m * qdot["x"] ** 2, force={"drive": drive})
     jl.acceleration(car, {"x": 0.0}, {"x": 0.0}, {"m": 10.0, "r": 0.5, "M0": 20.0}).qddot["x"]  # 4.0
@@ -77,21 +81,26 @@ def substitute(system: System, coordinates: Callable) -> System:
     $$ L'(t, q, \dot q) = L(t, x, \dot x), \qquad Q' = \left(\frac{\partial x}{\partial q}\right)^T Q, \qquad
        \dot x = \frac{\partial x}{\partial q}\,\dot q + \frac{\partial x}{\partial t} $$
 
-    With fewer new coordinates than old ones this eliminates constraints: x(t, q) are the constraint equations solved
+    With fewer new coordinates than old ones this eliminates constraints: x(t, q) is the solution of the constraint equations
     (Bindungsgleichungen), and their forces do no work.
 
-    **Arguments:** `coordinates`: x(t, q), structured like the old coordinates; it receives the arguments it names, of `t`, `q`, `params`
-    and the entries of `params`. Time may appear.
+    **Arguments:**
 
-    **Returns:** a `System` whose terms keep their names. Any consistent units.
+    - `system`: the `System` in the old coordinates x.
+    - `coordinates`: x(t, q), with the structure and shapes of the old coordinates; it receives the arguments it names, out of `t`, `q`,
+      `params` and the entries of `params`. Time may appear.
+
+    **Returns:** a `System` in the new coordinates q, whose terms keep their names. Any consistent units.
+
+    **Raises:** `TypeError` where `coordinates` is no hashable function.
 
     **Source:** Goldstein, Classical Mechanics, 3rd ed., section 1.4; Lurie, Analytical Mechanics, section 1.4.
 
     ```python
     import jax.numpy as jnp
     import jaxlag as jl
-    bob = jl.System(lambda q, qdot, m, g: 0.5 * m * qdot @ qdot - m * g * q[1])  # in x and y
-    pendulum = jl.substitute(bob, lambda q, l: l * jnp.stack([jnp.sin(q), -jnp.cos(q)]))  # in the angle
+    mass = jl.System(lambda q, qdot, m, g: 0.5 * m * qdot @ qdot - m * g * q[1])  # in x and y
+    pendulum = jl.substitute(mass, lambda q, l: l * jnp.stack([jnp.sin(q), -jnp.cos(q)]))  # in the angle
     jl.acceleration(pendulum, 0.5, 0.0, {"m": 1.0, "g": 9.81, "l": 2.0}).qddot  # −(g/l) sin φ = −2.35
     ```
     """
@@ -112,8 +121,8 @@ def substitute(system: System, coordinates: Callable) -> System:
     )
 
 
-class _Stated:
-    """A function of the state made from a user's functions: it shows the names it needs, so that the one rule holds for it too."""
+class _Composed:
+    """A function of the state composed of a user's functions: its signature names what they need, so it too is called by names."""
 
     @property
     def __signature__(self) -> inspect.Signature:
@@ -124,30 +133,30 @@ class _Stated:
 
 
 def _multipliers_of(function: Callable) -> tuple[str, ...]:
-    return ("multipliers",) if names(function, "multipliers") else ()
+    return ("multipliers",) if asks_for(function, "multipliers") else ()
 
 
-def _moving(coordinate: Callable, spoken: str, t: Any, q: Any, qdot: Any, params: Any) -> tuple[Any, Any]:
+def _with_velocity(coordinate: Callable, label: str, t: Any, q: Any, qdot: Any, params: Any) -> tuple[Any, Any]:
     """A position and its velocity, by one `jvp`."""
     t = jnp.asarray(t, jnp.result_type(*jax.tree.leaves(q), 1.0))
     q, qdot = (jax.tree.map(lambda leaf: jnp.asarray(leaf, t.dtype), tree) for tree in (q, qdot))
-    return jax.jvp(lambda t, q: call(coordinate, spoken, params, t=t, q=q), (t, q), (jnp.ones_like(t), qdot))
+    return jax.jvp(lambda t, q: call(coordinate, label, params, t=t, q=q), (t, q), (jnp.ones_like(t), qdot))
 
 
 @dataclasses.dataclass(frozen=True)
-class _Rate(_Stated):
+class _Rate(_Composed):
     coordinate: Callable
 
     def _names(self):
         return ("t", "q", "qdot", "params")
 
     def __call__(self, t=None, q=None, qdot=None, params=None):
-        if t is None and not names(self.coordinate, "t"):
+        if t is None and not asks_for(self.coordinate, "t"):
             t = 0.0
         for name, value in (("t", t), ("q", q), ("qdot", qdot)):
             if value is None:
                 raise TypeError(f"a rate must be given t, q and qdot, but `{name}` is missing. Call it `rate(x)(t, q, qdot, params)`.")
-        return _moving(self.coordinate, "`coordinate`", t, q, qdot, params)[1]
+        return _with_velocity(self.coordinate, "`coordinate`", t, q, qdot, params)[1]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -157,7 +166,7 @@ class _Constant:
     @classmethod
     def of(cls, effort: Any) -> "_Constant":
         if not is_concrete(effort):
-            raise TypeError("`effort` must be known when it is stated, but is traced. Make it an entry of params: `lambda F: F`.")
+            raise TypeError("`effort` must be known when it is given, but is traced. Make it an entry of params: `lambda F: F`.")
         return cls(_tuples(np.asarray(numbers(effort, "`effort`")).tolist()))
 
     def __call__(self):
@@ -165,7 +174,7 @@ class _Constant:
 
 
 @dataclasses.dataclass(frozen=True)
-class _VirtualWork(_Stated):
+class _VirtualWork(_Composed):
     coordinate: Callable
     effort: Callable
 
@@ -184,19 +193,19 @@ class _VirtualWork(_Stated):
 
 
 @dataclasses.dataclass(frozen=True)
-class _PulledBack(_Stated):
+class _PulledBack(_Composed):
     """L, D or a of the old coordinates."""
 
     function: Callable
     coordinates: Callable
-    spoken: str
+    label: str
 
     def _names(self):
         return ("t", "q", "qdot", "params", *_multipliers_of(self.function))
 
     def __call__(self, t, q, qdot, params, **multipliers):
-        x, xdot = map(_vectors, _moving(self.coordinates, "`coordinates`", t, q, qdot, params))
-        return call(self.function, self.spoken, params, t=t, q=x, qdot=xdot, **multipliers)
+        x, xdot = map(_vectors, _with_velocity(self.coordinates, "`coordinates`", t, q, qdot, params))
+        return call(self.function, self.label, params, t=t, q=x, qdot=xdot, **multipliers)
 
 
 class _PulledPosition(_PulledBack):
@@ -207,20 +216,20 @@ class _PulledPosition(_PulledBack):
 
     def __call__(self, t, q, params):
         x = _vectors(call(self.coordinates, "`coordinates`", params, t=t, q=q))
-        return call(self.function, self.spoken, params, t=t, q=x)
+        return call(self.function, self.label, params, t=t, q=x)
 
 
 class _PulledForce(_PulledBack):
-    """Q of the old coordinates, brought to the new ones by its virtual work."""
+    """Q of the old coordinates, mapped to the new ones by equal virtual work."""
 
     def __call__(self, t, q, qdot, params, **multipliers):
         force = super().__call__(t, q, qdot, params, **multipliers)
         x, pull = jax.vjp(lambda q: _vectors(call(self.coordinates, "`coordinates`", params, t=t, q=q)), q)
-        return pull(ravel_pytree(x)[1](flat_like(x, self.spoken, force)))[0]
+        return pull(ravel_pytree(x)[1](flat_like(x, self.label, force)))[0]
 
 
 def _vectors(tree: Any) -> Any:
-    """Lists and plain tuples of numbers as vectors: a point (x, 0.0) is one."""
+    """A pytree with its lists and plain tuples of numbers as vectors: a point (x, 0.0) is one."""
     is_number = lambda x: isinstance(x, (jax.Array, np.ndarray)) and x.shape == ()
     is_vector = lambda node: type(node) in (list, tuple) and len(node) > 0 and all(map(is_number, node))
     return jax.tree.map(lambda node: jnp.stack(node) if is_vector(node) else node, tree, is_leaf=is_vector)

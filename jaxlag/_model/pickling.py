@@ -1,4 +1,4 @@
-"""Functions in pickles: by the name under which Python finds them again; what has none is told so, on both sides."""
+"""Functions in pickles: stored by the name under which Python finds them again, with clear errors on both sides."""
 
 import dataclasses
 import importlib
@@ -9,26 +9,26 @@ from collections.abc import Callable
 from typing import Any
 
 INSTEAD = (
-    "Results need none of the functions where they are saved by `motion.save(file)` or `fit.save(file)` and loaded by `jl.load(file)`."
+    "To keep results without any functions, save them with `motion.save(file)` or `fit.save(file)` and load them with `jl.load(file)`."
 )
 
 
 @dataclasses.dataclass(frozen=True)
 class Reference:
-    """Where a function is found."""
+    """Where a function can be imported from."""
 
     module: str
     name: str
 
     def found(self) -> Any:
-        """The function; AttributeError or ImportError where it is not there."""
+        """The function; raises AttributeError or ImportError where it does not exist."""
         return operator.attrgetter(self.name)(importlib.import_module(self.module))
 
 
-def portable(function: Callable, spoken: str) -> Any:
-    """What stands for a function in a pickle.
+def picklable(function: Callable, label: str) -> Any:
+    """What represents a function in a pickle.
 
-    Picklers that take functions along as they are, where there are any in this process, are not stood in the way of.
+    Where cloudpickle or dill is loaded, which pickle functions by value, the function itself.
     """
     if any(module.rpartition(".")[2] in ("cloudpickle", "dill") for module in sys.modules):
         return function
@@ -44,19 +44,19 @@ def portable(function: Callable, spoken: str) -> Any:
     except (pickle.PicklingError, AttributeError, TypeError):
         pass
     raise pickle.PicklingError(
-        f"{spoken} must be a function of a module for a pickle, but {name or type(function).__name__!r} is not to be found by its name. "
-        f"Define it by `def` in a module. {INSTEAD}"
+        f"{label} must be a function of a module to be pickled, but {name or type(function).__name__!r} cannot be found by its name. "
+        f"Define it with `def` in a module. {INSTEAD}"
     )
 
 
-def restored(stands: Any) -> Callable:
-    """The function that something in a pickle stands for."""
-    if not isinstance(stands, Reference):
-        return stands
+def unpickled(reference: Any) -> Callable:
+    """The function that something in a pickle represents."""
+    if not isinstance(reference, Reference):
+        return reference
     try:
-        return stands.found()
+        return reference.found()
     except (AttributeError, ImportError) as error:
         raise pickle.UnpicklingError(
-            f"the functions of a system must be where they were when it was pickled, but there is no {stands.name!r} in module "
-            f"{stands.module!r}. Import or define it there first. {INSTEAD}"
+            f"the functions of a system must be importable as when it was pickled, but there is no {reference.name!r} in module "
+            f"{reference.module!r}. Define it there first. {INSTEAD}"
         ) from error

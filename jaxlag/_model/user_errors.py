@@ -1,4 +1,4 @@
-"""What goes wrong in a user's function, said of its own line: operations that JAX cannot trace, and functions made anew again and again."""
+"""Errors in a user's functions, reported at the user's line: operations that JAX cannot trace, and functions recreated in a loop."""
 
 import contextlib
 import dataclasses
@@ -23,12 +23,12 @@ HERE = os.path.dirname(os.path.dirname(os.path.abspath(__file__))) + os.sep  # t
 
 CHOICE = "Write `jnp.where(condition, a, b)` for `if`, `and` and masks, `jnp.maximum(a, b)` for `max`."
 NUMPY = "Write `jnp.sin` for `np.sin`, and so on, after `import jax.numpy as jnp`."
-PLAIN = "Write `jnp.sin` for `math.sin`, and so on, and leave out `float(...)` and `.item()`."
+PLAIN = "Write `jnp.sin` for `math.sin`, and so on, and omit `float(...)` and `.item()`."
 COUNT = (
-    "What is in params or q is differentiated, so it cannot count or index. Keep a whole number apart from params: as a default value, "
-    "`def f(q, n=3)`, by `functools.partial(f, n=3)`, or as the length of an array."
+    "Entries of params and q are differentiated, so they cannot count or index. Keep an integer out of params: pass it as a default value, "
+    "`def f(q, n=3)`, with `functools.partial(f, n=3)`, or as the length of an array."
 )
-INTEGER_WANTED = (  # what JAX says where a number that it traces was to be an integer, in errors of no kind of their own
+INTEGER_WANTED = (  # what JAX says where it needs an integer but got a tracer, in errors without a class of their own
     "Only integer scalar arrays can be converted",
     "Shapes must be 1D sequences of concrete values",
     "Indexer must have integer",
@@ -38,8 +38,8 @@ INTEGER_WANTED = (  # what JAX says where a number that it traces was to be an i
 
 
 @contextlib.contextmanager
-def told_by_line(role: str) -> Iterator[None]:
-    """Turns JAX's errors about what it traces into a sentence with the user's line and the cure."""
+def explain_tracing_errors(role: str) -> Iterator[None]:
+    """Turns JAX's tracing errors into a sentence with the user's line and the cure."""
     try:
         yield
     except (TypeError, IndexError) as error:
@@ -48,7 +48,7 @@ def told_by_line(role: str) -> Iterator[None]:
             raise
         where = _line_of(error.__traceback__)
         raise TypeError(
-            f"{role} must be written in operations that JAX can trace, for it is differentiated and compiled, but {where} is not. {cure}"
+            f"{role} must be written in operations that JAX can trace, since it is differentiated and compiled, but {where} is not. {cure}"
         ) from error
 
 
@@ -66,24 +66,24 @@ def _cure(error: Exception) -> str | None:
 
 
 def _line_of(trace: TracebackType | None) -> str:
-    """The innermost line that is neither of this package nor of JAX."""
+    """The innermost line of code that belongs neither to this package nor to JAX."""
     frames = traceback.extract_tb(trace)
     users = [frame for frame in frames if not frame.filename.startswith((*LIBRARIES, HERE))]
     frame = (users or frames)[-1]
     return f"line {frame.lineno} of {frame.filename}" + (f", `{frame.line}`," if frame.line else "")
 
 
-REPEATS = 3  # of a function with one body in systems of one kind: then it is made anew in a loop
+RECREATIONS = 3  # of one function body in systems of one kind, from which on it counts as recreated in a loop
 
-_met: weakref.WeakSet = weakref.WeakSet()
-_times_made: weakref.WeakKeyDictionary[CodeType, dict[str, int]] = weakref.WeakKeyDictionary()
+_seen: weakref.WeakSet = weakref.WeakSet()
+_creations: weakref.WeakKeyDictionary[CodeType, dict[str, int]] = weakref.WeakKeyDictionary()
 
 
-def warn_of_functions_made_anew(functions: list[tuple[str, Callable]], shapes: Any) -> None:
-    """Warns once where functions that differ in nothing but what they hold are compiled again and again; holds none of them.
+def warn_of_recreated_functions(functions: list[tuple[str, Callable]], shapes: Any) -> None:
+    """Warns once where functions that differ only in what they close over are compiled again and again; keeps none of them alive.
 
-    `functions` are those of one system with how messages speak of them; `shapes` of what they are compiled for, for other shapes have to
-    be compiled anyway.
+    `functions` are those of one system, each with its name in messages; `shapes` are those they are compiled for: other shapes have to be
+    compiled anyway.
     """
     by_code: dict[CodeType, list[tuple[str, Any]]] = {}
     for role, function in functions:
@@ -91,22 +91,22 @@ def warn_of_functions_made_anew(functions: list[tuple[str, Callable]], shapes: A
             by_code.setdefault(part.__code__, []).append((role, part))
     kind = str(([role for role, _ in functions], shapes))
     for code, made in by_code.items():
-        anew = not any(function in _met for _, function in made)
+        is_new = not any(function in _seen for _, function in made)
         for _, function in made:
-            _met.add(function)
-        counts = _times_made.setdefault(code, {})
-        counts[kind] = counts.get(kind, 0) + anew
-        if anew and counts[kind] == REPEATS:
+            _seen.add(function)
+        counts = _creations.setdefault(code, {})
+        counts[kind] = counts.get(kind, 0) + is_new
+        if is_new and counts[kind] == RECREATIONS:
             warnings.warn(
                 f"{made[0][0]} must be made once to be compiled once, but `{code.co_name}`, line {code.co_firstlineno} of "
-                f"{code.co_filename}, was made anew {REPEATS} times, and each time all is compiled again. Define it and the system "
-                "once, outside of the loop, and let what changes be an entry of params.",
-                stacklevel=_levels_to_the_user(),
+                f"{code.co_filename}, was created {RECREATIONS} times, and each time everything is compiled again. "
+                "Define it and the system once, outside the loop, and make what changes an entry of params.",
+                stacklevel=levels_to_the_user(),
             )
 
 
 def _parts(function: Any) -> Iterator[Any]:
-    """The plain functions that a function is made from."""
+    """The plain functions that a function is composed of."""
     function = inspect.unwrap(function)
     if isinstance(function, functools.partial):
         yield from _parts(function.func)
@@ -120,8 +120,8 @@ def _parts(function: Any) -> Iterator[Any]:
                 yield from _parts(part)
 
 
-def _levels_to_the_user() -> int:
-    """How far up from the caller the first line is that is of no library."""
+def levels_to_the_user() -> int:
+    """How many frames above the caller the first line lies that belongs to no library."""
     frame, level = sys._getframe(1), 1
     while frame.f_back is not None and frame.f_code.co_filename.startswith((*LIBRARIES, HERE)):
         frame, level = frame.f_back, level + 1

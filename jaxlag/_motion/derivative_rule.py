@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
 
-from .variational import along, parted
+from .variational import jvp_along, pushforward, split_varying
 
 # Up to this many perturbed numbers the Jacobian comes whole out of one vectorised forward pass; beyond it a tangent is
 # pushed forward, or a cotangent pulled back, alone. The two cross near 100 (tests/benchmarks/bench_gradient.py).
@@ -25,9 +25,9 @@ def differentiable(solve: Callable, pull_back: Callable, drift: Callable, push: 
     - `solve`: has forward-mode derivatives in `inputs`, a pytree. `aux` is not differentiated.
     - `pull_back`: the same function with reverse-mode derivatives, for many inputs.
     - `drift(inputs, ts, y)`: dy/dts, each sample to its own time.
-    - `push(moving, still, directions, ts)`: y, its derivatives along directions of what moves, and aux; by default what `solve` gives.
+    - `push(varying, constant, directions, ts)`: y, its derivatives along directions of what varies, and aux; by default what `solve` gives.
     """
-    push = push or pushed(solve)
+    push = push or pushforward(solve)
 
     @eqx.filter_custom_jvp
     def motion(inputs, ts):
@@ -36,8 +36,8 @@ def differentiable(solve: Callable, pull_back: Callable, drift: Callable, push: 
     @motion.def_jvp
     def rule(primals, tangents):
         (inputs, ts), (d_inputs, d_ts) = primals, tangents
-        moving, still = parted(inputs, d_inputs)
-        x, unravel = ravel_pytree(moving)
+        varying, constant = split_varying(inputs, d_inputs)
+        x, unravel = ravel_pytree(varying)
         dx = ravel_pytree(d_inputs)[0]
         of_x = lambda f: lambda x_and_still, *rest: f(eqx.combine(unravel(x_and_still[0]), x_and_still[1]), *rest)
         at_x = of_x(solve), of_x(pull_back), of_x(drift)
@@ -45,11 +45,11 @@ def differentiable(solve: Callable, pull_back: Callable, drift: Callable, push: 
         if x.size == 0:
             y, aux = motion(inputs, ts)
         elif x.size <= FORWARD_LIMIT:
-            (y, J), aux = differentiable(*_with_jacobian(push, pushed(pull_back), at_x[2], unravel))((x, still), ts)
+            (y, J), aux = differentiable(*_with_jacobian(push, pushforward(pull_back), at_x[2], unravel))((x, constant), ts)
             change = jax.tree.map(lambda rows: rows @ dx, J)
         else:
             y, aux = motion(inputs, ts)
-            change = _jacobian_product(at_x[0], at_x[1], (x, still), ts, y, dx)
+            change = _jacobian_product(at_x[0], at_x[1], (x, constant), ts, y, dx)
         if d_ts is not None:
             shift = jax.tree.map(lambda rate: jax.vmap(jnp.multiply)(rate, d_ts), drift(inputs, ts, y))
             change = shift if change is None else jax.tree.map(jnp.add, change, shift)
@@ -58,8 +58,8 @@ def differentiable(solve: Callable, pull_back: Callable, drift: Callable, push: 
     return motion
 
 
-def differentiable_abreast(solve: Callable, drift: Callable, push: Callable) -> Callable:
-    """The same for members side by side that do not touch one another: `solve((common, own), ts) -> (y, aux)`.
+def differentiable_batch(solve: Callable, drift: Callable, push: Callable) -> Callable:
+    """The same for a batch of independent members: `solve((common, own), ts) -> (y, aux)`.
 
     Leaves of `own`, and y, have the members as their last axis: one pass along e perturbs that number of every member, and gives each
     of them its own derivative.
@@ -72,9 +72,9 @@ def differentiable_abreast(solve: Callable, drift: Callable, push: Callable) -> 
     @motions.def_jvp
     def rule(primals, tangents):
         (inputs, ts), (d_inputs, d_ts) = primals, tangents
-        moving, still = parted(inputs, d_inputs)
-        x, unravel = ravel_pytree(moving[0])
-        flat, structure = jax.tree.flatten(moving[1])
+        varying, constant = split_varying(inputs, d_inputs)
+        x, unravel = ravel_pytree(varying[0])
+        flat, structure = jax.tree.flatten(varying[1])
         sizes = [leaf[..., 0].size for leaf in flat]
         members = jax.tree.leaves(inputs[1])[0].shape[-1]
 
@@ -90,7 +90,7 @@ def differentiable_abreast(solve: Callable, drift: Callable, push: Callable) -> 
             y, aux = motions(inputs, ts)
         else:
             directions = jax.vmap(direction, out_axes=-1)(jnp.eye(count, dtype=ts.dtype))
-            y, J, aux = push(moving, still, directions, ts)
+            y, J, aux = push(varying, constant, directions, ts)
             dx = jnp.broadcast_to(ravel_pytree(d_inputs[0])[0][:, None], (x.size, members))
             change = jnp.einsum("...mp,pm->...m", J, jnp.concatenate([dx, joined(jax.tree.leaves(d_inputs[1]))]))
         if d_ts is not None:
@@ -101,29 +101,21 @@ def differentiable_abreast(solve: Callable, drift: Callable, push: Callable) -> 
     return motions
 
 
-def pushed(solve: Callable) -> Callable:
-    """How `solve` itself differentiates forward: y, its derivatives along directions, which come last in their leaves, and aux."""
-
-    def push(moving, still, directions, ts):
-        return along(lambda moving: solve(eqx.combine(moving, still), ts), moving, directions)
-
-    return push
-
-
 def _with_jacobian(push, push_back, drift, unravel):
-    """The three functions of `differentiable` for (y, ∂y/∂x) in place of y, where inputs = (x, still)."""
+    """The three functions of `differentiable` for (y, ∂y/∂x) in place of y, where inputs = (x, constant)."""
 
     def both(push):
         def value_and_jacobian(inputs, ts):
-            x, still = inputs
-            y, J, aux = push(unravel(x), still, jax.vmap(unravel, out_axes=-1)(jnp.eye(x.size, dtype=x.dtype)), ts)
+            x, constant = inputs
+            y, J, aux = push(unravel(x), constant, jax.vmap(unravel, out_axes=-1)(jnp.eye(x.size, dtype=x.dtype)), ts)
             return (y, J), aux
 
         return value_and_jacobian
 
     def drift_of_both(inputs, ts, y_and_J):
-        (x, still), (y, J) = inputs, y_and_J
-        rate, change, _ = along(lambda both: (drift((both[0], still), ts, both[1]), None), (x, y), (jnp.eye(x.size, dtype=x.dtype), J))
+        (x, constant), (y, J) = inputs, y_and_J
+        of_both = lambda both: (drift((both[0], constant), ts, both[1]), None)
+        rate, change, _ = jvp_along(of_both, (x, y), (jnp.eye(x.size, dtype=x.dtype), J))
         return rate, change
 
     # A Jacobian of more columns than FORWARD_LIMIT never comes here, and solve has forward mode: it serves as both.
@@ -136,13 +128,13 @@ def _jacobian_product(solve, pull_back, inputs, ts, y, dx):
     JAX takes a transpose from the user in `custom_linear_solve` alone: here a symmetric one whose "solution" of (a, b) is
     (Jᵀb, Ja). Of the two products the one that is not asked for is dropped by the compiler.
     """
-    x, still = inputs
+    x, constant = inputs
 
     def products(_, z):
         a, b = z
-        pushed = jax.jvp(lambda x: solve((x, still), ts)[0], (x,), (a,))[1]
-        pulled = jax.vjp(lambda x: pull_back((x, still), ts)[0], x)[1](b)[0]
-        return pulled, pushed
+        pushforward = jax.jvp(lambda x: solve((x, constant), ts)[0], (x,), (a,))[1]
+        pulled = jax.vjp(lambda x: pull_back((x, constant), ts)[0], x)[1](b)[0]
+        return pulled, pushforward
 
     def matrix(z):
         only_first = eqx.internal.nondifferentiable(x, msg=SECOND_ORDER)

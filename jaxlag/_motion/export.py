@@ -24,12 +24,12 @@ def arrays_of(**trees: PyTree) -> dict[str, np.ndarray]:
     names = [name for name, _ in named]
     for name in names:
         if names.count(name) > 1:
-            raise ValueError(f"names must differ in a table, but two entries are called {name!r}. Do without points in names.")
+            raise ValueError(f"names must differ in a table, but two entries are called {name!r}. Avoid dots in names.")
     return {name: np.asarray(leaf) for name, leaf in named}
 
 
 def frame_of(columns: Mapping[str, Any], frame: Callable | None) -> Any:
-    """A data frame: of the given class, or of pandas or polars, whichever there is."""
+    """A data frame: of the given class, or of pandas or polars, whichever is installed."""
     return (_installed() if frame is None else frame)(dict(columns))
 
 
@@ -41,13 +41,13 @@ def _installed() -> Callable:
             from polars import DataFrame
         except ImportError:
             raise ImportError(
-                "`to_dataframe` must have pandas or polars, but neither can be imported. Install one of them, or take `to_dict()`."
+                "`to_dataframe` must have pandas or polars, but neither can be imported. Install one of them, or use `to_dict()`."
             ) from None
     return DataFrame
 
 
 def nested(tree: PyTree, leaf: Callable[[Any], Any]) -> Any:
-    """A pytree as dicts and lists, `leaf` of what is in them; of an object, of a NamedTuple say, the dict of its fields."""
+    """A pytree as dicts and lists of `leaf(x)`; an object such as a NamedTuple becomes the dict of its fields."""
     parts = jax.tree_util.tree_flatten_with_path(tree, is_leaf=lambda node: node is not tree)[0]
     if [path for path, _ in parts] == [()]:
         return leaf(tree)
@@ -59,7 +59,7 @@ def nested(tree: PyTree, leaf: Callable[[Any], Any]) -> Any:
 
 
 def jsonable(tree: PyTree) -> Any:
-    """What `json.dumps` takes: numbers that are none, NaN and infinite ones, as None; what is no data at all by the name of its kind."""
+    """What `json.dumps` accepts: NaN and infinities as None; what is not data by the name of its type."""
 
     def plain(x):
         if x is None or isinstance(x, (str, bool)):
@@ -73,14 +73,14 @@ def jsonable(tree: PyTree) -> Any:
 
 
 def write_arrays(file: str | Path, kind: str, arrays: Mapping[str, np.ndarray], **about: Any) -> None:
-    """Arrays by name, in the format of NumPy (.npz), and beside them what they are about."""
+    """Arrays by name, in the format of NumPy (.npz), with a description of them."""
     said = json.dumps({"jaxlag": kind, "format": FORMAT} | about)
     with open(file, "wb") as stream:  # `savez` would add to a name
         np.savez(stream, allow_pickle=False, about=np.array(said), **arrays)
 
 
 def write_json(file: str | Path, kind: str, content: Mapping[str, Any]) -> None:
-    """A text file that every language reads."""
+    """A text file that every language can read."""
     said = json.dumps({"jaxlag": kind, "format": FORMAT} | dict(content), indent=1, allow_nan=False, ensure_ascii=False)
     Path(file).write_text(said, encoding="utf-8")
 

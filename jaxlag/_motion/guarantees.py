@@ -1,4 +1,4 @@
-"""What a motion that is called successful has kept, at each of its samples."""
+"""What a successful motion guarantees at each of its samples."""
 
 from typing import Any
 
@@ -7,24 +7,25 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from .._mechanics.projection import off_constraints
-from .first_order import Equations, Sample
+from .first_order import EquationsOfMotion, Sample
+from .protocol import Arguments
 from .results import RESULTS
 
 
-def upheld(
-    equations: Equations, ts: Float[Array, " T1"], ys: Float[Array, "T1 y"], samples: Sample, params, result: RESULTS, tolerances
+def verified(
+    equations: EquationsOfMotion, ts: Float[Array, " T1"], ys: Float[Array, "T1 y"], samples: Sample, params, result: RESULTS, tolerances
 ) -> tuple[Sample, RESULTS, Float[Array, ""]]:
-    """The samples that keep what they promise, NaN from the first that does not; the reason that the motion ended; and the time it reached.
+    """The samples that keep the guarantees, NaN from the first that does not; the reason that the motion ended; and the time it reached.
 
-    The last sample is none, but the last state that the integration came to, and says why it came no farther.
+    The last sample is not one of the motion but the last state that the integration reached, and says why it got no farther.
     """
     reached = ts[-1]
     result = RESULTS.where((result == RESULTS.dt_min_reached) & _locks(equations, ts, samples), RESULTS.beyond_reach, result)
     ts, ys, *samples = jax.tree.map(lambda leaf: leaf[:-1], (ts, ys, *samples))
     samples = Sample(*samples)
     there = jnp.all(jnp.isfinite(ys), axis=1)
-    for kept, reason in _promises(equations, ts, ys, samples, params, tolerances):
-        broken = there & ~kept
+    for projected, reason in _guarantees(equations, ts, ys, samples, params, tolerances):
+        broken = there & ~projected
         first = jnp.argmax(broken)
         there = there & (jnp.cumsum(broken) == 0)
         result = RESULTS.where(jnp.any(broken), reason, result)
@@ -36,30 +37,30 @@ def upheld(
     return jax.tree.map(masked, samples), result, reached
 
 
-def _promises(equations: Equations, ts, ys, samples: Sample, params, tolerances) -> list[tuple[Bool[Array, " T"], Any]]:
-    """Which samples keep each promise, and the reason that a motion ended where one does not."""
+def _guarantees(equations: EquationsOfMotion, ts, ys, samples: Sample, params, tolerances) -> list[tuple[Bool[Array, " T"], Any]]:
+    """Which samples keep each guarantee, and the reason that a motion ended where one does not."""
     numbers = jax.tree.leaves((samples.qddot, samples.multipliers))
     finite = jnp.all(jnp.stack([jnp.all(jnp.isfinite(leaf.reshape(len(ts), -1)), axis=1) for leaf in numbers]), axis=0)
-    promises = [(finite, RESULTS.undefined)]
+    guarantees = [(finite, RESULTS.undefined)]
     if equations.rows:
-        excess, scale = samples.beyond
+        excess, scale = samples.violation
         within = excess <= LITTLE * scale + LITTLE**1.5 * jnp.max(jnp.where(jnp.isfinite(scale), scale, 0), axis=0, keepdims=True)
-        promises.append((jnp.all(within, axis=1), RESULTS.missed))
+        guarantees.append((jnp.all(within, axis=1), RESULTS.missed))
     if equations.projection is not None:
         off = jax.vmap(lambda t, y: _off(equations, t, y, params))(*jax.lax.stop_gradient((ts, ys)))
-        promises += [(off <= _promised(tolerances), RESULTS.contradictory), (samples.sound.satisfied, RESULTS.contradictory)]
+        guarantees += [(off <= _residual_bound(tolerances), RESULTS.contradictory), (samples.sound.satisfied, RESULTS.contradictory)]
     elif equations.system.constraints:  # what drifts contradicts itself in time
-        promises.append((samples.sound.satisfied | (jnp.arange(len(ts)) > 0), RESULTS.contradictory))
-    return promises
+        guarantees.append((samples.sound.satisfied | (jnp.arange(len(ts)) > 0), RESULTS.contradictory))
+    return guarantees
 
 
 def _off(equations, t, y, params):
     q, v, _, sigma, *_ = equations.parts(y)
-    _, mode, _ = equations.mode(t, q, v, sigma, (params, None))
+    _, mode, _ = equations.mode(t, q, v, sigma, Arguments(params))
     return off_constraints(mode, t, q, v)
 
 
-def _promised(tolerances):
+def _residual_bound(tolerances):
     """What projection leaves: far less than the tolerance of the integration, and where that is below √eps, than √eps."""
     rtol, atol = tolerances
     return jnp.maximum(rtol + atol, jnp.finfo(rtol.dtype).eps ** 0.5)

@@ -13,20 +13,20 @@ from .._mechanics.stick_slip import Regularised, StickSlip
 from .export import FORMAT, filled_outline
 from .provenance import Recorded
 from .results import result_of
-from .trajectory import Rubbing, Trajectory
+from .trajectory import FrictionState, Trajectory
 
 
 def load(file: str | Path) -> Any:
-    """A motion or a fit from a file that `Trajectory.save` or `Fit.save` has written. None of the user's functions are needed.
+    """A motion or a fit from a file written by `Trajectory.save` or `Fit.save`. None of the user's functions are needed.
 
-    **Arguments:** `file`: the path, as it was given to `save`.
+    **Arguments:** `file`: the path that was given to `save`.
 
-    **Returns:** of a motion a `Trajectory` with all its samples, its result, stats, energies and slip velocities, and the numbers of its
-    params; what needs the system itself, as forces on points in `animate`, it refuses in a sentence. Mappings and sequences are dicts and
-    lists, of a NamedTuple or another object there is the dict of its fields. Of a fit the dict that `Fit.to_dict` made, and its card under
-    `"card"`.
+    **Returns:** for a motion, a `Trajectory` with all its samples, result, stats, energies, slip velocities, and the numbers of its
+    params; what needs the system itself, such as forces on points in `animate`, raises an error that says so. Mappings and sequences
+    become dicts and lists; a NamedTuple or another object becomes the dict of its fields. For a fit, the dict of `Fit.to_dict`, with its
+    card under `"card"`.
 
-    **Raises:** `ValueError` where the file is none of these; what `open` raises.
+    **Raises:** `ValueError` where the file is neither; whatever `open` raises.
 
     **Source:** NumPy's format NPY 1.0 (NEP 1) in a ZIP archive, without pickled objects; JSON, RFC 8259.
 
@@ -54,7 +54,7 @@ def load(file: str | Path) -> Any:
 
 
 def _read(file):
-    """What is said in a file, and its arrays."""
+    """The description in a file, and its arrays."""
     with open(file, "rb") as stream:
         is_archive = stream.read(2) == b"PK"
     if not is_archive:
@@ -74,8 +74,8 @@ def _motion(about, arrays):
     rate = lambda name: jax.tree.map(lambda leaf: jnp.asarray(arrays[name + leaf.removeprefix("q")]), like)
     kinds = {kind.__name__: kind for kind in (StickSlip, Regularised)}
     (friction,) = (kinds[name](**fields) for name, fields in about["friction"].items())
-    energy, rubbing = part("energy"), part("friction")
-    terms = list(dict.fromkeys(name.rpartition(".")[0] for name in rubbing))
+    energy, friction_states = part("energy"), part("friction")
+    terms = list(dict.fromkeys(name.rpartition(".")[0] for name in friction_states))
     return Trajectory(
         ts=jnp.asarray(arrays["t"]),
         q=tree("q"),
@@ -85,6 +85,6 @@ def _motion(about, arrays):
         result=result_of(arrays["result"]),
         stats=part("stats"),
         works=part("works") if about["audit"] else None,
-        friction={term: Rubbing(rubbing[f"{term}.force"], rubbing[f"{term}.sticking"]) for term in terms},
-        stated=Recorded((energy["h"], energy["turned"]), part("slip"), tree("params"), tuple(about["one_sided"]), friction),
+        friction={term: FrictionState(friction_states[f"{term}.force"], friction_states[f"{term}.sticking"]) for term in terms},
+        provenance=Recorded((energy["h"], energy["turned"]), part("slip"), tree("params"), tuple(about["one_sided"]), friction),
     )

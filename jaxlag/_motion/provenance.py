@@ -1,4 +1,4 @@
-"""What a motion was computed from: the system and its params; or what is left of them in a file."""
+"""What a motion was computed from: the system and its params, or what a file keeps of them."""
 
 import equinox as eqx
 import jax
@@ -8,9 +8,9 @@ from .._mechanics.stick_slip import Regularised, StickSlip
 from .._model.system import System
 
 
-class Stated(eqx.Module):
-    """The system and params of a motion, and how friction was taken. What is no array in params is kept aside, so that batches of
-    motions are arrays alone.
+class Provenance(eqx.Module):
+    """The system and params of a motion, and the treatment of friction. What is not an array in params is kept apart, so that batches
+    of motions consist of arrays only.
     """
 
     numbers: list[Array]
@@ -19,7 +19,7 @@ class Stated(eqx.Module):
     friction: StickSlip | Regularised = eqx.field(static=True)
 
     @classmethod
-    def of(cls, system: System, params: PyTree, friction: StickSlip | Regularised = StickSlip()) -> "Stated":
+    def of(cls, system: System, params: PyTree, friction: StickSlip | Regularised = StickSlip()) -> "Provenance":
         leaves, structure = jax.tree.flatten(params)
         numbers = [leaf for leaf in leaves if eqx.is_array(leaf)]
         return cls(numbers, system, (structure, tuple(None if eqx.is_array(leaf) else leaf for leaf in leaves)), friction)
@@ -38,7 +38,7 @@ class Stated(eqx.Module):
 
 
 class Recorded(eqx.Module):
-    """What a motion from a file has in place of its system: what was computed by that, at the samples, before it was saved."""
+    """What a motion from a file has in place of its system: what the system had computed at the samples before it was saved."""
 
     energies: tuple[Array, Array]
     slip: dict[str, Array]
@@ -48,8 +48,8 @@ class Recorded(eqx.Module):
 
     @property
     def system(self) -> System:
-        """There is none."""
+        """None is available."""
         raise ValueError(
             "a motion that was loaded from a file must do without its system, whose functions are not in the file, but these are needed "
-            "here. Simulate it anew; energies, works and slip velocities are there as they were saved."
+            "here. Simulate it again; energies, works and slip velocities are there as they were saved."
         )

@@ -22,26 +22,38 @@ class RESULTS(dfx.RESULTS):  # pyright: ignore
     not_affine = NOT_AFFINE
     undefined = UNDEFINED
     contradictory = (
-        "the constraints are not satisfied there: they contradict each other, nearly repeat each other, or ask for more than the mechanism "
-        "can reach. Look at them with `examine`, and at what drives them."
+        "the constraints are not satisfied there: they contradict each other, nearly repeat each other, or demand more than the mechanism "
+        "can reach. Check them with `examine`, and check what drives them."
     )
     beyond_reach = (
-        "the constraints leave the motion no way on: they drive a mechanism beyond its reach, or into a position that locks it. "
-        "Let them ask for less, or leave out the one that does."
+        "the constraints leave no way to continue: they drive a mechanism beyond its reach, or into a position that locks it. "
+        "Let them demand less, or leave out the one that does."
     )
-    negative_bound = "`dissipation` must have bounds of friction that are not negative, but one is. Take `jnp.abs` of a normal force."
+    negative_bound = "`dissipation` must have friction bounds that are not negative, but one is. Take `jnp.abs` of a normal force."
     missed = (
-        "friction is beyond its bound there, or slips against its force: an end of sticking or slipping was missed. Take a smaller `rtol`, "
-        "and give loads that come and go as `Signal`s."
+        "friction exceeds its bound there, or slips against its force: the end of sticking or slipping was missed. Use a smaller `rtol`, "
+        "and give intermittent loads as `Signal`s."
     )
     no_friction = (
-        "no sliding and no sticking agrees with the friction forces it brings about, or more than one does (Painlevé's paradox). "
+        "no mode of sliding and sticking is consistent with the friction forces it causes, or more than one is (Painlevé's paradox). "
         "Lower the coefficient of friction, or give the contact its compliance."
     )
     chattering = (
         "friction changed between sliding and sticking more than `max_transitions` times: it chatters. "
-        "Allow more by `friction=StickSlip(max_transitions=...)`, or smooth it by `friction=Regularised(width)`."
+        "Allow more with `friction=StickSlip(max_transitions=...)`, or smooth it with `friction=Regularised(width)`."
     )
+
+
+def under_diffrax(reason: Any) -> dfx.RESULTS:
+    """A reason of mechanics as diffrax carries it through its loop: a number beyond its own, and not `successful`."""
+    successful: Any = dfx.RESULTS.successful
+    return eqx.tree_at(lambda r: r._value, successful, reason._value)
+
+
+def from_diffrax(result: Any) -> RESULTS:
+    """What diffrax returns, with the reasons of mechanics told apart again. The numbers of its own reasons are the same in both."""
+    successful: Any = RESULTS.successful
+    return eqx.tree_at(lambda r: r._value, successful, result._value)
 
 
 OF_THE_INPUT = (
@@ -52,11 +64,11 @@ OF_THE_INPUT = (
     RESULTS.not_affine,
     RESULTS.negative_bound,
 )
-OF_THE_STEPS = (RESULTS.max_steps_reached, RESULTS.dt_min_reached)  # which other numerics may mend
+OF_THE_STEPS = (RESULTS.max_steps_reached, RESULTS.dt_min_reached)  # which other numerical settings may cure
 
 
 def reason_of(result: Any) -> str:
-    """What a result says; of a batch, what the first failure says, and before all others one of the input, which may bring these about."""
+    """The sentence of a result; in a batch, that of the first failure, failures of the input before all others, which they may cause."""
     successful: Any = RESULTS.successful
     named = lambda value: RESULTS[eqx.tree_at(lambda r: r._value, successful, jnp.asarray(value))]  # type: ignore[misc]
     reasons = [named(value) for value in dict.fromkeys(np.ravel(result._value)[np.ravel(result != successful)].tolist())]
@@ -65,7 +77,7 @@ def reason_of(result: Any) -> str:
 
 
 def names_of(result: Any) -> np.ndarray:
-    """The names of results, which outlast the numbers that stand for them."""
+    """The names of results, which stay the same where their numbers may not."""
     named = {int(item._value): name for name, item in RESULTS._name_to_item.items()}  # type: ignore[attr-defined]
     return np.reshape([named[value] for value in np.ravel(result._value).tolist()], np.shape(result._value))
 

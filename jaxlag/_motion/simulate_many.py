@@ -1,6 +1,5 @@
 """Many motions of one system at once."""
 
-import dataclasses
 import functools
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -16,19 +15,24 @@ from jaxtyping import Array, PyTree
 
 from .._mechanics.projection import Baumgarte, NoStabilisation, Projection
 from .._mechanics.stick_slip import Regularised, StickSlip
+from .._model.deprecation import renamed
 from .._model.paths import is_within, leaf_names
-from .._model.signal import is_signal, jump_times, solved
+from .._model.signal import is_signal, jump_times, with_second_derivatives
 from .._model.system import System
 from .._model.validation import checked, coordinates, parameters, sample_times, state
 from .._program.jit import jitted
-from .derivative_rule import differentiable_abreast, pushed
-from .first_order import Equations
-from .integrate import How, begun, can_be_varied, judged, raise_failure, states_at, states_varied, tolerances_of
+from .batch import BatchedEquations
+from .derivative_rule import differentiable_batch
+from .failure import raise_failure
+from .first_order import EquationsOfMotion, Formulation
+from .integrate import SolverOptions, initialised, is_variational, states_and_variations, states_at, tolerances_of, with_status
+from .protocol import Arguments
 from .results import RESULTS
 from .simulate import simulate, trajectory_of
 from .trajectory import Trajectory
+from .variational import pushforward
 
-ABREAST = 64  # members that share their steps: as many as the cache holds the stages of
+BATCH_SIZE = 64  # members that share their steps: as many as the cache holds the stages of
 
 
 def simulate_many(
@@ -39,7 +43,7 @@ def simulate_many(
     params: PyTree = None,
     *,
     over: Sequence[str],
-    steps: str | None = None,
+    common_steps: bool | None = None,
     solver: dfx.AbstractSolver | None = None,
     rtol: float | Array | None = None,
     atol: float | Array | None = None,
@@ -47,6 +51,7 @@ def simulate_many(
     friction: StickSlip | Regularised = StickSlip(),
     max_steps: int = 100_000,
     throw: bool = True,
+    steps: str | None = None,
 ) -> Trajectory:
     r"""The motions of many machines that differ in their parameters or in their starts.
 
@@ -60,12 +65,15 @@ def simulate_many(
 
     - `system`, `q0`, `qdot0`, `ts`, `params`, `solver` to `throw`: as `simulate`; `ts` is the same for all.
     - `over`: what differs: "q0", "qdot0", entries of them ("q0.phi") or of `params` ("b", "wheel.c").
-    - `steps`: "common" has 64 members at a time take the same steps, short enough for each of them, with the members as the last axis
-      of all arithmetic: many times as fast as one by one. "own" lets each take its own. Default: "common", but "own" where there is
-      dry friction or a measured input that jumps, whose steps end at times that differ. Where one of 64 cannot go on, all stop: "own"
-      then says which.
+    - `common_steps`: True has 64 members at a time take the same steps, short enough for each of them, with the members as the last
+      axis of all arithmetic: many times as fast as one by one. False lets each member take its own. Default: True, but False where there
+      is dry friction or a measured input that jumps, whose steps end at times that differ. Where one of 64 cannot go on, all stop:
+      `common_steps=False` then says which.
+    - `steps`: deprecated; "common" is now `common_steps=True`, "own" `common_steps=False`.
 
-    **Returns:** a `Trajectory`. **Raises:** as `simulate`; `ValueError` where `over` or `steps` is none of these, or sizes differ.
+    **Returns:** a `Trajectory`; each of its fields has the B members as its first axis, the samples as its second.
+
+    **Raises:** as `simulate`; `ValueError` where `over` names none of these, where sizes differ, or where common steps are impossible.
 
     **Source:** Hairer, Nørsett & Wanner, Solving Ordinary Differential Equations I, section II.4: a step fits a vector of equations
     when it fits the worst of them.
@@ -83,13 +91,21 @@ def simulate_many(
     everything["params"] = parameters(params, everything["q0"])
     own, shared = eqx.partition(everything, _differing(everything, tuple(over)))
     dtype = jnp.result_type(*jax.tree.leaves((everything["q0"], everything["qdot0"])))
-    how = How.of(solver, stabilisation, friction, max_steps)
-    if steps not in (None, "common", "own"):
-        raise ValueError(f'`steps` must be "common" or "own", but is {steps!r}. Leave it out to have it chosen.')
-    trajectory = _simulate_many(system, how, steps, own, shared, sample_times(ts, dtype), tolerances_of(rtol, atol, dtype))
+    options = SolverOptions.of(solver, Formulation(stabilisation, friction), max_steps)
+    common_steps = _choice_of_steps(common_steps, steps)
+    trajectory = _simulate_many(system, options, common_steps, own, shared, sample_times(ts, dtype), tolerances_of(rtol, atol, dtype))
     if throw:
         raise_failure(trajectory)
     return trajectory
+
+
+def _choice_of_steps(common_steps, steps):
+    if steps not in (None, "common", "own"):
+        raise ValueError(f'`steps` must be "common" or "own", but is {steps!r}. Write `common_steps=True` or `common_steps=False`.')
+    common_steps = renamed(common_steps, "common_steps", steps=None if steps is None else steps == "common")
+    if common_steps not in (None, True, False):
+        raise ValueError(f"`common_steps` must be True or False, but is {common_steps!r}. Leave it out to have it chosen.")
+    return common_steps
 
 
 def _differing(everything, over):
@@ -113,34 +129,34 @@ def _differing(everything, over):
 
 
 @jitted
-def _simulate_many(system, how, steps, own, shared, ts, tolerances):
+def _simulate_many(system, options, common_steps, own, shared, ts, tolerances):
     first = eqx.combine(jax.tree.map(lambda leaf: leaf[0], own), shared)
     q0, qdot0 = state(first["q0"], first["qdot0"], ("q0", "qdot0"))
-    _, t0, q, v = checked(system, ts[0], q0, qdot0, first["params"])
-    equations = Equations.of(system, q0, how.stabilisation, how.friction, False, t0, q, v, first["params"])
+    flat, t0, q, v = checked(system, ts[0], q0, qdot0, first["params"])
+    equations = EquationsOfMotion.of(system, q0, options.formulation, flat, t0, q, v)
     members, (numbers, rest) = jax.tree.leaves(own)[0].shape[0], eqx.partition(shared, eqx.is_array)
-    if _common(steps, equations, first["params"], own):
-        batch = lambda own, *given: _side_by_side(system, equations, how, own, eqx.combine(given[0], rest), *given[1:])
+    if _share_steps(common_steps, equations, first["params"], own):
+        batch = lambda own, *given: _in_batches(system, equations, options, own, eqx.combine(given[0], rest), *given[1:])
     else:
-        one = lambda own, *given: _alone(system, how, eqx.combine(own, given[0], rest), *given[1:])
+        one = lambda own, *given: _one(system, options, eqx.combine(own, given[0], rest), *given[1:])
         batch = lambda own, *given: of_each(lambda own: one(own, *given), own)
     if min(members, jax.device_count()) > 1:
         devices = Mesh(np.array(jax.devices()), "members")
-        own = jax.tree.map(lambda leaf: filled_up(leaf, devices.size), own)
-        along, all_ = PartitionSpec("members"), PartitionSpec()
-        batch = jax.shard_map(batch, mesh=devices, in_specs=(along, all_, all_, all_), out_specs=along, check_vma=False)
+        own = jax.tree.map(lambda leaf: padded(leaf, devices.size), own)
+        split, all_ = PartitionSpec("members"), PartitionSpec()
+        batch = jax.shard_map(batch, mesh=devices, in_specs=(split, all_, all_, all_), out_specs=split, check_vma=False)
     return jax.tree.map(lambda leaf: leaf[:members], batch(own, numbers, ts, tolerances))
 
 
-def _common(steps, equations, params, own):
+def _share_steps(common_steps, equations, params, own):
     signals = [leaf for leaf in jax.tree.leaves(own, is_leaf=is_signal) if is_signal(leaf) and jax.tree.leaves(leaf)]
     obstacle = equations.rows or signals or jump_times(params, float) is not None
-    if steps == "common" and obstacle:
+    if common_steps and obstacle:
         raise ValueError(
-            '`steps` must be "own" where dry friction or a jumping input ends steps at times of its own, or where signals differ, but is '
-            '"common". Leave it out.'
+            "`common_steps` must be False where dry friction or a jumping input ends steps at times of its own, or where signals differ, "
+            "but is True. Leave it out."
         )
-    return steps != "own" and not obstacle
+    return common_steps is not False and not obstacle
 
 
 def of_each(function: Callable, members: PyTree) -> PyTree:
@@ -151,31 +167,33 @@ def of_each(function: Callable, members: PyTree) -> PyTree:
     return jax.lax.map(function, members) if jax.default_backend() == "cpu" else jax.vmap(function)(members)
 
 
-def filled_up(leaf, size):
+def padded(leaf: Array, size: int) -> Array:
     """With copies of the last member, to a multiple of a size."""
     return jnp.concatenate([leaf, jnp.repeat(leaf[-1:], -len(leaf) % size, axis=0)])
 
 
-def _alone(system, how, everything, ts, tolerances):
+def _one(system, options, everything, ts, tolerances):
     """One member, with steps of its own."""
-    numerics = dict(solver=how.solver, stabilisation=how.stabilisation, friction=how.friction, max_steps=how.max_steps)
-    start = everything["q0"], everything["qdot0"]
-    return simulate(system, *start, ts, everything["params"], rtol=tolerances[0], atol=tolerances[1], **numerics, throw=False)
+    formulation = options.formulation
+    choices = dict(stabilisation=formulation.stabilisation, friction=formulation.friction, max_steps=options.max_steps)
+    start = everything["q0"], everything["qdot0"], ts, everything["params"]
+    return simulate(system, *start, solver=options.solver, rtol=tolerances[0], atol=tolerances[1], **choices, throw=False)
 
 
-def _side_by_side(system, equations, how, own, shared, ts, tolerances):
-    """Members in groups of those that share their steps."""
+def _in_batches(system, equations, options, own, shared, ts, tolerances):
+    """Members in batches that share their steps."""
     members = jax.tree.leaves(own)[0].shape[0]
-    size = min(members, ABREAST)
-    groups = jax.tree.map(lambda leaf: (x := filled_up(leaf, size)).reshape(-1, size, *x.shape[1:]), own)
-    found = jax.lax.map(lambda own: _group(system, equations, how, own, shared, ts, tolerances), groups)
+    size = min(members, BATCH_SIZE)
+    batches = jax.tree.map(lambda leaf: (x := padded(leaf, size)).reshape(-1, size, *x.shape[1:]), own)
+    found = jax.lax.map(lambda own: _batch(system, equations, options, own, shared, ts, tolerances), batches)
     return jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:])[:members], found)
 
 
-def _group(system, equations, how, own, shared, ts, tolerances):
+def _batch(system, equations, options, own, shared, ts, tolerances):
     """Members that share their steps."""
-    solve = functools.partial(_motions, equations, how)
-    run = differentiable_abreast(solve, functools.partial(_drift, equations), functools.partial(_varied_motions, equations, how))
+    solve = functools.partial(_motions, equations, options)
+    push = functools.partial(_motions_and_variations, equations, options)
+    run = differentiable_batch(solve, functools.partial(_drift, equations), push)
     last = jax.tree.map(lambda leaf: jnp.moveaxis(leaf, 0, -1), own)
     ys, (result, stats, moved) = run(((ts[0], tolerances, shared), last), ts)
 
@@ -189,44 +207,45 @@ def _group(system, equations, how, own, shared, ts, tolerances):
     return jax.vmap(one, in_axes=(-1, -1, 0, 0, 0))(ys, last_ys, result, moved, own)
 
 
-def _motions(equations, how, inputs, ts):
+def _motions(equations, options, inputs, ts):
     """States at the samples, (T, size, members); and, not differentiated, why each motion ended, the counts, how far starts were off."""
     (t0, tolerances, shared), own = inputs
-    y0, start = _started(equations, inputs, ts)
-    args = (solved(shared["params"]), own["params"]), None
-    ys, result, stats = states_at(Abreast(equations), how, dfx.ForwardMode(), t0, y0, ts, args, tolerances)
-    return _judged(ys, result, stats, start)
+    y0, start = _initialised(equations, inputs, ts)
+    args = Arguments(with_second_derivatives(shared["params"]), own=own["params"])
+    ys, result, stats = states_at(BatchedEquations(equations), options, dfx.ForwardMode(), t0, y0, ts, args, tolerances)
+    return _with_status(ys, result, stats, start)
 
 
-def _varied_motions(equations, how, moving, still, directions, ts):
-    """The same with derivatives along directions of what moves, by the variational equations where they hold."""
-    (t0, tolerances, shared), own = eqx.combine(moving, still)
-    if not can_be_varied(equations, how, moving[0][2]["params"], shared["params"]):
-        return pushed(functools.partial(_motions, equations, how))(moving, still, directions, ts)
-    started = lambda moving: _started(equations, eqx.combine(moving, still), ts)
-    args = (solved(shared["params"]), own["params"]), (directions[0][2]["params"], directions[1]["params"])
-    along_all = moving, directions, t0, directions[0][0], ts, args
-    ys, change, *rest = states_varied(Abreast(equations), how, started, *along_all, tolerances)
-    ys, aux = _judged(ys, *rest)
+def _motions_and_variations(equations, options, varying, constant, directions, ts):
+    """The same with derivatives along directions of what varies, by the variational equations where they hold."""
+    (t0, tolerances, shared), own = eqx.combine(varying, constant)
+    if not is_variational(equations, options, varying[0][2]["params"], shared["params"]):
+        return pushforward(functools.partial(_motions, equations, options))(varying, constant, directions, ts)
+    initial = lambda varying: _initialised(equations, eqx.combine(varying, constant), ts)
+    of_params = directions[0][2]["params"], directions[1]["params"]
+    args = Arguments(with_second_derivatives(shared["params"]), own=own["params"], directions=of_params)
+    along_all = varying, directions, t0, directions[0][0], ts, args
+    ys, change, *rest = states_and_variations(BatchedEquations(equations), options, initial, *along_all, tolerances)
+    ys, aux = _with_status(ys, *rest)
     return ys, jnp.where(jnp.isfinite(ys)[..., None], change, 0), aux
 
 
-def _started(equations, inputs, ts):
+def _initialised(equations, inputs, ts):
     """y0; and, not differentiated, how far starts were off and what is wrong with them."""
     (t0, _, shared), own = inputs
-    shared = shared | {"params": solved(shared["params"])}
+    shared = shared | {"params": with_second_derivatives(shared["params"])}
 
     def start(own):
         member = eqx.combine(own, shared)
         q, v = (ravel_pytree(member[name])[0] for name in ("q0", "qdot0"))
-        found = begun(equations, t0, q, v, member["params"])
-        return found.y, (found.moved, judged(found.y, RESULTS.successful, found.obstacles, (member, ts))[1])
+        found = initialised(equations, t0, q, v, member["params"])
+        return found.y, (found.moved, with_status(found.y, RESULTS.successful, found.conditions, (member, ts))[1])
 
     y0, start = jax.vmap(start, in_axes=-1, out_axes=(-1, 0))(own)
     return y0, start
 
 
-def _judged(ys, result, stats, start):
+def _with_status(ys, result, stats, start):
     moved, started = start
     result = jax.vmap(lambda started: RESULTS.where(started == RESULTS.successful, result, started))(started)
     return jnp.where((started == RESULTS.successful)[None, None] & jnp.isfinite(ys), ys, jnp.nan), (result, stats, moved)
@@ -234,35 +253,5 @@ def _judged(ys, result, stats, start):
 
 def _drift(equations, inputs, ts, ys):
     (_, _, shared), own = inputs
-    args = (shared["params"], own["params"]), None
-    return jax.vmap(lambda t, y: Abreast(equations).rates(t, y, args))(ts, ys)
-
-
-@dataclasses.dataclass(frozen=True)
-class Abreast:
-    """The equations of motion of members that share their steps, as one system: y has them as its last axis."""
-
-    equations: Equations
-    rows = 0
-
-    @property
-    def size(self) -> int:
-        return self.equations.size
-
-    @property
-    def projection(self) -> Projection | None:
-        return self.equations.projection
-
-    def error_norm(self, error):
-        """That of the worst."""
-        return jnp.max(self.equations.error_norm(error))
-
-    def rates(self, t, y, args):
-        return self._each(self.equations.rates, t, y, args)
-
-    def kept(self, t, y, args):
-        return self._each(self.equations.kept, t, y, args)
-
-    def _each(self, function, t, y, args):
-        (shared, own), scales = args
-        return jax.vmap(lambda y, own: function(t, y, (eqx.combine(shared, own), scales)), in_axes=-1, out_axes=-1)(y, own)
+    args = Arguments(shared["params"], own=own["params"])
+    return jax.vmap(lambda t, y: BatchedEquations(equations).rates(t, y, args))(ts, ys)

@@ -1,9 +1,9 @@
-"""Watching a step, so that no end of a mode and no pulse is missed.
+"""Monitoring a step, so that no end of a mode and no pulse is missed.
 
-A mode may end and begin again between two looks in two ways. What follows the state is smooth on a step, so a dip shows in the slopes at
-the looks on both sides of it. What follows the time alone, a load that comes as a pulse, need not show at all: bounds of it over the
-whole interval (`_program.time_bounds`) say by how much it may have changed there. Wherever a margin may have been used up, looks are
-closer.
+A mode may end and begin again between two samples of a step in two ways. What follows the state is smooth on a step, so a dip shows in
+the slopes at the samples on both sides of it. What follows time alone, such as a load that comes as a pulse, need not show at all:
+bounds of it over the whole interval (`_program.time_bounds`) say by how much it may have changed there. Wherever a margin may have been
+used up, samples are closer.
 """
 
 from collections.abc import Callable
@@ -16,7 +16,7 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
-from .._program.time_bounds import OfTime, of_time
+from .._program.time_bounds import TimeDependence, time_dependence
 
 LOOKS = 8  # parts of an interval, at whose ends it is looked at
 NEARER = (1e-2, 1e-4, 1e-7)  # of an interval with an end in it, how close around the root of its chord it is looked at next
@@ -66,10 +66,10 @@ def first_end(margins: Callable, path: Callable, t0, t1, elements: int, scales: 
 
     Not `exactly`: only whether there is one.
     """
-    parted = of_time(margins, t0, path(t0))
-    look, near = _looking(margins, path, t0, t1, parted), NEAR * scales.rounding
+    of_time_alone = time_dependence(margins, t0, path(t0))
+    look, near = _looking(margins, path, t0, t1, of_time_alone), NEAR * scales.rounding
     brief = jnp.maximum(BRIEF * scales.duration, near)
-    if parted is not None and not parted.is_bounded:
+    if of_time_alone is not None and not of_time_alone.is_bounded:
         brief = jnp.maximum(brief, jnp.minimum(UNBOUNDED * scales.duration, scales.spacing))
 
     def closer(search):
@@ -115,12 +115,12 @@ def is_hidden(rates: Callable, nodes: np.ndarray, t0, t1, y, scales: Any) -> Any
 
     Such a pulse the error of the step does not know of. `nodes` are the times of the stages, from 0 to 1.
     """
-    parted = of_time(rates, t0, y)
-    if parted is None or not parted.is_bounded:
+    of_time_alone = time_dependence(rates, t0, y)
+    if of_time_alone is None or not of_time_alone.is_bounded:
         return jnp.array(False)
     flat = lambda leaves: jnp.concatenate([jnp.ravel(leaf).astype(y.dtype) for leaf in leaves])
-    ends = lambda start, end: [flat(side) for side in zip(*parted.bounds(start, end), strict=True)]
-    seen = jax.vmap(lambda t: flat(parted.phi(t)))(t0 + (t1 - t0) * nodes)
+    ends = lambda start, end: [flat(side) for side in zip(*of_time_alone.bounds(start, end), strict=True)]
+    seen = jax.vmap(lambda t: flat(of_time_alone.phi(t)))(t0 + (t1 - t0) * nodes)
     least, most = jnp.min(seen, axis=0), jnp.max(seen, axis=0)
     grid = t0 + (t1 - t0) * np.linspace(0, 1, PARTS + 1)
     low, high = jax.vmap(ends)(grid[:-1], grid[1:])
@@ -146,18 +146,18 @@ def _dips(value, slope, part):
     return turns & (left + falls * meeting < 0)
 
 
-def _looking(margins, path, t0, t1, parted: OfTime | None) -> Callable[..., Looks]:
+def _looking(margins, path, t0, t1, of_time_alone: TimeDependence | None) -> Callable[..., Looks]:
     """Looks at some times along a path."""
 
     def along(t):
         y, dy = jax.jvp(path, (t,), (jnp.ones_like(t),))
         return jax.jvp(margins, (t, y), (jnp.ones_like(t), dy))
 
-    if parted is None:
+    if of_time_alone is None:
         changed = lambda ts: jnp.zeros(())
     else:
-        reach = jnp.max(jax.vmap(lambda t: _reach(parted, t, path(t)))(jnp.linspace(t0, t1, 3)), axis=0)
-        changed = lambda ts: jax.vmap(lambda start, end: _change(parted, reach, start, end))(ts[:-1], ts[1:])
+        reach = jnp.max(jax.vmap(lambda t: _reach(of_time_alone, t, path(t)))(jnp.linspace(t0, t1, 3)), axis=0)
+        changed = lambda ts: jax.vmap(lambda start, end: _change(of_time_alone, reach, start, end))(ts[:-1], ts[1:])
 
     def looks(ts):
         value, slope = jax.vmap(along)(ts)
@@ -166,16 +166,16 @@ def _looking(margins, path, t0, t1, parted: OfTime | None) -> Callable[..., Look
     return looks
 
 
-def _reach(parted: OfTime, t, y) -> Float[Array, "m p"]:
+def _reach(of_time_alone: TimeDependence, t, y) -> Float[Array, "m p"]:
     """|∂f/∂φ|."""
-    found = parted.phi(t)
+    found = of_time_alone.phi(t)
     phi, unravel = ravel_pytree(eqx.filter(found, eqx.is_inexact_array))
-    return jnp.abs(jax.jacfwd(lambda phi: parted.rest(eqx.combine(unravel(phi), found), y))(phi))
+    return jnp.abs(jax.jacfwd(lambda phi: of_time_alone.rest(eqx.combine(unravel(phi), found), y))(phi))
 
 
-def _change(parted: OfTime, reach, start, end):
+def _change(of_time_alone: TimeDependence, reach, start, end):
     """By how much φ may change f from one time to another, with |∂f/∂φ|; choices may change it altogether."""
-    intervals = parted.bounds(start, end)
+    intervals = of_time_alone.bounds(start, end)
     widths = [high - low for low, high in intervals if jnp.issubdtype(low.dtype, jnp.inexact)]
     switches = [jnp.any(low != high) for low, high in intervals if not jnp.issubdtype(low.dtype, jnp.inexact)]
     width = jnp.concatenate([jnp.ravel(width) for width in widths]) if widths else jnp.zeros(0, reach.dtype)

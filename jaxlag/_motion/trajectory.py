@@ -13,19 +13,19 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float, PyTree
 
-from .._mechanics.friction_terms import kinks_of
-from .._mechanics.power import energy_turnover
-from .._mechanics.stick_slip import Regularised
-from .._model.paths import leaf_names
-from .._model.system import bind
+from .._mechanics.friction_elements import find_elements
+from .._mechanics.power import energy_exchange
+from .._model.deprecation import warn_renamed
+from .._model.flat import bind
 from .._program.jit import compiled, is_concrete
+from .card import card
 from .export import arrays_of, frame_of, outline, write_arrays
 from .interpolation import Moving, between
-from .provenance import Recorded, Stated
-from .results import RESULTS, names_of, reason_of
+from .provenance import Provenance, Recorded
+from .results import RESULTS, names_of
 
 
-class Rubbing(eqx.Module):
+class FrictionState(eqx.Module):
     """Dry friction along a motion: the `force` on each slip velocity, also while it sticks, and whether it is `sticking`."""
 
     force: Float[Array, "..."]
@@ -33,7 +33,7 @@ class Rubbing(eqx.Module):
 
 
 class Instant(eqx.Module):
-    """A motion at one of its samples: `t`, and the state there, e.g. to go on from."""
+    """A motion at one of its samples: the time `t`, and `q`, `qdot`, `qddot` and `multipliers` there, e.g. to continue from."""
 
     t: Float[Array, ""]
     q: PyTree
@@ -43,11 +43,11 @@ class Instant(eqx.Module):
 
 
 class Interpolated(eqx.Module):
-    """A motion at other times `ts`, as `Trajectory.at` gives it.
+    """A motion at other times `ts`, from `Trajectory.at`.
 
     - `q`, `qdot`, `qddot`: structured like q0, with the axes of `ts` first. NaN outside the motion.
-    - `q_error`, `qdot_error`: how far they may be off, by what interpolation misses samples by that are left out: where the motion is
-      smooth, some 64 and 18 times too much.
+    - `q_error`, `qdot_error`: error estimates, from how well interpolation reproduces samples that are left out: where the motion
+      is smooth, some 64 and 18 times too large.
     """
 
     ts: Float[Array, "..."]
@@ -71,10 +71,11 @@ class Trajectory(eqx.Module):
     - `ts`: the times; `q`, `qdot`, `qddot`: structured like q0; `multipliers`: λ by the constraint's name.
     - `result`: `RESULTS.successful`, or the reason of failure; samples that were not reached are NaN.
     - `friction`: by the name of the dissipation term, the `force` on its slip velocities and whether they are `sticking`.
-    - `works`: what `work()` returns, where the motion was computed with `audit=True`.
-    - `stats`: `num_steps`, `num_accepted_steps`, `num_rejected_steps`, and `start_moved`, how far the start was projected. With dry
-      friction, at each sample and since the start: `transitions`, how often slip velocities changed between sliding and sticking or
-      reversed; `time_stuck`, for how long each of them has stuck.
+    - `works`: what `work()` returns, where the motion was computed with `works=True`.
+    - `stats`: `num_steps`, `num_accepted_steps`, `num_rejected_steps`; `start_moved`, how far the initial state was projected;
+      `reached`, the time to which the motion was computed. With dry friction, at each sample and since the start: `transitions`, how
+      often slip velocities changed between sliding and sticking or reversed; `time_stuck`, for how long each of them has stuck.
+    - `provenance`: the system, params and treatment of friction that the motion was computed from.
     """
 
     ts: Float[Array, "*members T"]
@@ -85,8 +86,8 @@ class Trajectory(eqx.Module):
     result: RESULTS
     stats: dict[str, Any]
     works: dict[str, Float[Array, "*members T"]] | None
-    friction: dict[str, Rubbing]
-    stated: Stated | Recorded
+    friction: dict[str, FrictionState]
+    provenance: Provenance | Recorded
 
     @property
     def succeeded(self) -> Any:
@@ -99,24 +100,24 @@ class Trajectory(eqx.Module):
 
     def work(self) -> dict[str, Float[Array, " T"]]:
         """Work since the start of each dissipation term, force and constraint by its name, of explicit time in L (`"time"`), and of the
-        projection (`"projection"`). Integrated along with the motion: needs `simulate(..., audit=True)`.
+        projection (`"projection"`). Integrated along with the motion: needs `simulate(..., works=True)`.
         """
         if self.works is None:
             raise ValueError(
-                "the motion must be computed with its works, but was computed without. Ask for them by `simulate(..., audit=True)`."
+                "the motion must be computed with its works, but was computed without. Ask for them with `simulate(..., works=True)`."
             )
         return self.works
 
     def balance(self) -> Float[Array, " T"]:
-        """Residual of the energy balance, ΔE − ΣW, as a fraction of the energy turned over: the largest q̇ · ∂L/∂q̇ and all works."""
-        energy, turned = energies(self)
+        """Residual of the energy balance, ΔE − ΣW, as a fraction of the energy exchanged: the largest q̇ · ∂L/∂q̇ and all works."""
+        energy, exchanged = energies(self)
         works = jnp.stack(list(self.work().values()))
-        scale = jnp.nanmax(jnp.abs(turned)) + jnp.nansum(jnp.nanmax(jnp.abs(works), axis=1))
+        scale = jnp.nanmax(jnp.abs(exchanged)) + jnp.nansum(jnp.nanmax(jnp.abs(works), axis=1))
         return (energy - energy[0] - jnp.sum(works, axis=0)) / jnp.where(scale > 0, scale, 1)
 
     def slip(self) -> dict[str, Float[Array, "..."]]:
         """The slip velocities of each dissipation term with dry friction, shaped like `friction[name].force`."""
-        return self.stated.slip if isinstance(self.stated, Recorded) else _slips(self)
+        return self.provenance.slip if isinstance(self.provenance, Recorded) else _slips(self)
 
     def pulling(self) -> dict[str, PyTree]:
         """By the name of each constraint that is `one_sided`, at which samples λ < 0: there it would have to pull, and the contact would
@@ -127,7 +128,7 @@ class Trajectory(eqx.Module):
         def below(x):
             return x < -(jnp.finfo(x.dtype).eps ** 0.5) * jnp.nanmax(jnp.abs(x), axis=axis, keepdims=True)
 
-        return {name: jax.tree.map(below, self.multipliers[name]) for name in self.stated.one_sided}
+        return {name: jax.tree.map(below, self.multipliers[name]) for name in self.provenance.one_sided}
 
     def __len__(self) -> int:
         return self.ts.shape[0]
@@ -154,11 +155,11 @@ class Trajectory(eqx.Module):
         since = lambda count: chosen(count) - chosen(count)[:1]
         counts = {name: since(count) if name in COUNTED else count for name, count in self.stats.items()}
         works = None if self.works is None else jax.tree.map(since, self.works)
-        stated = self.stated
-        if isinstance(stated, Recorded):
-            stated = dataclasses.replace(stated, energies=chosen(stated.energies), slip=chosen(stated.slip))
+        provenance = self.provenance
+        if isinstance(provenance, Recorded):
+            provenance = dataclasses.replace(provenance, energies=chosen(provenance.energies), slip=chosen(provenance.slip))
         states = chosen((self.ts, self.q, self.qdot, self.qddot, self.multipliers))
-        return Trajectory(*states, self.result, counts, works, chosen(self.friction), stated)
+        return Trajectory(*states, self.result, counts, works, chosen(self.friction), provenance)
 
     def at(self, ts: Any) -> Interpolated:
         r"""The motion at other times, one or an array of them, interpolated between the samples by their q, q̇ and q̈.
@@ -182,8 +183,8 @@ class Trajectory(eqx.Module):
             )
         ts = jnp.asarray(ts, self.ts.dtype)
         if is_concrete(ts, self.ts):
-            (first, last), slack = np.asarray(self.ts)[[0, -1]], 4 * np.finfo(ts.dtype).eps * np.max(np.abs(self.ts))
-            outside = np.ravel(ts)[(np.ravel(ts) < first - slack) | (np.ravel(ts) > last + slack)]
+            (first, last), rounding = np.asarray(self.ts)[[0, -1]], 4 * np.finfo(ts.dtype).eps * np.max(np.abs(self.ts))
+            outside = np.ravel(ts)[(np.ravel(ts) < first - rounding) | (np.ravel(ts) > last + rounding)]
             if outside.size:
                 raise ValueError(
                     f"`ts` must lie within the motion, from {first:g} to {last:g}, but holds {outside[0]:g}. Simulate further."
@@ -214,73 +215,58 @@ class Trajectory(eqx.Module):
         return frame_of({entry(name, at): x[:, *at] for name, x in arrays for at in np.ndindex(x.shape[1:])}, frame)
 
     def save(self, file: str | Path) -> None:
-        """Writes the motion to a file that NumPy reads (.npz), with its energies and slip velocities; `jl.load` makes a `Trajectory` of it,
-        for which none of the functions of the system are needed. Pickles do need them.
+        """Writes the motion, with its energies and slip velocities, to `file` in the format of NumPy (.npz).
+
+        `jl.load` makes a `Trajectory` of it, without the functions of the system; a pickle needs them.
 
         Of params the numbers are kept. Structures become dicts and lists: of a NamedTuple the dict of its fields.
         """
         each = lambda function: functools.reduce(lambda f, _: jax.vmap(f), self.ts.shape[1:], function)
-        kept = Recorded(each(energies)(self), each(Trajectory.slip)(self), self.stated.params, self.stated.one_sided, self.stated.friction)
-        numbers = jax.tree.map(lambda leaf: leaf if eqx.is_array(leaf) else None, kept.params)
-        more = arrays_of(stats=self.stats, energy=dict(zip(("h", "turned"), kept.energies, strict=True)), slip=kept.slip, params=numbers)
+        of = self.provenance
+        recorded = Recorded(each(energies)(self), each(Trajectory.slip)(self), of.params, of.one_sided, of.friction)
+        numbers = jax.tree.map(lambda leaf: leaf if eqx.is_array(leaf) else None, recorded.params)
+        energy = dict(zip(("h", "turned"), recorded.energies, strict=True))
+        more = arrays_of(stats=self.stats, energy=energy, slip=recorded.slip, params=numbers)
         trees = dict(q=self.q, multipliers=self.multipliers, params=numbers)
         write_arrays(
             file,
             "Trajectory",
             self.to_dict() | more | {"result": names_of(self.result)},
             outlines={name: outline(tree, arrays_of(**{name: tree})) for name, tree in trees.items()},
-            audit=self.works is not None,
-            one_sided=kept.one_sided,
-            friction={type(kept.friction).__name__: dataclasses.asdict(kept.friction)},
+            audit=self.works is not None,  # the name in files
+            one_sided=recorded.one_sided,
+            friction={type(recorded.friction).__name__: dataclasses.asdict(recorded.friction)},
         )
 
     def _vectors(self):
         return [_ravelled(tree) for tree in (self.q, self.qdot)]
 
     def _flat(self):
-        return bind(self.stated.system, jax.tree.map(lambda leaf: leaf[0], self.q), self.stated.params)
+        return bind(self.provenance.system, jax.tree.map(lambda leaf: leaf[0], self.q), self.provenance.params)
 
     def __repr__(self) -> str:
-        if not is_concrete(self):
-            return "Trajectory(traced)"
-        batch = self.ts.shape[:-1]
-        rows = [("coordinates", ", ".join(leaf_names(self.q)))]
-        if self.multipliers:
-            rows.append(("constraints", ", ".join(self.multipliers)))
-        steps, rejected = (np.asarray(self.stats[key]) for key in ("num_steps", "num_rejected_steps"))
-        rows.append(("steps", f"{steps.max()}, {rejected.max()} of them rejected" + (" (the most in the batch)" if batch else "")))
-        if self.multipliers:
-            rows.append(("start moved by", f"{np.max(self.stats['start_moved']):.2g}"))
-        if self.friction:
-            transitions, stuck = (np.nan_to_num(self.stats[name]) for name in COUNTED)  # NaN where the motion has not come to
-            most = " (the most in the batch)" if batch else ""
-            rows.append(("friction", f"{int(transitions.max())} transitions, stuck for {stuck.max():.4g}{most}"))
-        if isinstance(self.stated.friction, Regularised):
-            rows.append(("friction", f"made smooth below a slip velocity of {self.stated.friction.width:g}, where it creeps"))
-        if self.works is not None:
-            residual = self.balance() if not batch else jax.vmap(lambda motion: motion.balance())(self)
-            rows.append(("energy balance", f"off by {np.nanmax(np.abs(residual)):.1e} of the energy turned over"))
-        for name, pulls in self.pulling().items():
-            rows.append(("one-sided", _pulled(name, pulls, self)))
-        rows.append(("result", "successful" if np.all(self.succeeded) else reason_of(self.result)))
-        of = f"{' × '.join(map(str, batch))} motions of " if batch else ""
-        head = f"Trajectory: {of}{self.ts.shape[-1]} samples, t = {np.min(self.ts):g} … {np.max(self.ts):g}"
-        return "\n".join([head, *(f"  {name:<15}{value}" for name, value in rows)])
+        return card(self)
+
+    @property
+    def stated(self) -> Provenance | Recorded:
+        """Deprecated name of `provenance`."""
+        warn_renamed("stated", "provenance")
+        return self.provenance
 
 
 @compiled  # so that parameters are unknown, as they were in the motion: a friction of 0 is one, too
 def _slips(motion: Trajectory) -> dict[str, Float[Array, "..."]]:
     flat, (q, v) = motion._flat(), motion._vectors()
-    kinks = kinks_of(flat, motion.ts[0], q[0], v[0]) if motion.friction else None
-    if kinks is None:
+    elements = find_elements(flat, motion.ts[0], q[0], v[0]) if motion.friction else None
+    if elements is None:
         return {}
-    slip = jax.vmap(kinks.slip)(motion.ts, q, v)
-    return {name: slip[:, rows].reshape(motion.friction[name].force.shape) for name, rows in kinks.rows_of_term.items()}
+    slip = jax.vmap(elements.slip)(motion.ts, q, v)
+    return {name: slip[:, rows].reshape(motion.friction[name].force.shape) for name, rows in elements.rows_of_term.items()}
 
 
 def energies(motion: Trajectory) -> tuple[Float[Array, " T"], Float[Array, " T"]]:
     """The energy h and q̇ · ∂L/∂q̇ at the samples."""
-    return motion.stated.energies if isinstance(motion.stated, Recorded) else _energies(motion)
+    return motion.provenance.energies if isinstance(motion.provenance, Recorded) else _energies(motion)
 
 
 def _ravelled(tree):
@@ -289,7 +275,7 @@ def _ravelled(tree):
 
 @compiled
 def _energies(motion):
-    return jax.vmap(functools.partial(energy_turnover, motion._flat()))(motion.ts, *motion._vectors())
+    return jax.vmap(functools.partial(energy_exchange, motion._flat()))(motion.ts, *motion._vectors())
 
 
 @compiled
@@ -297,16 +283,3 @@ def _between(motion, at):
     unravelled = jax.vmap(ravel_pytree(jax.tree.map(lambda leaf: leaf[0], motion.q))[1])
     found, error = between(motion.ts, Moving(*map(_ravelled, (motion.q, motion.qdot, motion.qddot))), at)
     return [unravelled(x) for x in (*found, error.q, error.v)]
-
-
-def _pulled(name, pulls, motion):
-    """What the card says of a constraint that cannot pull."""
-    samples = lambda tree: np.concatenate([np.reshape(x, (*motion.ts.shape, -1)) for x in jax.tree.leaves(tree)], axis=-1)
-    where, multipliers = np.any(samples(pulls), axis=-1), samples(motion.multipliers[name])
-    if not where.any():
-        return f"{name!r} never pulls"
-    several = f"of {int(where.any(axis=-1).sum())} motions " if where.ndim > 1 else ""
-    return (
-        f"{name!r} would have to pull at {where.sum()} of {where.size} samples {several}(first at t = {motion.ts[where].min():g}, "
-        f"λ down to {np.nanmin(multipliers):.3g}): its contact would have opened"
-    )

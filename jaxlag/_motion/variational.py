@@ -15,28 +15,40 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
+from .._mechanics.projection import Projection
+from .protocol import Arguments, FirstOrderSystem
 
-def along(function: Callable, x: Any, directions: Any) -> tuple[Any, Any, Any]:
+
+def jvp_along(function: Callable, x: Any, directions: Any) -> tuple[Any, Any, Any]:
     """`function(x) -> (y, aux)`: y, its derivatives along the directions, which come last in their leaves, and aux."""
     one = lambda dx: jax.jvp(function, (x,), (dx,), has_aux=True)
     return jax.vmap(one, in_axes=-1, out_axes=(None, -1, None))(directions)
 
 
-def parted(x: Any, dx: Any) -> tuple[Any, Any]:
-    """What moves of x, and what stands still, whose dx is None."""
+def pushforward(solve: Callable) -> Callable:
+    """How `solve` itself differentiates forward: y, its derivatives along directions, which come last in their leaves, and aux."""
+
+    def push(varying, constant, directions, ts):
+        return jvp_along(lambda varying: solve(eqx.combine(varying, constant), ts), varying, directions)
+
+    return push
+
+
+def split_varying(x: Any, dx: Any) -> tuple[Any, Any]:
+    """What varies of x, and what is constant, whose dx is None."""
     return eqx.partition(x, jax.tree.map(lambda d: d is not None, dx, is_leaf=lambda d: d is None))
 
 
-def beside(y: Array, dy: Array) -> Array:
+def with_variations(y: Array, dy: Array) -> Array:
     """y and its variations, as one array with the variations last."""
     return jnp.concatenate([y[..., None], dy], axis=-1)
 
 
 @dataclasses.dataclass(frozen=True)
-class Varied:
-    """Equations of motion without stick and slip, with their variations; `args` are (params, δparams)."""
+class VariationalEquations:
+    """The `FirstOrderSystem` of a motion without stick and slip together with its variations, which are the last axis of y."""
 
-    equations: Any
+    equations: FirstOrderSystem
     rows = 0
 
     @property
@@ -44,22 +56,26 @@ class Varied:
         return self.equations.size
 
     @property
-    def projection(self) -> Any:
+    def projection(self) -> Projection | None:
         return self.equations.projection
 
-    def error_norm(self, error) -> Array:
+    def error_norm(self, error: Array) -> Array:
         """The error of the motion alone sets the steps."""
         return self.equations.error_norm(error[..., 0])
 
-    def rates(self, t, y, args):
+    def rates(self, t: Any, y: Array, args: Arguments) -> Array:
         return self._varied(self.equations.rates, t, y, args)
 
-    def kept(self, t, y, args):
-        return self._varied(self.equations.kept, t, y, args)
+    def projected(self, t: Any, y: Array, args: Arguments) -> Array:
+        return self._varied(self.equations.projected, t, y, args)
 
     def _varied(self, function, t, y, args):
-        params, d_params = args
-        moving, still = parted(params, d_params)
-        of_both = lambda both: (function(t, both[0], (eqx.combine(both[1], still), None)), None)
-        value, change, _ = along(of_both, (y[..., 0], moving), (y[..., 1:], d_params))
-        return beside(value, change)
+        varying, constant = split_varying((args.params, args.own), args.directions)
+        of_both = lambda both: (function(t, both[0], _arguments(eqx.combine(both[1], constant))), None)
+        value, change, _ = jvp_along(of_both, (y[..., 0], varying), (y[..., 1:], args.directions))
+        return with_variations(value, change)
+
+
+def _arguments(numbers):
+    params, own = numbers
+    return Arguments(params, own=own)

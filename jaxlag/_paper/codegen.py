@@ -1,4 +1,4 @@
-"""Equations of motion as programs that need nothing of this package: NumPy, C."""
+"""Equations of motion as programs that do not need this package: NumPy, C."""
 
 import keyword
 import re
@@ -10,28 +10,28 @@ from sympy.printing.c import C99CodePrinter, reserved_words
 from sympy.printing.codeprinter import CodePrinter, PrintMethodNotImplementedError
 from sympy.printing.numpy import NumPyPrinter
 
-from .derivation import derivative
+from .derivative import derivative
 
 
 class Program(NamedTuple):
-    """What is computed from what: q̈ and λ, which make the residuals zero, by formulas where all have one."""
+    """What a program computes: q̈ and λ, which make the residuals zero, by formulas where all have one."""
 
     t: Symbol
     q: tuple[Symbol, ...]
     qdot: tuple[Symbol, ...]
     qddot: tuple[Symbol, ...]
-    params: list[tuple[Symbol, str]]  # and how Python reaches them
+    params: list[tuple[Symbol, str]]  # each with its path in Python
     multipliers: tuple[Symbol, ...]
     residuals: tuple[Expr, ...]
     solution: dict[Symbol, Expr]
 
     @property
     def unknowns(self) -> tuple[Symbol, ...]:
-        """Accelerations, then multipliers: z."""
+        """The accelerations, then the multipliers: z."""
         return (*self.qddot, *self.multipliers)
 
     def formulas(self) -> list[Expr] | None:
-        """Those of z; None where some have none."""
+        """Formulas of z; None where some unknown has none."""
         return [self.solution[x] for x in self.unknowns] if all(x in self.solution for x in self.unknowns) else None
 
     def system(self) -> tuple[Matrix, Matrix]:
@@ -39,32 +39,32 @@ class Program(NamedTuple):
         A = Matrix([[derivative(residual, x) for x in self.unknowns] for residual in self.residuals])
         if not A.free_symbols.isdisjoint(self.unknowns):
             raise ValueError(
-                "`force` and `dissipation` must be linear in the multipliers where a program is to solve for these, but they are not. "
-                "Say which multipliers are `positive`, or take the second kind of Lagrange's equations."
+                "`force` and `dissipation` must be linear in the multipliers for a program to solve for them, but they are not. "
+                "Say which multipliers are `positive`, or eliminate coordinates (`multipliers=False`)."
             )
         at_zero = dict.fromkeys(self.unknowns, sympy.Integer(0))
         return A, Matrix([-residual.xreplace(at_zero) for residual in self.residuals])
 
 
-OWN = re.findall(r"\w+", "t q qdot params qddot multipliers acceleration matrix right size solution solve numpy math functools")
-TAKEN = frozenset((*keyword.kwlist, *OWN))
-IN_C = re.findall(
+OWN_NAMES = re.findall(r"\w+", "t q qdot params qddot multipliers acceleration matrix right size solution solve numpy math functools")
+RESERVED_IN_PYTHON = frozenset((*keyword.kwlist, *OWN_NAMES))
+C_FUNCTIONS = re.findall(
     r"\w+", "fabs fmax fmin pow sqrt exp log sin cos tan asin acos atan atan2 sinh cosh tanh asinh acosh atanh erf erfc floor ceil"
 )
-TAKEN_IN_C = frozenset((*reserved_words, *OWN, *IN_C))
+RESERVED_IN_C = frozenset((*reserved_words, *OWN_NAMES, *C_FUNCTIONS))
 
 
 LEAST_NORM = [
     "size = numpy.abs(matrix).max(axis=1)",
     "size[size == 0] = 1",
-    "# constraints may depend on each other: then the multipliers are those of least norm",
+    "# constraints may be redundant: then the multipliers are those of least norm",
     "solution = numpy.linalg.lstsq(matrix / size[:, None], right / size, rcond=1e-12)[0]",
 ]
 
 
 def to_python(program: Program) -> str:
-    """The text of a NumPy function."""
-    writer = _Writer(program, NumPyPrinter({"strict": True}), TAKEN)
+    """The source of a NumPy function."""
+    writer = _Writer(program, NumPyPrinter({"strict": True}), RESERVED_IN_PYTHON)
     names = lambda symbols: ", ".join(writer.names[symbol] for symbol in symbols)
     array = lambda formulas: f"numpy.array([{', '.join(formulas)}], float)"
     body = [f"{names(part)}{',' * (len(part) == 1)} = {given}" for part, given in ((program.q, "q"), (program.qdot, "qdot"))]
@@ -85,8 +85,8 @@ def to_python(program: Program) -> str:
 
 
 def to_c(program: Program) -> str:
-    """The text of a function in C99."""
-    writer = _Writer(program, C99CodePrinter({"strict": True, "math_macros": {}}), TAKEN_IN_C)
+    """The source of a function in C99."""
+    writer = _Writer(program, C99CodePrinter({"strict": True, "math_macros": {}}), RESERVED_IN_C)
     given = [("q", program.q), ("qdot", program.qdot), ("params", tuple(symbol for symbol, _ in program.params))]
     body = [f"const double {writer.names[symbol]} = {part}[{i}];" for part, symbols in given for i, symbol in enumerate(symbols)]
     body += [f"const double {name} = {formula};" for name, formula in writer.shared]
@@ -107,14 +107,14 @@ def to_c(program: Program) -> str:
 
 
 class _Writer:
-    """Formulas in a language: names for the symbols, the steps that several formulas share, and z, or A and b, by them."""
+    """Formulas in a language: names of the symbols, common subexpressions, and with these z, or A and b."""
 
-    def __init__(self, program: Program, printer: CodePrinter, taken: frozenset[str]):
+    def __init__(self, program: Program, printer: CodePrinter, reserved: frozenset[str]):
         self.printer = printer
         self.names: dict[Symbol, str] = {program.t: "t"}
         for symbol in (*program.q, *program.qdot, *(symbol for symbol, _ in program.params), *program.multipliers):
             name = re.sub(r"\W", "_", symbol.name)
-            while name in taken or name in self.names.values():
+            while name in reserved or name in self.names.values():
                 name += "_"
             self.names[symbol] = name
         z = program.formulas()
@@ -123,25 +123,25 @@ class _Writer:
         formulas = [formula.xreplace(renamed) for formula in (*(z or []), *A, *b)]
         fresh = (symbol for symbol in sympy.numbered_symbols("s", real=True) if symbol.name not in self.names.values())
         shared, final = sympy.cse(formulas, symbols=fresh, order="none")
-        self.shared = [(symbol.name, self._written(formula)) for symbol, formula in shared]
-        written = list(map(self._written, final))
+        self.shared = [(symbol.name, self._print(formula)) for symbol, formula in shared]
+        printed = list(map(self._print, final))
         columns = len(program.unknowns)
-        self.z = written if z is not None else []
-        self.A = [written[i * columns : (i + 1) * columns] for i in range(A.rows)]
-        self.b = written[A.rows * columns :] if z is None else []
+        self.z = printed if z is not None else []
+        self.A = [printed[i * columns : (i + 1) * columns] for i in range(A.rows)]
+        self.b = printed[A.rows * columns :] if z is None else []
 
-    def _written(self, formula: Expr) -> str:
+    def _print(self, formula: Expr) -> str:
         try:
             return self.printer.doprint(formula)
         except PrintMethodNotImplementedError as error:
             unknown = str(error).splitlines()[0].split()[-1]
             raise ValueError(
-                f"a program must use functions that its language has, but has {unknown}. Write the system by others."
+                f"a program must use functions that its language has, but has {unknown}. Write the system with others."
             ) from None
 
 
 CONSTANTS = {constant: sympy.Float(constant, 17) for constant in (sympy.pi, sympy.E)}
-SOLVE = """/* z of A z = b, by elimination with complete pivoting; of least norm where rows depend on each other. */
+SOLVE = """/* z of A z = b, by elimination with complete pivoting; of least norm where rows are linearly dependent. */
 static void solve(int n, double A[n][n], double *b, double *z)
 {
     int place[n], rank = 0;
@@ -171,7 +171,7 @@ static void solve(int n, double A[n][n], double *b, double *z)
         }
     }
     for (int i = 0; i < n; i++) z[place[i]] = i < rank ? b[i] / A[i][i] : 0;
-    for (int k = rank; k < n; k++) { /* take out what A does not see: its null vectors, one orthogonal to the other */
+    for (int k = rank; k < n; k++) { /* remove the null space of A, by orthogonal null vectors */
         for (int i = 0; i < n; i++) free[k][place[i]] = i < rank ? -A[i][k] / A[i][i] : i == k;
         for (int l = rank; l <= k; l++) {
             double *target = l < k ? free[k] : z, *along = l < k ? free[l] : free[k], dot = 0, square = 0;

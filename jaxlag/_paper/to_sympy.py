@@ -1,156 +1,67 @@
-"""Functions of arrays as formulas: jaxprs evaluated over SymPy expressions, with exact numbers.
+"""Any function of arrays as a formula. SymPy is imported when one is asked for."""
 
-Imported where a formula is asked for, and nowhere else: SymPy is an extra.
-"""
-
-import functools
-import itertools
-import math
-import operator
 from collections.abc import Callable
-from fractions import Fraction
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
-import sympy
 from jaxtyping import PyTree
-from sympy.logic.boolalg import Boolean
-
-from .._program.interpreter import evaluate
-from .._program.scalar_graph import Algebra, filled
 
 
-def formulas(function: Callable, *arguments: PyTree[np.ndarray]) -> PyTree[np.ndarray]:
-    """`function` of pytrees of arrays of expressions, or of numbers; traced in double precision, whatever the programs run in."""
-    shapes = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, float if x.dtype.kind in "Of" else x.dtype), arguments)
-    with jax.enable_x64(True):
-        closed, out = jax.make_jaxpr(function, return_shape=True)(*shapes)
-        outputs = evaluate(closed, Formulas(), *jax.tree.leaves(arguments))
-    return jax.tree.unflatten(jax.tree.structure(out), [_expressions(array) for array in outputs])
+def to_sympy(function: Callable, *arguments: PyTree) -> PyTree:
+    r"""A function of arrays as a formula: its program, evaluated entry by entry on SymPy expressions.
+
+    $$ f(x_1, x_2, \dots) \;\mapsto\; \text{one expression for each entry of what } f \text{ returns} $$
+
+    It handles what Lagrangians are made of: arithmetic, elementary functions, abs, sign, min, max, where, indexing, reductions, products,
+    loops of known length, small linear solves, determinants and norms, and derivatives of all these. A float is written as the simple
+    fraction (of 1, of π, or under a root) to which it is the nearest float: 0.5 is 1/2, and `1 / 3` is 1/3. Other floats stay floats.
+
+    **Arguments:**
+
+    - `function`: a JAX function, jitted or not.
+    - `arguments`: its arguments, with SymPy expressions in place of numbers: pytrees of expressions and numbers, of lists of them (each a
+      vector) and of arrays or SymPy matrices of them, of any shape. Symbols stand for real numbers; make them with `real=True`.
+
+    **Returns:** what the function returns: an expression for each scalar, and a NumPy array of expressions, of the same shape, for each
+    array.
+
+    **Raises:** `NotImplementedError`, which names the operation and its line, where an operation has no formula; `TypeError` where an
+    argument is neither an expression nor a number; `ImportError` without SymPy.
+
+    **Source:** the program is JAX's jaxpr: Frostig, Johnson & Leary, Compiling machine learning programs via high-level tracing (2018).
+
+    ```python
+    import jax
+    import jax.numpy as jnp
+    import jaxlag as jl
+    import sympy
+    m, l, phi, omega = sympy.symbols("m l phi omega", real=True)
+    lagrangian = lambda phi, omega, m, l: 0.5 * m * (l * omega) ** 2 + m * l * jnp.cos(phi)
+    jl.to_sympy(lagrangian, phi, omega, m, l)  # l**2*m*omega**2/2 + l*m*cos(phi)
+    jl.to_sympy(jax.grad(lagrangian, argnums=1), phi, omega, m, l)  # l**2*m*omega
+    ```
+    """
+    require_sympy("to_sympy")
+    from .formulas import formulas
+
+    is_leaf = lambda node: isinstance(node, list) or hasattr(node, "applyfunc")
+    out = formulas(function, *jax.tree.map(_expressions, arguments, is_leaf=is_leaf))
+    return jax.tree.map(lambda array: array if array.shape else array[()], out)
 
 
-def _expressions(array: np.ndarray) -> np.ndarray:
-    return array if array.dtype == object else filled(array.shape, map(exact, array.flat))
+def require_sympy(what: str) -> None:
+    """Raises an error that names the extra where SymPy is missing."""
+    try:
+        import sympy  # noqa: F401
+    except ImportError as error:
+        raise ImportError(f"`{what}` must have SymPy, but it cannot be imported. Install `jaxlag[symbolic]`.") from error
 
 
-@functools.lru_cache(maxsize=4096)
-def exact(x: Any) -> sympy.Basic:
-    """A number as a person would write it: a simple fraction, of 1 or of π, or its root, where the float is the nearest one to it."""
-    if x.dtype.kind != "f":
-        return sympy.sympify(x.item())
-    value, precision = float(x), np.finfo(x.dtype)
-    if not math.isfinite(value):
-        return sympy.sympify(value)
-    if abs(value) <= precision.tiny:  # zero, or a threshold that keeps 0/0 out of a program
-        return sympy.Integer(0)
-    simple = 1000 if precision.bits == 64 else 100  # so few fractions that a float is hardly the nearest to one by chance
-    near = lambda y: sympy.Rational(*Fraction(y).limit_denominator(simple).as_integer_ratio())
-    if x.dtype.type(float(near(value))) == x:
-        return near(value)
-    if precision.bits == 64 and float(np.float32(value)) == value:  # a number that was made in single precision
-        return exact(np.float32(value))
-    sign = int(math.copysign(1, value))
-    roots = sympy.pi * near(value / math.pi), sign * sympy.sqrt(near(value**2)), sign * sympy.sqrt(sympy.pi * near(value**2 / math.pi))
-    computed = lambda number: abs(float(number) - value) <= 2 * precision.eps * abs(value)  # by a few roundings
-    return next(filter(computed, roots), sympy.Float(value))
-
-
-class Formulas(Algebra):
-    """Scalars are SymPy expressions of real symbols, truth values are SymPy's."""
-
-    def number(self, x):
-        """The number, exact where it was meant to be."""
-        return exact(np.asarray(x)[()])
-
-    def folds(self, x):
-        """Whole numbers and eighths: their arithmetic is exact in floating point. 1/3 and √2 are left to SymPy."""
-        return True if x.dtype.kind != "f" else (np.abs(x) < 2**15) & (8 * x == np.round(8 * x))
-
-    def function(self, primitive, params, dtype):
-        """From a table. Of whole numbers that are not known there is no division, and nothing by bits."""
-        if primitive.name == "convert_element_type":
-            return _converting(dtype)
-        is_whole = np.issubdtype(dtype, np.integer)
-        return None if is_whole and primitive.name in ("div", "rem", "and", "or", "xor", "not") else FUNCTIONS.get(primitive.name)
-
-    def shortcut(self, equation):
-        """Functions of JAX whose bodies guard against overflow or count signs."""
-        name = equation.params.get("name")
-        if name not in SHORTCUTS:
-            return None
-        function, formula = SHORTCUTS[name]
-        avals = [atom.aval for atom in equation.invars]
-        shapes = [jax.ShapeDtypeStruct(aval.shape, aval.dtype, weak_type=aval.weak_type) for aval in avals]
-        (call,) = jax.make_jaxpr(function)(*shapes).eqns
-        return formula if str(call.params["jaxpr"]) == str(equation.params["jaxpr"]) else None
-
-
-def _is_truth(x: Any) -> bool:
-    return isinstance(x, Boolean) and not isinstance(x, sympy.Expr)  # a symbol may be either
-
-
-def _converting(dtype: Any) -> Callable:
-    if np.issubdtype(dtype, np.bool_):
-        return lambda x: sympy.Ne(x, 0)
-    number = lambda x: sympy.Piecewise((1, x), (0, True)) if _is_truth(x) else x
-    if np.issubdtype(dtype, np.integer):
-        return lambda x: number(x) if _is_truth(x) or x.is_integer else sympy.sign(x) * sympy.floor(abs(x))
-    return number
-
-
-def _selected(which: Any, *cases: Any) -> Any:
-    if not _is_truth(which):
-        *others, last = cases
-        return sympy.Piecewise(*((case, sympy.Eq(which, k)) for k, case in enumerate(others)), (last, True))
-    no, yes = cases
-    return sympy.ITE(which, yes, no) if _is_truth(yes) else sympy.Piecewise((yes, which), (no, True))
-
-
-def _equal(x: Any, y: Any) -> Any:
-    return sympy.Equivalent(x, y) if _is_truth(x) else sympy.Eq(x, y)
-
-
-FUNCTIONS: dict[str, Callable] = {
-    **dict(add=operator.add, add_any=operator.add, sub=operator.sub, mul=operator.mul, div=operator.truediv, neg=operator.neg),
-    **dict(pow=operator.pow, sqrt=sympy.sqrt, rsqrt=lambda x: 1 / sympy.sqrt(x), abs=sympy.Abs, sign=sympy.sign),
-    **dict(exp=sympy.exp, exp2=lambda x: 2**x, expm1=lambda x: sympy.exp(x) - 1, log=sympy.log, log1p=lambda x: sympy.log(1 + x)),
-    **dict(sin=sympy.sin, cos=sympy.cos, tan=sympy.tan, asin=sympy.asin, acos=sympy.acos, atan=sympy.atan, atan2=sympy.atan2),
-    **dict(sinh=sympy.sinh, cosh=sympy.cosh, tanh=sympy.tanh, asinh=sympy.asinh, acosh=sympy.acosh, atanh=sympy.atanh),
-    **dict(cbrt=lambda x: sympy.sign(x) * sympy.cbrt(abs(x)), logistic=lambda x: 1 / (1 + sympy.exp(-x))),
-    **dict(erf=sympy.erf, erfc=sympy.erfc, erf_inv=sympy.erfinv, lgamma=lambda x: sympy.log(abs(sympy.gamma(x))), digamma=sympy.digamma),
-    **dict(max=sympy.Max, min=sympy.Min, clamp=lambda low, x, high: sympy.Min(sympy.Max(low, x), high)),
-    **dict(floor=sympy.floor, ceil=sympy.ceiling, rem=lambda x, y: x - y * sympy.sign(x / y) * sympy.floor(abs(x / y))),
-    **dict(eq=_equal, ne=lambda x, y: sympy.Not(_equal(x, y)), lt=operator.lt, le=operator.le, gt=operator.gt, ge=operator.ge),
-    "and": sympy.And,
-    "or": sympy.Or,
-    "xor": sympy.Xor,
-    "not": sympy.Not,
-    **dict(select_n=_selected, stop_gradient=lambda x: x, is_finite=lambda x: sympy.true),
-}
-
-
-def _determinant(A: np.ndarray) -> list[np.ndarray]:
-    batch = A.shape[:-2]
-    return [filled(batch, [sympy.Matrix(A[at]).det(method="berkowitz") for at in np.ndindex(batch)])]
-
-
-def _interpolated(x: np.ndarray, xp: np.ndarray, fp: np.ndarray, left: Any = None, right: Any = None) -> list[np.ndarray]:
-    """Straight lines from point to point of a table, level beyond its ends."""
-    points = list(zip(xp, fp, strict=True))
-    line = lambda x, a, b: a[1] + (b[1] - a[1]) / (b[0] - a[0]) * (x - a[0])
-
-    def at(x):
-        inside = [(line(x, a, b), x < b[0]) for a, b in itertools.pairwise(points) if a[0] != b[0]]  # where points are equal it jumps
-        before, beyond = (end[()] if end is not None else f for end, f in ((left, fp[0]), (right, fp[-1])))
-        return sympy.Piecewise((before, x < xp[0]), *inside, (fp[-1], sympy.Eq(x, xp[-1])), (beyond, True))
-
-    return [filled(x.shape, map(at, x.flat))]
-
-
-SHORTCUTS: dict[str, tuple[Callable, Callable]] = {
-    "hypot": (jnp.hypot, lambda x, y: [filled(x.shape, (sympy.sqrt(a**2 + b**2) for a, b in zip(x.flat, y.flat, strict=True)))]),
-    "det": (jnp.linalg.det, _determinant),
-    "_interp": (jnp.interp, _interpolated),
-}
+def _expressions(argument: Any) -> np.ndarray:
+    """An expression, a number, or a list, a matrix or an array of them."""
+    array = np.asarray(argument.tolist() if hasattr(argument, "applyfunc") else argument)
+    are_formulas = all(hasattr(x, "free_symbols") or isinstance(x, (int, float, np.generic)) for x in array.flat)
+    if not (are_formulas and array.dtype.kind in "Obiuf"):
+        raise TypeError(f"`arguments` must hold expressions and numbers, but hold {argument!r}. Make symbols by `sympy.Symbol`.")
+    return array

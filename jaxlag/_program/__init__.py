@@ -1,5 +1,5 @@
 """Programs of JAX, read and rewritten.
 
-One walker of jaxprs (`interpreter`) over any scalar algebra (`scalar_graph`), the structure of Jacobians, nonsmooth terms as they are
-written, bounds over intervals, and choices of the compiler.
+One walk over jaxprs (`walker`), their interpretation over any scalar algebra (`interpreter`, `scalar_graph`), the structure of Jacobians,
+absolute values and norms as they are written, bounds over intervals of time, and compiler options.
 """

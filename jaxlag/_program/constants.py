@@ -1,4 +1,4 @@
-"""Equations of numbers, computed while a program is read: by NumPy, which compiles nothing, or by JAX itself where they are not alike."""
+"""Constant folding: equations of numbers are computed while tracing, by NumPy, which compiles nothing, or by JAX where the two differ."""
 
 import functools
 from collections.abc import Callable
@@ -8,16 +8,21 @@ import jax
 import numpy as np
 from jax.extend import core
 
-KNOWN = frozenset(map(np.dtype, ("bool", *(f"{sign}int{bits}" for sign in ("", "u") for bits in (8, 16, 32, 64)), "float32", "float64")))
+FOLDABLE = frozenset(map(np.dtype, ("bool", *(f"{sign}int{bits}" for sign in ("", "u") for bits in (8, 16, 32, 64)), "float32", "float64")))
 
 
-def is_known(atom: Any) -> bool:
-    """Whether NumPy and JAX compute alike with its entries; with complex numbers or half precision that is not certain."""
-    return not is_extended(atom) and np.dtype(atom.aval.dtype) in KNOWN
+def is_foldable(atom: Any) -> bool:
+    """Whether NumPy and JAX agree on arithmetic of this dtype; with complex numbers or half precision that is not certain."""
+    return not has_extended_dtype(atom) and np.dtype(atom.aval.dtype) in FOLDABLE
 
 
-def is_extended(atom: Any) -> bool:
-    """Whether its entries are no numbers at all, as those of a random key."""
+def is_numeric(x: Any) -> bool:
+    """Whether its numbers are at hand: not traced, and not another object."""
+    return isinstance(x, (np.ndarray, np.generic, jax.Array, int, float)) and not isinstance(x, jax.core.Tracer)
+
+
+def has_extended_dtype(atom: Any) -> bool:
+    """Whether its elements are not numbers at all, like those of a random key."""
     return jax.dtypes.issubdtype(atom.aval.dtype, jax.dtypes.extended)
 
 
@@ -32,7 +37,7 @@ def folded(primitive: core.Primitive, params: dict, dtype: Any, *numbers: Any) -
 
 
 def converted(x: Any, dtype: Any) -> Any:
-    """In another dtype; None where a number has no place in it, which NumPy and XLA take differently."""
+    """In another dtype; None where a number is out of its range, where NumPy and XLA differ."""
     if np.dtype(dtype).kind in "iu" and x.dtype.kind == "f":
         ends = np.iinfo(dtype)
         return x.astype(dtype) if np.all((x > float(ends.min)) & (x < float(ends.max))) else None
@@ -49,7 +54,7 @@ def _remainder(x, y):
     return None if x.dtype.kind != "f" and np.any(y == 0) else np.fmod(x, y)
 
 
-# Element-wise primitives, and how numbers are folded; None: by JAX itself, as where the function gives None.
+# Element-wise primitives and their NumPy functions; None: folded by JAX itself, as where the function returns None.
 
 ELEMENTWISE: dict[str, Callable | None] = {
     **dict(add=np.add, add_any=np.add, sub=np.subtract, mul=np.multiply, neg=np.negative, abs=np.abs, sign=np.sign, pow=np.power),
@@ -75,21 +80,21 @@ ELEMENTWISE: dict[str, Callable | None] = {
 }
 
 
-def on_arrays(equation: Any) -> Callable[..., list]:
+def as_function(equation: Any) -> Callable[..., list]:
     """The equation as a function of its operands."""
     places = {atom: i for i, atom in enumerate(equation.invars) if not isinstance(atom, core.Literal)}
-    jaxpr = _nothing().replace(invars=list(places), outvars=equation.outvars, eqns=[equation], effects=equation.effects)
+    jaxpr = _empty_jaxpr().replace(invars=list(places), outvars=equation.outvars, eqns=[equation], effects=equation.effects)
     function = core.jaxpr_as_fun(core.ClosedJaxpr(jaxpr, ()))
     return lambda *operands: function(*(operands[i] for i in places.values()))
 
 
 @functools.cache
-def _nothing() -> Any:
-    """A program that does nothing."""
+def _empty_jaxpr() -> Any:
+    """An empty program."""
     return jax.make_jaxpr(lambda: ())().jaxpr
 
 
-def by_jax(equation: Any, operands: Any) -> list[np.ndarray]:
-    """The outputs of an equation of numbers, as JAX computes them now."""
+def fold_by_jax(equation: Any, operands: Any) -> list[np.ndarray]:
+    """The outputs of an equation of numbers, computed by JAX while tracing."""
     with jax.ensure_compile_time_eval():
-        return [np.asarray(x) for x in on_arrays(equation)(*operands)]
+        return [np.asarray(x) for x in as_function(equation)(*operands)]

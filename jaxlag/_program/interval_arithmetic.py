@@ -1,6 +1,6 @@
-"""Interval arithmetic: bounds of what an operation of JAX makes of operands that lie anywhere between two values.
+"""Interval arithmetic: bounds on the results of JAX's operations, whose operands lie anywhere between two values.
 
-What an operation has no good bounds for lies anywhere between −∞ and ∞.
+Where no good bounds are known, they are −∞ and ∞.
 Source: Moore, Kearfott & Cloud, Introduction to Interval Analysis (2009), chapters 2 and 5.
 """
 
@@ -12,8 +12,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-Interval = tuple[Any, Any]  # the least and the largest value, of arrays entry by entry
-WINDOW = 8  # entries of a table that are looked up at once
+Interval = tuple[Any, Any]  # the least and the greatest value, of arrays element by element
+WINDOW = 8  # elements of a table that are looked up at once
 
 
 def _extremes(dtype) -> tuple[Any, Any]:
@@ -23,30 +23,30 @@ def _extremes(dtype) -> tuple[Any, Any]:
 
 
 def anything(aval) -> Interval:
-    """Of an array of which nothing is known."""
+    """The interval of an array of which nothing is known."""
     least, most = _extremes(aval.dtype)
     return jnp.full(aval.shape, least, aval.dtype), jnp.full(aval.shape, most, aval.dtype)
 
 
-def _known(where, low, high) -> Interval:
+def _where_known(where, low, high) -> Interval:
     least, most = _extremes(low.dtype)
     return jnp.where(where, low, jnp.asarray(least, low.dtype)), jnp.where(where, high, jnp.asarray(most, low.dtype))
 
 
 def without_nan(low, high) -> Interval:
-    """Where an operation has no value at an end of the interval, or ∞ − ∞, it may be anything."""
+    """Where an operation is undefined at an end of the interval, or is ∞ − ∞, its result may be anything."""
     if not jnp.issubdtype(jnp.result_type(low), jnp.floating):
         return low, high
-    return _known(~(jnp.isnan(low) | jnp.isnan(high)), low, high)
+    return _where_known(~(jnp.isnan(low) | jnp.isnan(high)), low, high)
 
 
 def hull(*values) -> Interval:
-    """The least and the largest of some arrays."""
+    """The least and the greatest of some arrays."""
     return functools.reduce(jnp.minimum, values), functools.reduce(jnp.maximum, values)
 
 
 def _product(_, x, y):
-    if x is y:  # a square, as which a product may be written
+    if x is y:  # a square
         return _even(jnp.square, x)
     return hull(*(jnp.where((a == 0) | (b == 0), 0, a * b) for a in x for b in y))
 
@@ -58,7 +58,7 @@ def _quotient(_, x, y):
 
 
 def _even(power, x):
-    """A power that is least at zero."""
+    """An even power, which is least at zero."""
     ends = power(x[0]), power(x[1])
     return jnp.where((x[0] <= 0) & (x[1] >= 0), 0, jnp.minimum(*ends)), jnp.maximum(*ends)
 
@@ -73,17 +73,17 @@ def _integer_power(params, x):
 
 
 def _power(_, x, y):
-    """xʸ of a base that is nowhere negative; of others anything, for not even its sign is known."""
+    """xʸ of a base that is nowhere negative; of others anything, for not even the sign is known."""
     low, high = hull(*(a**b for a in x for b in y))
     return jnp.where(x[0] >= 0, low, jnp.nan), high
 
 
 def _cosine(x):
     """Between its values at the ends, unless a multiple of π lies between them."""
-    crest = jnp.floor(x[1] / (2 * jnp.pi)) >= jnp.ceil(x[0] / (2 * jnp.pi))
-    trough = jnp.floor(x[1] / (2 * jnp.pi) - 0.5) >= jnp.ceil(x[0] / (2 * jnp.pi) - 0.5)
+    has_maximum = jnp.floor(x[1] / (2 * jnp.pi)) >= jnp.ceil(x[0] / (2 * jnp.pi))
+    has_minimum = jnp.floor(x[1] / (2 * jnp.pi) - 0.5) >= jnp.ceil(x[0] / (2 * jnp.pi) - 0.5)
     low, high = hull(jnp.cos(x[0]), jnp.cos(x[1]))
-    return jnp.where(trough, -1, low), jnp.where(crest, 1, high)
+    return jnp.where(has_minimum, -1, low), jnp.where(has_maximum, 1, high)
 
 
 def _tangent(_, x):
@@ -93,30 +93,30 @@ def _tangent(_, x):
 
 def _remainder(_, x, y):
     size = jnp.maximum(jnp.abs(y[0]), jnp.abs(y[1]))
-    turn = lambda a: jnp.trunc(a / y[0])
-    within = (y[0] == y[1]) & (turn(x[0]) == turn(x[1])) & (jnp.sign(x[0]) == jnp.sign(x[1]))
+    period = lambda a: jnp.trunc(a / y[0])
+    within = (y[0] == y[1]) & (period(x[0]) == period(x[1])) & (jnp.sign(x[0]) == jnp.sign(x[1]))
     low, high = (jax.lax.rem(end, y[0]) for end in x)
     return jnp.where(within, low, jnp.where(x[0] < 0, -size, 0)), jnp.where(within, high, jnp.where(x[1] > 0, size, 0))
 
 
-def _converted(params, x):
-    """To another kind of number: to a truth, which is whether it is not zero, or to integers, which may be too small for it."""
+def _convert(params, x):
+    """To another dtype: to truth values, which say whether a number is not zero, or to integers, whose range may be too small."""
     kind = params["new_dtype"]
     if jnp.issubdtype(kind, bool):
         return (x[0] > 0) | (x[1] < 0), (x[0] != 0) | (x[1] != 0)
-    return _exactly(kind, *x) if jnp.issubdtype(kind, jnp.integer) else tuple(end.astype(kind) for end in x)
+    return _rounded_to_integers(kind, *x) if jnp.issubdtype(kind, jnp.integer) else tuple(end.astype(kind) for end in x)
 
 
-def _exactly(kind, low, high) -> Interval:
-    """Integers that were reckoned as real numbers; anything where they are too large for that, or for their kind."""
+def _rounded_to_integers(kind, low, high) -> Interval:
+    """Integers that were computed as real numbers; anything where they are too large to be exact, or for their dtype."""
     limit = 1 / float(jnp.finfo(float).eps)
     fits = (low >= max(-limit, float(jnp.iinfo(kind).min))) & (high <= min(limit, float(jnp.iinfo(kind).max)))
-    return _known(fits, *(jnp.where(fits, jnp.trunc(end), 0).astype(kind) for end in (low, high)))
+    return _where_known(fits, *(jnp.where(fits, jnp.trunc(end), 0).astype(kind) for end in (low, high)))
 
 
 def in_integers(kind, rule: Callable, operands) -> Interval:
-    """A rule of arithmetic on integers, which begin anew behind the largest one."""
-    return _exactly(kind, *rule(*(tuple(end.astype(float) for end in x) for x in operands)))
+    """A rule of arithmetic on integers, which wrap around beyond the greatest one."""
+    return _rounded_to_integers(kind, *rule(*(tuple(end.astype(float) for end in x) for x in operands)))
 
 
 def _finite(x):
@@ -130,48 +130,48 @@ def _equal(x, y):
     return (x[0] == x[1]) & (y[0] == y[1]) & (x[0] == y[0]), (x[0] <= y[1]) & (y[0] <= x[1])
 
 
-def _chosen(_, which, *cases):
+def _select(_, which, *cases):
     low, high = functools.reduce(jnp.minimum, [x for x, _ in cases]), functools.reduce(jnp.maximum, [x for _, x in cases])
     known = which[0] == which[1]
     one = [jax.lax.select_n(jnp.broadcast_to(which[0], jnp.shape(low)), *(x[end] for x in cases)) for end in (0, 1)]
     return jnp.where(known, one[0], low), jnp.where(known, one[1], high)
 
 
-def _contracted(params, x, y):
-    """A product of matrices, by centres and radii."""
+def _dot_general(params, x, y):
+    """A product of matrices, by midpoints and radii."""
     product = functools.partial(jax.lax.dot_general, **{key: params[key] for key in ("dimension_numbers", "precision")})
     (cx, rx), (cy, ry) = (((low + high) / 2, (high - low) / 2) for low, high in (x, y))
     centre, radius = product(cx, cy), product(jnp.abs(cx), ry) + product(rx, jnp.abs(cy)) + product(rx, ry)
     return centre - radius, centre + radius
 
 
-def _looked_up(take, table, *indices):
-    """Entries of a table whose numbers are not quite known: the extremes of what they may be, where these are few."""
-    unsure = [high - low for low, high in indices if low is not high]
+def _table_lookup(take, table, *indices):
+    """Elements of a table at indices that are not quite known: the extremes of the candidates, where these are few."""
+    widths = [high - low for low, high in indices if low is not high]
     windows = [[low + jnp.minimum(k, high - low).astype(low.dtype) for low, high in indices] for k in range(WINDOW)]
     tables = table[:1] if table[0] is table[1] else table
     found = hull(*(take(x, *window) for window in windows for x in tables))
-    few = jnp.all(jnp.stack([jnp.all(width < WINDOW) for width in unsure])) if unsure else True
-    return _known(few if len(unsure) <= 1 else False, *found)
+    is_narrow = jnp.all(jnp.stack([jnp.all(width < WINDOW) for width in widths])) if widths else True
+    return _where_known(is_narrow if len(widths) <= 1 else False, *found)
 
 
-def _gathered(params, table, index):
+def _gather(params, table, index):
     take = functools.partial(jax.lax.gather_p.bind, **params)
-    one_way = index[0].shape[-1] == 1 or index[0] is index[1]
-    return _looked_up(take, table, index) if one_way else _known(False, *[take(table[0], index[0])] * 2)
+    is_single = index[0].shape[-1] == 1 or index[0] is index[1]
+    return _table_lookup(take, table, index) if is_single else _where_known(False, *[take(table[0], index[0])] * 2)
 
 
-def _scattered(params, x, index, updates):
-    """What is added to entries in known places."""
+def _scatter_add(params, x, index, updates):
+    """Updates added to elements at known indices."""
     ends = [jax.lax.scatter_add_p.bind(*end, **params) for end in zip(x, index, updates, strict=True)]
-    return _known(index[0] is index[1] and jnp.issubdtype(x[0].dtype, jnp.floating), *ends)  # integers may begin anew
+    return _where_known(index[0] is index[1] and jnp.issubdtype(x[0].dtype, jnp.floating), *ends)  # integers may wrap around
 
 
-def _sliced(params, table, *starts):
-    return _looked_up(lambda x, *at: jax.lax.dynamic_slice(x, at, params["slice_sizes"]), table, *starts)
+def _dynamic_slice(params, table, *starts):
+    return _table_lookup(lambda x, *at: jax.lax.dynamic_slice(x, at, params["slice_sizes"]), table, *starts)
 
 
-RULES: dict[str, Callable[..., Interval]] = {
+INTERVAL_RULES: dict[str, Callable[..., Interval]] = {
     "sub": lambda _, x, y: (x[0] - y[1], x[1] - y[0]) if x is not y else hull(jnp.zeros_like(x[0])),
     "mul": _product,
     "div": _quotient,
@@ -184,13 +184,13 @@ RULES: dict[str, Callable[..., Interval]] = {
     "cosh": lambda _, x: tuple(1 + end for end in _even(lambda x: jnp.cosh(x) - 1, x)),
     "tan": _tangent,
     "rem": _remainder,
-    "select_n": _chosen,
-    "dot_general": _contracted,
-    "convert_element_type": _converted,
+    "select_n": _select,
+    "dot_general": _dot_general,
+    "convert_element_type": _convert,
     "is_finite": lambda _, x: _finite(x),
-    "scatter-add": _scattered,
-    "gather": _gathered,
-    "dynamic_slice": _sliced,
+    "scatter-add": _scatter_add,
+    "gather": _gather,
+    "dynamic_slice": _dynamic_slice,
     "lt": lambda _, x, y: (x[1] < y[0], x[0] < y[1]),
     "le": lambda _, x, y: (x[1] <= y[0], x[0] <= y[1]),
     "gt": lambda _, x, y: (x[0] > y[1], x[1] > y[0]),
@@ -200,15 +200,15 @@ RULES: dict[str, Callable[..., Interval]] = {
     "eq": lambda _, x, y: _equal(x, y),
     "ne": lambda _, x, y: tuple(~end for end in reversed(_equal(x, y))),
 }  # fmt: skip
-MOVING = {
+ARRAY_OPERATIONS = {
     "reshape", "squeeze", "expand_dims", "broadcast_in_dim", "transpose", "rev", "slice", "split", "pad", "concatenate", "stack",
     "unstack", "tile", "copy", "stop_gradient", "reduce_sum", "reduce_max", "reduce_min", "reduce_and",
     "reduce_or", "cumsum", "cummax", "cummin", "optimization_barrier",
 }  # fmt: skip
-RISING = MOVING | {
+INCREASING = ARRAY_OPERATIONS | {
     "add", "add_any", "max", "min", "clamp", "exp", "exp2", "expm1", "log", "log1p", "sqrt", "cbrt", "sinh", "tanh", "asinh", "acosh",
     "atanh", "asin", "atan", "erf", "logistic", "floor", "ceil", "round", "sign", "and", "or",
 }  # fmt: skip
-FALLING = {"neg", "rsqrt", "acos", "erfc", "not"}
-ARITHMETIC = {"add", "add_any", "sub", "mul", "neg", "div", "abs", "square", "integer_pow", "pow", "reduce_sum", "cumsum", "dot_general"}
-LOGICAL = {"and", "or", "not", "reduce_and", "reduce_or"}  # of other integers they are neither rising nor falling
+DECREASING = {"neg", "rsqrt", "acos", "erfc", "not"}
+MAY_OVERFLOW = {"add", "add_any", "sub", "mul", "neg", "div", "abs", "square", "integer_pow", "pow", "reduce_sum", "cumsum", "dot_general"}
+LOGICAL = {"and", "or", "not", "reduce_and", "reduce_or"}  # on other integers they are neither increasing nor decreasing

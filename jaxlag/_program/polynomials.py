@@ -1,34 +1,34 @@
-"""Polynomials in entries of a program, in moduli u = ‖s‖ and in signs σ of an entry s: σ s = u, σ u = s, σ² = 1."""
+"""Polynomials in expression nodes, in moduli u = ‖s‖ and in signs σ of a node s: σ s = u, σ u = s, σ² = 1."""
 
 from collections import Counter
 from typing import NamedTuple
 
-from .scalar_graph import Entry
+from .expressions import Node
 
-Product = frozenset  # of pairs of a factor (an entry, a modulus, a sign) and its exponent
-Polynomial = dict[Product, float]  # the number before each product
-TERMS = 32  # a longer polynomial is not looked at
+Monomial = frozenset  # of pairs of a factor (a node, a modulus, a sign) and its exponent
+Polynomial = dict[Monomial, float]  # the coefficient of each monomial
+MAX_TERMS = 32  # a longer polynomial is given up
 
 
 class Modulus(NamedTuple):
-    """u = ‖s‖ of the entries s, each but for a factor: of one entry the absolute value."""
+    """u = ‖s‖ of the nodes s, up to a factor: of one node, its absolute value."""
 
-    of: tuple[Entry, ...]
+    of: tuple[Node, ...]
 
 
 class Sign(NamedTuple):
-    """σ, the sign of an entry."""
+    """σ, the sign of a node."""
 
-    of: Entry
+    of: Node
 
 
 def moduli_in(p: Polynomial) -> set[Modulus]:
-    """Those of a polynomial."""
-    return {factor for product in p for factor, _ in product if isinstance(factor, Modulus)}
+    """The moduli of a polynomial."""
+    return {factor for monomial in p for factor, _ in monomial if isinstance(factor, Modulus)}
 
 
-def joined(*powers: dict) -> dict:
-    """The powers of a product of products."""
+def combined_powers(*powers: dict) -> dict:
+    """The exponents of the product of some monomials."""
     whole: Counter = Counter()
     for given in powers:
         for x, n in given.items():
@@ -37,33 +37,33 @@ def joined(*powers: dict) -> dict:
 
 
 def added(*polynomials: Polynomial | None) -> Polynomial | None:
-    """The sum; None where one is none, or it is long."""
+    """The sum; None where a summand is None, or where it is too long."""
     if any(p is None for p in polynomials):
         return None
     total: Polynomial = {}
     for p in polynomials:
-        for product, number in (p or {}).items():
-            total[product] = total.get(product, 0.0) + number
-    return {product: number for product, number in total.items() if number} if len(total) <= TERMS else None
+        for monomial, number in (p or {}).items():
+            total[monomial] = total.get(monomial, 0.0) + number
+    return {monomial: number for monomial, number in total.items() if number} if len(total) <= MAX_TERMS else None
 
 
 def scaled(p: Polynomial | None, number: float) -> Polynomial | None:
     """The polynomial times a number."""
-    return p and {product: number * before for product, before in p.items()}
+    return p and {monomial: number * coefficient for monomial, coefficient in p.items()}
 
 
 def multiplied(p: Polynomial | None, q: Polynomial | None) -> Polynomial | None:
-    """The product, with signs taken into the moduli."""
-    if p is None or q is None or len(p) * len(q) > TERMS**2:
+    """The product, with signs absorbed in the moduli."""
+    if p is None or q is None or len(p) * len(q) > MAX_TERMS**2:
         return None
-    return added(*({_together(x, y): a * b} for x, a in p.items() for y, b in q.items()))
+    return added(*({_monomial_product(x, y): a * b} for x, a in p.items() for y, b in q.items()))
 
 
-def _together(x: Product, y: Product) -> Product:
-    powers = joined(dict(x), dict(y))
+def _monomial_product(x: Monomial, y: Monomial) -> Monomial:
+    powers = combined_powers(dict(x), dict(y))
     for sign in [factor for factor in powers if isinstance(factor, Sign)]:
         modulus = Modulus((sign.of,))
         if powers.pop(sign) % 2:
-            here, there = next(((a, b) for a, b in ((sign.of, modulus), (modulus, sign.of)) if powers.get(a, 0) >= 1), (None, sign))
-            powers = joined(powers, {there: 1}, {here: -1} if here is not None else {})
-    return Product(powers.items())
+            absorbed, result = next(((a, b) for a, b in ((sign.of, modulus), (modulus, sign.of)) if powers.get(a, 0) >= 1), (None, sign))
+            powers = combined_powers(powers, {result: 1}, {absorbed: -1} if absorbed is not None else {})
+    return Monomial(powers.items())

@@ -1,7 +1,4 @@
-"""What a program makes of the time alone, and bounds of that over whole intervals of time, in which nothing can hide.
-
-Interval arithmetic on a jaxpr.
-"""
+"""The part of a program that depends on time alone, and bounds on it over whole intervals of time, between which no pulse can hide."""
 
 import functools
 import itertools
@@ -11,61 +8,60 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.extend.core import Literal
 from jaxtyping import Array
 
-from .interpreter import is_extended, on_arrays
-from .interval_arithmetic import ARITHMETIC, FALLING, LOGICAL, RISING, RULES, Interval, anything, in_integers, without_nan
-from .rules import CALLS, body
+from .constants import as_function, has_extended_dtype
+from .interval_arithmetic import DECREASING, INCREASING, INTERVAL_RULES, LOGICAL, MAY_OVERFLOW, Interval, anything, in_integers, without_nan
+from .walker import CALLS, called_program, walk
 
 
-class OfTime(NamedTuple):
+class TimeDependence(NamedTuple):
     """How a program f(t, y) depends on t beside y: f(t, y) = rest(φ(t), y)."""
 
     phi: Callable[..., list[Array]]
     bounds: Callable[..., list[Interval]]  # of φ from one time to another
     rest: Callable[..., Any]
-    is_bounded: bool  # whether all that leads to φ is known here
+    is_bounded: bool  # whether there are interval rules for all that leads to φ
 
 
-def of_time(function: Callable, t: Array, y: Array) -> OfTime | None:
-    """Reads `function(t, y)`, an array; None where t has no part in it."""
+def time_dependence(function: Callable, t: Array, y: Array) -> TimeDependence | None:
+    """How `function(t, y)`, an array, depends on t; None where it does not."""
     closed = jax.make_jaxpr(function)(t, y)
-    steps, constants, (output,) = _flattened(closed)
+    steps, constants, (output,) = _inlined(closed)
 
-    def reached(start):
+    def dependents(start):
         found = {start}
         for step in steps:
             if found.intersection(step.operands):
                 found.update(step.results)
         return found
 
-    by_t, by_y = reached(T), reached(Y)
-    early = [step for step in steps if not by_y.intersection(step.results)]
-    late = [step for step in steps if by_y.intersection(step.results)]
-    used = [output, *(x for step in late for x in step.operands)]
-    frontier = list(dict.fromkeys(x for x in used if x in by_t and x not in by_y))
+    of_t, of_y = dependents(T), dependents(Y)
+    before_y = [step for step in steps if not of_y.intersection(step.results)]
+    with_y = [step for step in steps if of_y.intersection(step.results)]
+    used = [output, *(x for step in with_y for x in step.operands)]
+    frontier = list(dict.fromkeys(x for x in used if x in of_t and x not in of_y))
     if not frontier:
         return None
 
     def phi(t):
-        found = _run(early, constants | {T: t})
+        found = _run_steps(before_y, constants | {T: t})
         return [found[x] for x in frontier]
 
     def bounds(start, end):
         found = {x: (value, value) for x, value in constants.items()} | {T: (start, end)}
-        for step in early:
-            found |= dict(zip(step.results, _enclosed(step.equation, [found[x] for x in step.operands]), strict=True))
+        for step in before_y:
+            found |= dict(zip(step.results, _evaluate_intervals(step.equation, [found[x] for x in step.operands]), strict=True))
         return [found[x] for x in frontier]
 
     def rest(phi, y):
-        always = [step for step in early if not by_t.intersection(step.results)]
-        return _run([*always, *late], constants | {Y: y} | dict(zip(frontier, phi, strict=True)))[output]
+        always = [step for step in before_y if not of_t.intersection(step.results)]
+        return _run_steps([*always, *with_y], constants | {Y: y} | dict(zip(frontier, phi, strict=True)))[output]
 
-    return OfTime(phi, bounds, rest, all(_is_known(step.equation) for step in early if by_t.intersection(step.results)))
+    return TimeDependence(phi, bounds, rest, all(_has_bounds(step.equation) for step in before_y if of_t.intersection(step.results)))
 
 
-TURNS = 100  # of a loop that is followed; a search in a table takes twenty for a million entries
+MAX_ITERATIONS = 100  # of a loop that is bounded; a search in a table takes twenty for a million elements
 T, Y = 0, 1  # the numbers of the arguments among all quantities
 
 
@@ -77,21 +73,21 @@ class _Step(NamedTuple):
     results: list[int]
 
 
-def _flattened(closed) -> tuple[list[_Step], dict[int, Any], list[int]]:
-    """The equations of a program with those of the programs it calls in their places, each once; its constants, and the outputs."""
+def _inlined(closed) -> tuple[list[_Step], dict[int, Any], list[int]]:
+    """The equations of a program with calls inlined, equal ones once; its constants, and the numbers of its outputs."""
     numbers, constants = itertools.count(2), {}
     steps: list[_Step] = []
-    made: dict[Any, Any] = {}
+    cache: dict[Any, Any] = {}
 
-    def once(key, make):
+    def cached(key, make):
         try:
-            return made[key] if key in made else made.setdefault(key, make())
+            return cache[key] if key in cache else cache.setdefault(key, make())
         except TypeError:  # parameters that cannot be compared
             return make()
 
     def constant(value):
         small = isinstance(value, np.ndarray) and value.size < 100
-        number = once((value.dtype, value.shape, value.tobytes()) if small else id(value), lambda: next(numbers))
+        number = cached((value.dtype, value.shape, value.tobytes()) if small else id(value), lambda: next(numbers))
         constants[number] = value
         return number
 
@@ -99,113 +95,105 @@ def _flattened(closed) -> tuple[list[_Step], dict[int, Any], list[int]]:
         steps.append(_Step(equation, operands, [next(numbers) for _ in equation.outvars]))
         return steps[-1].results
 
-    def read(jaxpr, places):
-        place = lambda atom: constant(np.asarray(atom.val, atom.aval.dtype)) if isinstance(atom, Literal) else places[atom]
-        for equation in jaxpr.eqns:
-            operands = [place(atom) for atom in equation.invars]
-            if equation.primitive.name in CALLS:
-                inner = body(equation)
-                given = (*map(constant, inner.consts), *operands)
-                results = read(inner.jaxpr, dict(zip((*inner.jaxpr.constvars, *inner.jaxpr.invars), given, strict=True)))
-            else:
-                what = (equation.primitive, tuple(equation.params.items()), tuple(operands))
-                results = once(what, lambda equation=equation, operands=operands: step(equation, operands))
-            places |= dict(zip(equation.outvars, results, strict=True))
-        return [place(atom) for atom in jaxpr.outvars]
+    def evaluate(equation, operands):
+        if equation.primitive.name in CALLS:
+            return inlined(called_program(equation), operands)
+        return cached((equation.primitive, tuple(equation.params.items()), tuple(operands)), lambda: step(equation, operands))
 
-    jaxpr = closed.jaxpr
-    places = dict(zip((*jaxpr.constvars, *jaxpr.invars), (*map(constant, closed.consts), T, Y), strict=True))
-    return steps, constants, read(jaxpr, places)
+    def inlined(program, inputs):
+        return walk(program, inputs, evaluate, constant, literal=lambda atom: constant(np.asarray(atom.val, atom.aval.dtype)))
+
+    return steps, constants, inlined(closed, (T, Y))
 
 
-def _run(steps, found):
+def _run_steps(steps, found):
     for step in steps:
-        found |= dict(zip(step.results, on_arrays(step.equation)(*(found[x] for x in step.operands)), strict=True))
+        found |= dict(zip(step.results, as_function(step.equation)(*(found[x] for x in step.operands)), strict=True))
     return found
 
 
 # Intervals.
 
 
-def _enclosed(equation, operands: list[Interval]) -> list[Interval]:
+def _evaluate_intervals(equation, operands: list[Interval]) -> list[Interval]:
     """The outputs of one equation over intervals."""
     name, params = equation.primitive.name, equation.params
     if all(low is high for low, high in operands):
-        return [(x, x) for x in on_arrays(equation)(*(low for low, _ in operands))]
-    if name in PROGRAMS:
-        return _through(body(equation), operands)
-    if name in LOOPS and params.get("length", 1) <= TURNS:
-        return LOOPS[name](params, operands)
-    if name in LOOPS or not _is_known(equation):
+        return [(x, x) for x in as_function(equation)(*(low for low, _ in operands))]
+    if name in INLINED_CALLS:
+        return _run_intervals(called_program(equation), operands)
+    if name in CONTROL_FLOW and params.get("length", 1) <= MAX_ITERATIONS:
+        return CONTROL_FLOW[name](params, operands)
+    if name in CONTROL_FLOW or not _has_bounds(equation):
         return [anything(variable.aval) for variable in equation.outvars]
     kind = equation.outvars[0].aval.dtype
-    if name in ARITHMETIC and jnp.issubdtype(kind, jnp.integer):
-        rule = functools.partial(RULES[name], params) if name in RULES else lambda *of: [end for (end,) in _at_ends(equation)(*of)]
+    if name in MAY_OVERFLOW and jnp.issubdtype(kind, jnp.integer):
+        rule = (
+            functools.partial(INTERVAL_RULES[name], params)
+            if name in INTERVAL_RULES
+            else lambda *of: [end for (end,) in _at_ends(equation)(*of)]
+        )
         found = [in_integers(kind, rule, operands)]
-    elif name in RULES:
-        found = [RULES[name](params, *operands)]
+    elif name in INTERVAL_RULES:
+        found = [INTERVAL_RULES[name](params, *operands)]
     else:
         found = list(zip(*_at_ends(equation)(*operands), strict=True))
     return [without_nan(*interval) for interval in found]
 
 
 def _at_ends(equation) -> Callable[..., list[Any]]:
-    """The outputs, at the least and at the greatest, of an operation that rises, or falls, with all its operands."""
+    """The outputs at both ends of an operation that increases, or decreases, with all its operands."""
 
     def ends(*operands):
         made = [equation.primitive.bind(*end, **equation.params) for end in zip(*operands, strict=True)]
         made = made if equation.primitive.multiple_results else [[output] for output in made]
-        return made[::-1] if equation.primitive.name in FALLING else made
+        return made[::-1] if equation.primitive.name in DECREASING else made
 
     return ends
 
 
-def _through(closed, operands):
+def _run_intervals(closed, operands):
     """The outputs of a whole program over intervals."""
-    jaxpr, exact = closed.jaxpr, lambda x: (x, x)
-    found = dict(zip((*jaxpr.constvars, *jaxpr.invars), (*map(exact, closed.consts), *operands), strict=True))
-    read = lambda atom: exact(np.asarray(atom.val, atom.aval.dtype)) if isinstance(atom, Literal) else found[atom]
-    for equation in jaxpr.eqns:
-        found |= dict(zip(equation.outvars, _enclosed(equation, [read(atom) for atom in equation.invars]), strict=True))
-    return [read(atom) for atom in jaxpr.outvars]
+    exact = lambda x: (x, x)
+    return walk(closed, operands, _evaluate_intervals, exact, literal=lambda atom: exact(np.asarray(atom.val, atom.aval.dtype)))
 
 
-def _looped(params, operands):
-    """A loop over as many turns as there are: the same over intervals."""
+def _scan(params, operands):
+    """A `scan` over intervals is a `scan` as well, of as many iterations."""
     closed, split = params["jaxpr"], np.cumsum([params["num_consts"], params["num_carry"]])
     consts, carry, rows = (operands[i:j] for i, j in itertools.pairwise((0, *split, len(operands))))
 
-    def turn(carry, row):
-        outputs = _through(closed, [*consts, *carry, *row])
+    def iteration(carry, row):
+        outputs = _run_intervals(closed, [*consts, *carry, *row])
         return outputs[: len(carry)], outputs[len(carry) :]
 
-    last, made = jax.lax.scan(turn, [tuple(map(jnp.asarray, x)) for x in carry], rows, params["length"], params["reverse"])
-    return [*last, *made]
+    last, stacked = jax.lax.scan(iteration, [tuple(map(jnp.asarray, x)) for x in carry], rows, params["length"], params["reverse"])
+    return [*last, *stacked]
 
 
-def _branched(params, operands):
-    """One of several programs."""
+def _cond(params, operands):
+    """One of several branches."""
     which, *operands = operands
-    cases = [_through(branch, operands) for branch in params["branches"]]
+    cases = [_run_intervals(branch, operands) for branch in params["branches"]]
     which = tuple(jnp.clip(end, 0, len(cases) - 1) for end in which)
-    return [RULES["select_n"](None, which, *column) for column in zip(*cases, strict=True)]
+    return [INTERVAL_RULES["select_n"](None, which, *column) for column in zip(*cases, strict=True)]
 
 
-def _is_known(equation) -> bool:
-    """Whether bounds of its outputs are any good."""
+def _has_bounds(equation) -> bool:
+    """Whether there are useful bounds on its outputs."""
     name, params = equation.primitive.name, equation.params
-    if name in PROGRAMS:
-        return all(map(_is_known, body(equation).jaxpr.eqns))
-    if name in LOOPS:
-        return params.get("length", 1) <= TURNS and all(
-            _is_known(step) for inner in params.get("branches", [params.get("jaxpr")]) for step in inner.jaxpr.eqns
+    if name in INLINED_CALLS:
+        return all(map(_has_bounds, called_program(equation).jaxpr.eqns))
+    if name in CONTROL_FLOW:
+        return params.get("length", 1) <= MAX_ITERATIONS and all(
+            _has_bounds(step) for inner in params.get("branches", [params.get("jaxpr")]) for step in inner.jaxpr.eqns
         )
-    if any(is_extended(x) or jnp.issubdtype(x.aval.dtype, jnp.complexfloating) for x in (*equation.invars, *equation.outvars)):
+    if any(has_extended_dtype(x) or jnp.issubdtype(x.aval.dtype, jnp.complexfloating) for x in (*equation.invars, *equation.outvars)):
         return False
     if name in LOGICAL:
         return equation.outvars[0].aval.dtype == bool
-    return name in RISING | FALLING | RULES.keys()
+    return name in INCREASING | DECREASING | INTERVAL_RULES.keys()
 
 
-PROGRAMS = {*CALLS, "custom_jvp_call", "custom_vjp_call"}
-LOOPS = {"scan": _looped, "cond": _branched}
+INLINED_CALLS = {*CALLS, "custom_jvp_call", "custom_vjp_call"}
+CONTROL_FLOW = {"scan": _scan, "cond": _cond}

@@ -1,1 +1,1 @@
-"""The lecture's systems, ready to import: `from jaxlag.examples import pendulum, vehicle`."""
+"""Example systems, ready to import: `from jaxlag.examples import pendulum, stribeck, vehicle`."""

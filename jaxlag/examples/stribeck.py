@@ -1,15 +1,15 @@
-"""A drive axis whose friction curve is learnt from a recording of its speed, with no formula for it.
+"""A drive axis whose friction curve is learnt from a recording of its speed, without a formula for the curve.
 
     m ẍ = u(t) − D'(ẋ),   u(t) = Σ A_i sin(2πt/T_i),   D a network: `jaxlag.learnt.PassiveDissipation`
 
-The recording was made with Stribeck's curve, which falls from 5 N at creeping to 3 N and then rises with the speed:
+The recording was made with Stribeck's curve, which falls from 5 N at low speed towards 3 N and then rises with the speed:
 
     F(v) = (F_c + (F_s − F_c) exp(−(v/v_s)²)) tanh(v/v_0) + b v
 
-Two steps recover it. `from_accelerations` compares accelerations with differences of the measured speed (equation error), which costs
-nothing but takes the noise of v for motion: a start, off by 1 % of the curve's mean square and 5 % at worst, where it is steep.
-`recover` then fits the motion itself (output error): 0.6 % and 1.5 %, as good as the noise allows. No convex D comes closer than 10.5 %,
-for its force may not fall.
+Two steps recover it. `from_accelerations` compares accelerations with differences of the measured speed (equation error), which is
+cheap but mistakes the noise of v for motion: its result, the starting point, has a root mean square error of 1 % of the curve and at most
+5 %, where the curve is steep. `recover` then fits the motion itself (output error): 0.6 % and 1.5 %, as good as the noise allows. No
+convex D comes closer than 10.5 %, because its force cannot fall.
 
 Source: Klein & Morelli, Aircraft System Identification, chapters 5 and 6 (equation error, output error); the curve: Armstrong-Hélouvry,
 Dupont & Canudas de Wit, Automatica 30 (1994) 1083-1138.
@@ -31,12 +31,12 @@ def lagrangian(qdot, m):
 
 
 def friction(qdot, net):
-    """D, learnt."""
+    """D, learnt from the data."""
     return net(qdot)
 
 
 def drive(t, A, T):
-    """The force of the motor, known."""
+    """The known force of the motor."""
     return A @ jnp.sin(2 * jnp.pi * t / T)
 
 
@@ -54,7 +54,7 @@ recording = Path(__file__).with_name("stribeck_drive.csv")
 
 
 def true_friction(v):
-    """F(v), the curve to be found."""
+    """F(v), the curve to be recovered."""
     return (F_c + (F_s - F_c) * jnp.exp(-((v / v_s) ** 2))) * jnp.tanh(v / v_0) + b * v
 
 
@@ -65,7 +65,7 @@ def friction_of(net, v):
 
 
 def observe(qdot):
-    """What the recording holds: the speed."""
+    """The measured channel: the speed."""
     return {"v": qdot}
 
 
@@ -76,12 +76,12 @@ def experiment():
 
 
 def unlearnt(key):
-    """The network at its start: 48 weights."""
+    """The initial network: 48 weights."""
     return jl.learnt.PassiveDissipation(scale=0.1, power=0.5, width=16, depth=1, key=key)  # m/s, W
 
 
 def from_accelerations(net, record, steps=1500):
-    """The network that explains the differences of the measured speed best, by Adam."""
+    """The network that best explains the differences of the measured speed, found by Adam."""
     t, v = record.ts, record.values["v"]
     adam = optax.adam(optax.cosine_decay_schedule(2e-2, steps))
 
@@ -100,7 +100,7 @@ def from_accelerations(net, record, steps=1500):
 def recover(net=None, **numerics):
     """The fit of the network to the recorded motion; `fit.params["net"]` is the network.
 
-    Ten steps: the residual is noise by then. The curve is determined, its single weights are not, so there is no end to wait for.
+    After ten steps the residual is noise. The data determine the curve but not the individual weights, so the fit need not converge.
     """
     record = experiment()
     start = from_accelerations(unlearnt(jax.random.key(0)) if net is None else net, record)

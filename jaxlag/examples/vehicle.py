@@ -7,8 +7,8 @@ Coordinates x, y, φ; wheels at x ± a, rolling: φ₂ = −(x − a)/r, φ₃ =
     δW = −M₀ δφ₃, so Q_x = M₀/r
 
 Three ways to the same motion: `system` is that reduced form; `substituted` is the full Lagrangian in the body's x, y, φ, the
-wheels' x₂, φ₂, x₃, φ₃ and the strut ends' y₂, y₃, with six of them expressed by the others; `first_kind` keeps all nine and
-takes the six equations as constraints, whose multipliers are the forces that the parts pass to each other.
+wheels' x₂, φ₂, x₃, φ₃ and the strut ends' y₂, y₃, with six of them expressed by the others; `first_kind` keeps all nine
+coordinates and treats the six equations as constraints, whose multipliers are the forces between the parts.
 """
 
 from pathlib import Path
@@ -32,7 +32,7 @@ def dampers(qdot, b, a):
 
 
 def air(qdot, k, v):
-    """⅓k|ẋ + v|³, against a head wind v."""
+    """⅓k|ẋ + v|³, with a head wind v."""
     return k * jnp.abs(qdot["x"] + v) ** 3 / 3
 
 
@@ -45,7 +45,7 @@ system = jl.System(lagrangian, dissipation={"dampers": dampers, "air": air}, for
 
 
 def full_lagrangian(q, qdot, M, m, Theta_s, Theta_r, c, l, g):
-    """T − V of each part by itself; the strut ends y₂, y₃ carry no mass."""
+    """T − V of the separate parts; the strut ends y₂, y₃ are massless."""
     body = 0.5 * M * (qdot["x"] ** 2 + qdot["y"] ** 2) + 0.5 * Theta_s * qdot["phi"] ** 2 - M * g * q["y"]
     rear = 0.5 * m * qdot["x2"] ** 2 + 0.5 * Theta_r * qdot["phi2"] ** 2 - 0.5 * c * (q["y2"] - l) ** 2
     front = 0.5 * m * qdot["x3"] ** 2 + 0.5 * Theta_r * qdot["phi3"] ** 2 - 0.5 * c * (q["y3"] - l) ** 2
@@ -58,7 +58,7 @@ def full_dampers(qdot, b):
 
 
 def parts(q, r, a):
-    """The full coordinates from x, y, φ: the equations that bind the parts to each other (Bindungsgleichungen), solved."""
+    """The full coordinates from x, y, φ: the constraint equations between the parts (Bindungsgleichungen), solved."""
     x2, x3 = q["x"] - a, q["x"] + a
     struts = {"y2": q["y"] - a * q["phi"], "y3": q["y"] + a * q["phi"]}
     return {**q, **struts, "x2": x2, "x3": x3, "phi2": -x2 / r, "phi3": -x3 / r}
@@ -100,5 +100,5 @@ recording = Path(__file__).with_name("vehicle_drive.csv")
 
 
 def observe(q, qdot):
-    """What the recording holds: heave, pitch and speed."""
+    """The measured channels: heave, pitch and speed."""
     return {"y": q["y"], "phi": q["phi"], "xdot": qdot["x"]}

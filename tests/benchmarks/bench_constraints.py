@@ -1,6 +1,6 @@
 """Work and precision of constrained motions: a spherical pendulum, a four-bar, chains of rods in Cartesian coordinates.
 
-Time against the largest error of a coordinate, and the largest |g| beside it. The equations by hand are integrated without
+Time against the largest error of a coordinate, and the largest |g|. The hand-written equations are integrated without
 projection. References: SciPy's DOP853 at 1e-13, in angles for the spherical pendulum.
 Run: python tests/benchmarks/bench_constraints.py [spherical four-bar 4 16 64]
 """
@@ -22,7 +22,7 @@ MECHANISMS = {"spherical": spherical_pendulum, "four-bar": four_bar} | {str(n): 
 
 
 def by_jaxlag(rods, solver, tolerance):
-    """As it comes, with projection."""
+    """With its defaults, that is with projection."""
     how = {"solver": solver, "rtol": tolerance, "atol": 0.01 * tolerance}
     return jax.jit(lambda x0: jl.simulate(rods.system, x0, rods.v0, rods.ts, throw=False, **how).q)
 
@@ -36,7 +36,7 @@ def by_hand(rods, solver, tolerance):
 
 
 def reference(name, rods):
-    """The motion to some 1e-11."""
+    """The motion, accurate to about 1e-11."""
     if name == "spherical":
         return in_angles(rods)
     shape, acceleration = rods.x0.shape, jax.jit(rods.acceleration)
@@ -58,7 +58,7 @@ def in_angles(rods):
 
 
 def table(name):
-    """jaxlag's default and Dopri8, and by hand Dopri5 and Dopri8, at each of the tolerances."""
+    """jaxlag with its default solver and Dopri8, hand-written equations with Dopri5 and Dopri8, at each tolerance."""
     rods = MECHANISMS[name]()
     rods.check()
     methods = {

@@ -1,4 +1,6 @@
-"""Do the 95 % intervals hold the truth in 95 % where the noise is correlated? A damped oscillator, c and b fitted to 200 recordings each.
+"""Do 95 % intervals contain the true value in 95 % of cases when the noise is correlated?
+
+A damped oscillator, c and b fitted to 200 recordings for each correlation. Run:
 
 python tests/benchmarks/bench_coverage.py
 """
@@ -27,13 +29,13 @@ def position(ts, c, b):
 
 
 def noise(rho, seed):
-    """r_t = ρ r_{t−1} + e_t of standard deviation SIGMA, begun long ago."""
+    """r_t = ρ r_{t−1} + e_t with standard deviation SIGMA, in its stationary state."""
     e = np.random.default_rng(seed).standard_normal(len(TIMES) + 3000)
     return SIGMA * signal.lfilter([np.sqrt(1 - rho**2)], [1.0, -rho], e)[3000:]
 
 
 def deviations(rho):
-    """Standard deviations of the estimates to first order: as if the noise were white, and with its true covariance."""
+    """First-order standard deviations of the estimates: assuming white noise, and with the true covariance."""
     theta, h = np.array(list(TRUE.values())), 1e-5
     J = np.stack([(position(TIMES, *(theta + d)) - position(TIMES, *(theta - d))) / (2 * h) for d in h * np.eye(2)], axis=1)
     P = SIGMA * np.linalg.inv(J.T @ J)
@@ -49,7 +51,7 @@ def fits_of(rho, seeds, **more):
 
 
 def coverage(fits):
-    """The share of the intervals that hold the truth, of each parameter."""
+    """The fraction of intervals that contain the true value, for each parameter."""
     return {n: np.mean([f.interval(n).lower < TRUE[n] < f.interval(n).upper for f in fits]) for n in FREE}
 
 
@@ -58,7 +60,7 @@ def main() -> None:
     parser = argparse.ArgumentParser()
     parser.add_argument("--seeds", type=int, default=200)
     seeds = parser.parse_args().seeds
-    print(f"{'rho':>5} {'':3} {'hold':>7} {'as if white':>12} {'error / true':>13} {'white / true':>13} {'samples':>8} {'seconds':>8}")
+    print(f"{'rho':>5} {'':3} {'inside':>7} {'as if white':>12} {'error / true':>13} {'white / true':>13} {'samples':>8} {'seconds':>8}")
     for rho in RHOS:
         begin = time.perf_counter()
         fits = fits_of(rho, seeds)

@@ -1,4 +1,4 @@
-"""One core against all of them: 1024 vehicles by `simulate_many`, in fresh processes with one device and with one for each core.
+"""One core against all: 1024 vehicles by `simulate_many`, in fresh processes with one device and with one device per core.
 
 Run: python tests/benchmarks/bench_devices.py [processes]
 """
@@ -31,7 +31,7 @@ print(json.dumps(medians({{"": lambda: run(many)}})[""]))
 
 
 def seconds(devices):
-    """Of one process."""
+    """Median run time, measured in one process."""
     script = TIMED.format(devices=devices)
     here = os.path.dirname(os.path.abspath(__file__))
     done = subprocess.run([sys.executable, "-c", script], check=True, capture_output=True, text=True, cwd=here)
@@ -45,7 +45,7 @@ def main():
         for devices, times in taken.items():
             times.append(seconds(devices))
     all_, one = (statistics.median(times) for times in taken.values())
-    rows = [Row(f"{cores} devices, one for each core", seconds=all_, ratio=1.0), Row("one device", seconds=one, ratio=one / all_)]
+    rows = [Row(f"{cores} devices, one per core", seconds=all_, ratio=1.0), Row("one device", seconds=one, ratio=one / all_)]
     record("devices", [("1024 parameter sets", rows)])
 
 

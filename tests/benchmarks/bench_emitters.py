@@ -1,7 +1,7 @@
-"""What XLA's two ways to make its CPU kernels cost: seconds to compile, and each further call.
+"""What XLA's two kinds of CPU kernel emitters cost: seconds to compile, and time of each further call.
 
-By default each kernel is made by a compiler of its own (MLIR). `jaxlag._program.jit` takes the emitters from before it where Python calls
-a program of this package; here both compile the same programs.
+By default XLA compiles each kernel separately (MLIR). Where Python calls a program of this package, `jaxlag._program.jit` selects the older
+emitters; here both compile the same programs.
 Run: python tests/benchmarks/bench_emitters.py
 """
 
@@ -50,7 +50,7 @@ def table(name):
     for kind, new in (("older emitters", False), ("default", True)):
         begin = time.perf_counter()
         compiled = program.compile(compiler_options={"xla_cpu_use_fusion_emitters": new})
-        rows.append(Row(kind, first=time.perf_counter() - begin, note="first: compilation alone"))
+        rows.append(Row(kind, first=time.perf_counter() - begin, note="first: compilation only"))
         runs[kind] = lambda compiled=compiled: compiled(x)
     for row, seconds in zip(rows, medians(runs).values(), strict=True):
         row.seconds = seconds

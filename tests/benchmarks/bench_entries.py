@@ -1,14 +1,14 @@
-"""One acceleration as array code and entry by entry: run time and compile time of the n-link pendulum and of the vehicle.
+"""One acceleration as array code and as scalar code: run time and compile time of the n-link pendulum and of the vehicle.
 
 python tests/benchmarks/bench_entries.py [--limit 700] [--loop 10000] [n ...]
 
-Each time is that of one of many dependent evaluations inside one compiled loop (median of 7 runs), so that dispatch is out of it.
-On a CPU, XLA runs each fused operation of a loop as a kernel of its own, unless the loop is small: then the whole loop is one kernel,
-provided that nothing in it calls a library. What is small is set by a flag (its default: less than 1024 bytes read and written by one
-turn); both ways are measured, each in a fresh process.
+Each time is that of one of many dependent evaluations inside one compiled loop (median of 7 runs), which excludes the dispatch.
+On a CPU, XLA runs each fused operation of a loop as a separate kernel, unless the loop is small: then the whole loop is one kernel,
+provided that nothing in it calls a library. A flag sets what counts as small (default: less than 1024 bytes read and written per
+iteration); both cases are measured, each in a fresh process.
 
-    arrays      Lagrange's equations by automatic differentiation, as they stand
-    entries     the same, evaluated entry by entry
+    arrays      Lagrange's equations by automatic differentiation, unchanged
+    scalars     the same, as scalar code
     hand array  M_ij = (n − max(i, j)) cos(q_i − q_j) written by hand as array code, with jnp.linalg.solve
     hand scalar the same in scalars, with a factorisation L D Lᵀ in scalars (n ≤ 8); for the vehicle its three equations
 """
@@ -26,7 +26,7 @@ import numpy as np
 
 import jaxlag as jl
 from jaxlag._mechanics.saddle_point import constrained_acceleration
-from jaxlag._model.system import bind
+from jaxlag._model.flat import bind
 from jaxlag._program.scalarise import scalarised
 from jaxlag.examples import vehicle
 
@@ -95,7 +95,7 @@ def acceleration(system, like):
 
 
 def measured(function, n, params, loop):
-    """Time of one evaluation and of compiling the loop, in seconds, and the first value."""
+    """Seconds of one evaluation and of compiling the loop, and the first value."""
 
     @jax.jit
     def many(q, v, params):
@@ -111,7 +111,7 @@ def measured(function, n, params, loop):
     compiled = many.lower(q, v, params).compile()
     compiling = time.perf_counter() - start
     times = []
-    for _ in range(8):  # the first is a rehearsal
+    for _ in range(8):  # the first is a warm-up
         start = time.perf_counter()
         jax.block_until_ready(compiled(q, v, params))
         times.append((time.perf_counter() - start) / loop)
@@ -124,8 +124,8 @@ def table(links, limit, loop):
     cases = [(f"pendulum {n}", n, {}, acceleration(chain, np.zeros(n)), by_hand_in_arrays, by_hand_in_scalars) for n in links]
     params = jax.tree.map(jnp.asarray, vehicle.params)
     cases.append(("vehicle", 3, params, acceleration(vehicle.system, vehicle.q0), None, vehicle_by_hand))
-    names = "".join(f"{name:>10}" for name in ("arrays", "entries", "hand arr", "hand sc"))
-    print(f"{'':<13}{'µs for one acceleration':>40}{'s to trace and compile':>40}{'entries over':>26}")
+    names = "".join(f"{name:>10}" for name in ("arrays", "scalars", "hand arr", "hand sc"))
+    print(f"{'':<13}{'µs for one acceleration':>40}{'s to trace and compile':>40}{'scalars over':>26}")
     print(f"{'':<13}{names}{names}{'arrays':>12}{'hand arr':>10}{'hand sc':>10}")
     for name, n, params, function, arrays, scalars in cases:
         forms = [function, scalarised(function, **limit), arrays, scalars if n <= 8 else None]
@@ -147,7 +147,7 @@ def main():
     given = options.parse_args()
     if given.here:
         return table(given.links, {} if given.limit is None else {"limit": given.limit}, given.loop)
-    for title, size in {"each operation a kernel": 0, "the loop one kernel": 10**9}.items():
+    for title, size in {"one kernel per operation": 0, "one kernel for the loop": 10**9}.items():
         print(f"\n{title}", flush=True)
         flags = f"--xla_backend_extra_options=xla_cpu_small_while_loop_byte_threshold={size}"
         subprocess.run([sys.executable, __file__, "--here", *sys.argv[1:]], check=True, env=os.environ | {"XLA_FLAGS": flags})

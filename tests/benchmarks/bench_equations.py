@@ -2,10 +2,9 @@
 
 python tests/benchmarks/bench_equations.py [n ...]
 
-Both start from the same energies, this package from array code, SymPy from the sums written as expressions of its dynamic symbols, which
-is not timed. Here: tidied equations of motion, mass matrix and forces, compared with the simulation. There: the equations as they come,
-not simplified, with mass matrix and forces. Each is run in a fresh process, whose imports are not timed. That both say the same is shown
-by numbers at a random state.
+Both start from the same energies: this package from array code, SymPy from sums of its dynamic symbols, whose construction is not timed.
+Here: simplified equations of motion, mass matrix and forces, compared with the simulation. There: unsimplified equations, mass matrix and
+forces. Each runs in a fresh process, whose imports are not timed. Their agreement is shown by numbers at a random state.
 """
 
 import subprocess
@@ -20,7 +19,7 @@ def here(n):
     import sympy
 
     import jaxlag as jl
-    from jaxlag._paper import derivation, printers, simplify, symbolic_system, to_sympy  # noqa: F401
+    from jaxlag._paper import equations  # noqa: F401 - with all that it imports
 
     system = jl.System(chain)
     start = time.perf_counter()

@@ -1,7 +1,7 @@
-"""First use: seconds in fresh processes until the vehicle's first motion, gradient and fit are there, and then each again.
+"""First use: seconds until the vehicle's first motion, gradient and fit in fresh processes, and then of each again.
 
-jaxlag as a user calls it, against the equations derived by hand with diffrax and optimistix in their default settings (the
-gradient in reverse mode; only the fit needs another adjoint to run at all). "import" is that of the libraries named.
+jaxlag as a user calls it, against hand-derived equations with diffrax and optimistix in their default settings (gradient
+in reverse mode; only the fit requires another adjoint). "import" is that of the libraries named.
 Run: python tests/benchmarks/bench_first_use.py [processes]
 """
 
@@ -70,7 +70,7 @@ CODES = {
 
 
 def fresh(code):
-    """What one new process reports."""
+    """The times that one new process reports."""
     return json.loads(subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout)
 
 

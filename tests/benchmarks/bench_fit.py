@@ -1,4 +1,4 @@
-"""The fit of the vehicle's b, c and k: first in a fresh process, then again, beside SciPy on the hand-derived equations.
+"""The fit of the vehicle's b, c and k, first in a fresh process and then again, compared with SciPy on hand-derived equations.
 
 python tests/benchmarks/bench_fit.py
 """
@@ -67,7 +67,7 @@ def main() -> None:
     seconds, b = by_scipy()
     print(f"first fit, compilation included  {ours['first']:8.2f} s")
     print(f"again, {ours['steps']:.0f} steps                   {ours['again']:8.3f} s   b = {ours['b']:.1f}")
-    print(f"SciPy, hand-derived equations    {seconds:8.2f} s   b = {b:.1f}   {seconds / ours['again']:.0f} times as long")
+    print(f"SciPy, hand-derived equations    {seconds:8.2f} s   b = {b:.1f}   {seconds / ours['again']:.0f} times as slow")
 
 
 if __name__ == "__main__":

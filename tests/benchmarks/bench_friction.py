@@ -1,8 +1,8 @@
-"""Exact dry friction: against its smooth form at the same error, and how long it takes to compile.
+"""Exact dry friction, compared with its regularised form at the same error, and its compile time.
 
-A chain of 20 blocks that rub on the floor runs to rest; the error is the largest difference of the final positions from a motion with
-exact friction at rtol 1e-11. Then a pendulum with friction in its joint, by its angle and in Cartesian coordinates, where the friction
-is given or that of the rod's force: first call and each further one, of a motion and of its derivative in all coordinates of the start.
+A chain of 20 blocks slides on the floor until it rests; the error is the largest difference of the final positions from a motion with
+exact friction at rtol 1e-11. Then a pendulum with joint friction, in its angle and in Cartesian coordinates, where the friction is either
+given or proportional to the rod's force: first and further calls, of a motion and of its derivative with respect to the initial state.
 Run: python tests/benchmarks/bench_friction.py
 """
 

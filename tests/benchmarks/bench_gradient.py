@@ -1,6 +1,6 @@
-"""Where reverse mode overtakes the one forward pass: value and gradient of a motion with p parameters, both ways.
+"""Where reverse mode overtakes a single forward pass: value and gradient of a motion with p parameters, both ways.
 
-Four oscillators, whose stiffnesses are mixed from p parameters. The crossing sets FORWARD_LIMIT in jaxlag/_motion/derivative_rule.py.
+Four oscillators whose stiffnesses are mixtures of p parameters. The crossover sets FORWARD_LIMIT in jaxlag/_motion/derivative_rule.py.
 Run: python tests/benchmarks/bench_gradient.py
 """
 
@@ -17,7 +17,7 @@ TS = jnp.linspace(0, 5, 100)
 
 
 def seconds(p, limit):
-    """Compilation, and one evaluation (median)."""
+    """Seconds of compilation, and of one evaluation (median)."""
     derivative_rule.FORWARD_LIMIT = limit
     jax.clear_caches()
     q0 = jnp.ones(4)

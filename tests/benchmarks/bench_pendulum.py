@@ -1,7 +1,7 @@
-"""One acceleration of a pendulum of n links, by itself and for 1024 states at once: how the cost grows with n.
+"""One acceleration of a pendulum of n links, for one state and for 1024 states at once: how the cost grows with n.
 
-jaxlag starts from L; by hand there is array code with the same linear solve, and for few links scalar code with the
-Cholesky factorisation written out. Run: python tests/benchmarks/bench_pendulum.py [most links]
+jaxlag starts from L. The hand-written candidates are array code with the same linear solve and, for few links, scalar code with
+an explicit Cholesky factorisation. Run: python tests/benchmarks/bench_pendulum.py [most links]
 """
 
 import functools
@@ -15,7 +15,7 @@ from timing import compared, record, skipped
 import jaxlag as jl
 
 jax.config.update("jax_enable_x64", True)
-G, BATCH, SCALAR, MJX = 9.81, 1024, 8, 4  # scalar code and MJX up to so many links: beyond, one takes long to compile, the other to run
+G, BATCH, SCALAR, MJX = 9.81, 1024, 8, 4  # most links for scalar code and MJX: beyond, one compiles and the other runs too slowly
 
 
 def lagrangian(q, qdot):
@@ -68,7 +68,7 @@ def solved(A, f):
 
 
 def mujoco_model(n):
-    """The same chain in MuJoCo: hinges, masses of hardly any inertia, no contacts."""
+    """The same chain in MuJoCo: hinges, point masses with negligible rotational inertia, no contacts."""
     import mujoco
 
     body = '<body pos="0 0 {z}"><joint type="hinge" axis="0 -1 0"/><inertial pos="0 0 -1" mass="1" diaginertia="1e-9 1e-9 1e-9"/>'
@@ -78,12 +78,12 @@ def mujoco_model(n):
 
 
 def relative(x):
-    """Angles of the joints from those to the vertical."""
+    """Joint angles from the angles to the vertical."""
     return np.diff(x, prepend=0.0, axis=-1)
 
 
 def by_mujoco(q, v):
-    """`mj_forward` in C, state by state; a single state again and again."""
+    """`mj_forward` in C, state by state; a single state repeatedly."""
     import mujoco
 
     model = mujoco_model(q.shape[-1])
@@ -112,12 +112,12 @@ def by_mjx(n):
 
 
 def turns(q):
-    """How often a single state is evaluated within one call, so that the call itself does not count."""
+    """How often a single state is evaluated within one call, so that the overhead of the call does not count."""
     return 256 if q.ndim == 1 else 1
 
 
 def compiled(f, q, v):
-    """f at the state, or at each of a batch; a single one in a loop in which each evaluation waits for the one before."""
+    """f at one state, or at each of a batch; a single state in a loop in which each evaluation depends on the previous one."""
     if q.ndim == 2:
         return functools.partial(jax.jit(jax.vmap(f)), q, v)
     again = lambda q, v: jax.lax.fori_loop(1, turns(q), lambda _, a: f(q + 1e-9 * a, v), f(q, v))
@@ -125,7 +125,7 @@ def compiled(f, q, v):
 
 
 def candidates(n, q, v):
-    """What there is for n links; reasons for what is not."""
+    """The candidates for n links, and the reasons why others are missing."""
     written = {"jaxlag": by_jaxlag, "array code by hand": by_arrays} | ({"scalar code by hand": by_scalars} if n <= SCALAR else {})
     peers = {"MuJoCo": lambda: by_mujoco(np.asarray(q), np.asarray(v))}
     if n <= MJX:
@@ -140,7 +140,7 @@ def candidates(n, q, v):
 
 
 def table(n, batch):
-    """Times for n links; all have to give the same accelerations."""
+    """Times for n links; all candidates must give the same accelerations."""
     q, v = (jnp.asarray(x) for x in np.random.default_rng(n).uniform(-1.0, 1.0, (2, *batch, n)))
     runs, missing = candidates(n, q, v)
     rows, expected = compared(runs), np.asarray(runs["array code by hand"]())

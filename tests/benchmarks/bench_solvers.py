@@ -1,4 +1,4 @@
-"""Work and precision: the time of a motion against its error, by the solvers one would choose, at tolerances from 1e-4 to 1e-12.
+"""Work and precision: run time of a motion against its error, for the usual solvers, at tolerances from 1e-4 to 1e-12.
 
 The lecture's vehicle over 20 s against its exact solution. Draws notebooks/work_precision.png.
 Run: python tests/benchmarks/bench_solvers.py

@@ -1,7 +1,7 @@
 """The lecture's vehicle over 20 s: one motion, value and gradient in b, c, k, their fit, and 1024 parameter sets.
 
-jaxlag starts from L and D, all others from equations derived by hand. Each takes the loosest tolerance that brings its error
-within the bound; errors are against the exact solution.
+jaxlag starts from L and D, all others from equations derived by hand. Each uses the loosest tolerance that keeps its error
+within the bound; errors are relative to the exact solution.
 Run: python tests/benchmarks/bench_vehicle.py
 """
 
@@ -29,7 +29,7 @@ PEERS = {
 
 
 def candidates():
-    """The solvers there are, and the reason why others are not."""
+    """The solvers that are available, and the reasons why others are not."""
     found, missing = {"jaxlag": solvers.jaxlag()}, {}
     found |= {name: solvers.diffrax(solver()) for name, solver in DIFFRAX.items()} | {"DOP853 written out in lax": solvers.lax()}
     for name, peer in PEERS.items():
@@ -49,7 +49,7 @@ def table(tasks, error, bound, starts, missing, rounds=9):
 
 
 def motion(found, missing):
-    """States at 1000 samples, the coordinates within the bound."""
+    """States at 1000 samples, with the error of the coordinates within the bound."""
     error = lambda states: np.max(np.abs(np.asarray(states) - EXACT)[:, :3])
     tasks = {name: solver.motion for name, solver in (found | {"jaxlag, called from Python": solvers.jaxlag_from_python()}).items()}
     return table(tasks, error, MOTION, {}, missing)
@@ -80,12 +80,12 @@ def in_one(states):
 
 
 def jaxlag_states(theta, tolerance):
-    """What is recorded, by jaxlag."""
+    """The recorded channels, by jaxlag."""
     return solvers.stacked(*solvers.simulated(theta, jnp.asarray(TS), tolerance))[:, SEEN]
 
 
 def fit(found, missing, starts):
-    """b, c, k from the guess: jaxlag's `fit`, optimistix as it comes, and one Levenberg–Marquardt loop for all others."""
+    """b, c, k from the guess: jaxlag's `fit`, optimistix, and one Levenberg–Marquardt loop for all others."""
     tasks = {
         name: lambda tol, solver=solver: by_hand.fitted(lambda theta: map(np.asarray, solver.sensitive(theta, tol)))
         for name, solver in found.items()

@@ -1,8 +1,9 @@
-"""Where the time goes in what is not as fast as was asked: a fit, a first motion, many motions at once.
+"""Where the time goes in a fit, in a first motion, and in many motions at once.
 
 Run: python tests/benchmarks/bench_where.py
 """
 
+import importlib
 import json
 import subprocess
 import sys
@@ -19,7 +20,7 @@ from jaxlag.examples import vehicle
 
 jax.config.update("jax_enable_x64", True)
 TS = np.linspace(0, 20, 1000)
-HEARD = """
+LISTENER = """
 import collections, json, time
 import jax
 spent = collections.Counter()
@@ -28,14 +29,19 @@ jax.monitoring.register_event_duration_secs_listener(lambda event, seconds, **_:
 
 
 def of_a_fit(repeats=50):
-    """Milliseconds of the parts of a further fit of b, c, k."""
+    """Seconds spent in the parts of a repeated fit of b, c, k."""
     motion = jl.simulate(vehicle.system, vehicle.q0, vehicle.qdot0, TS, vehicle.params)
     experiment = jl.Experiment(TS, {"y": motion.q["y"], "x": motion.q["x"]}, vehicle.q0, vehicle.qdot0)
     start = vehicle.params | {"b": 4000.0, "c": 30000.0, "k": 0.8}
     fit = lambda: jl.fit(vehicle.system, experiment, start, free=("b", "c", "k"))
     fit()
-    parts = {"stating the problem": "_stated", "residuals with Jacobian": "linearise", "report": "report"}
-    spent, calls, before = dict.fromkeys(parts, 0.0), dict.fromkeys(parts, 0), {name: getattr(fit, name) for name in parts.values()}
+    whole_fit, search = (importlib.import_module(f"jaxlag._fit.{name}") for name in ("fit", "minimise"))
+    parts = {
+        "setting up the problem": (whole_fit, "_checked_problem"),
+        "residuals with Jacobian": (search, "linearise"),
+        "report": (whole_fit, "report"),
+    }
+    spent, calls, before = dict.fromkeys(parts, 0.0), dict.fromkeys(parts, 0), {part: getattr(*place) for part, place in parts.items()}
 
     def counted(part, function):
         def run(*given, **named):
@@ -47,21 +53,21 @@ def of_a_fit(repeats=50):
 
         return run
 
-    for part, name in parts.items():
-        setattr(fit, name, counted(part, before[name]))
+    for part, place in parts.items():
+        setattr(*place, counted(part, before[part]))
     begin = time.perf_counter()
     for _ in range(repeats):
         fit()
     whole = time.perf_counter() - begin
-    for name, function in before.items():
-        setattr(fit, name, function)
+    for part, place in parts.items():
+        setattr(*place, before[part])
     shares = {f"{part}, {calls[part] // repeats} times": seconds for part, seconds in spent.items()}
-    shares["iteration between them, and the rest"] = whole - sum(spent.values())
+    shares["iterations and the rest"] = whole - sum(spent.values())
     return {part: seconds / repeats for part, seconds in shares.items()}
 
 
 def of_a_first_motion(name, processes=5):
-    """Seconds of the parts of a first motion in a fresh process, as JAX tells them; what a part calls for is in both."""
+    """Seconds of the parts of a first motion in a fresh process, as reported by JAX; nested parts are counted in both."""
     code = CODES[name].split("for name, action in")[0]
     ending = """
 spent.clear()
@@ -69,7 +75,7 @@ jax.block_until_ready(motion())
 print(json.dumps(spent))
 """
     runs = [
-        json.loads(subprocess.run([sys.executable, "-c", HEARD + code + ending], capture_output=True, text=True, check=True).stdout)
+        json.loads(subprocess.run([sys.executable, "-c", LISTENER + code + ending], capture_output=True, text=True, check=True).stdout)
         for _ in range(processes)
     ]
     events = {"tracing": "jaxpr_trace_duration", "lowering": "jaxpr_to_mlir_module_duration", "compiling": "backend_compile_duration"}
@@ -77,7 +83,7 @@ print(json.dumps(spent))
 
 
 def of_many_motions():
-    """Seconds of 1024 motions up to their ends alone, and what 1000 samples add."""
+    """Seconds of 1024 motions without intermediate samples, and what 1000 samples add."""
     b = jnp.linspace(2500.0, 3500.0, 1024)
     numerics = {"over": ["b"], "rtol": 1e-5, "atol": 1e-7, "throw": False}
 
@@ -93,7 +99,7 @@ def of_many_motions():
 
 
 def main():
-    tables = {"a further fit": of_a_fit(), "1024 motions": of_many_motions()}
+    tables = {"a repeated fit": of_a_fit(), "1024 motions": of_many_motions()}
     tables |= {f"a first motion, {name}": of_a_first_motion(name) for name in CODES}
     for title, parts in tables.items():
         whole = sum(parts.values())

@@ -1,4 +1,4 @@
-"""The Runge–Kutta scheme DOP853 written out in `lax`, stage by stage: the limit of what a compiled motion can cost.
+"""The Runge–Kutta scheme DOP853 written directly in `lax`, stage by stage: a lower bound on the cost of a compiled motion.
 
 The state is an array of coordinates, or of coordinates × members for a batch that shares its steps.
 Source: Hairer, Nørsett & Wanner, Solving Ordinary Differential Equations I, section II.10.
@@ -13,8 +13,8 @@ STAGES = scheme.N_STAGES
 
 
 def motion(rates, start, ts, tolerance, max_steps=192):
-    """The states at `ts`, samples last. The steps are chosen by values alone: their size is not differentiated."""
-    # Held back from fusion: the compiler would compute a stage again for each one that uses it.
+    """The states at `ts`, samples last. Step sizes are chosen from values only and are not differentiated."""
+    # A barrier against fusion: the compiler would recompute a stage for each stage that uses it.
     rates = lambda y, rates=rates: jax.lax.optimization_barrier(rates(y))
     end, buffers = ts[-1], (jnp.full(max_steps, jnp.inf), jnp.ones(max_steps), jnp.zeros((max_steps, 8, *start.shape)))
 

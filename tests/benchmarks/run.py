@@ -1,6 +1,7 @@
-"""All comparisons of speed in one run, each in a process of its own; the tables go to `results.json`.
+"""All speed comparisons in one run, each in its own process; the tables go to `results.json`.
 
-Peers: pip install -e ".[benchmarks]". A peer that is not installed is named in the tables as skipped.
+Peers: pip install -e ".[benchmarks]". A peer that is not installed is listed as skipped.
+numbalsoda is not in that extra, because building it needs a Fortran compiler.
 Run: python tests/benchmarks/run.py
 """
 

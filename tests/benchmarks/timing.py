@@ -1,7 +1,7 @@
-"""Times measured side by side, and the tables made of them.
+"""Times measured side by side, and tables of them.
 
-Every round runs each candidate in turn, so that noise hits all alike; the time is the median of the rounds. The first call, which
-compiles, is kept apart. A table compares with its first row; `results.json` beside this file keeps them all.
+Every round runs each candidate in turn, so that noise affects all alike; the time is the median of the rounds. The first call, which
+compiles, is reported separately. Ratios are relative to the first row of a table; `results.json` beside this file keeps all tables.
 """
 
 import dataclasses
@@ -23,7 +23,7 @@ RESULTS = Path(__file__).with_name("results.json")
 
 @dataclasses.dataclass
 class Row:
-    """One candidate at one task; `seconds` is None where it was skipped, and `note` says why."""
+    """One candidate at one task; `seconds` is None if it was skipped, and `note` says why."""
 
     name: str
     first: float | None = None
@@ -36,14 +36,14 @@ class Row:
 
 
 def once(run: Callable[[], Any]) -> float:
-    """Seconds of one call, until its result is there."""
+    """Seconds of one call, until its result is available."""
     begin = time.perf_counter()
     jax.block_until_ready(run())
     return time.perf_counter() - begin
 
 
 def medians(runs: Mapping[str, Callable[[], Any]], rounds: int = ROUNDS, span: float = 2e-3) -> dict[str, float]:
-    """Median seconds of a call of each, compiled already; quick ones are called repeatedly until `span` seconds have passed."""
+    """Median seconds per call of each candidate, already compiled; quick ones are called repeatedly until `span` seconds have passed."""
     repeats = {name: max(1, int(span / max(min(once(run), once(run)), 1e-7))) for name, run in runs.items()}
     taken: dict[str, list[float]] = {name: [] for name in runs}
     for _ in range(rounds):
@@ -57,7 +57,7 @@ def medians(runs: Mapping[str, Callable[[], Any]], rounds: int = ROUNDS, span: f
 
 
 class Met(NamedTuple):
-    """The loosest tolerance that meets a bound, the error with it, and the seconds of the very first call."""
+    """The loosest tolerance that meets a bound, its error, and the seconds of the very first call."""
 
     tolerance: float
     error: float
@@ -65,7 +65,7 @@ class Met(NamedTuple):
 
 
 def loosest(run: Callable[[float], Any], error: Callable[[Any], float], bound: float, start: float = 1e-5) -> Met:
-    """The loosest tolerance, in quarters of a decade, with which the error is within the bound."""
+    """The loosest tolerance, in quarters of a decade, that keeps the error within the bound."""
     tolerance = start
     first = once(lambda: run(start))
     found = error(run(start))
@@ -88,7 +88,7 @@ def compared(runs: Mapping[str, Callable[[], Any]], met: Mapping[str, Met] | Non
 
 
 def skipped(names: Mapping[str, str]) -> list[Row]:
-    """Rows of candidates that are not there, with the reason."""
+    """Rows of candidates that are missing, with the reason."""
     return [Row(name, note=f"skipped: {reason}") for name, reason in names.items()]
 
 
@@ -102,7 +102,7 @@ def show(task: str, rows: Iterable[Row]) -> None:
 
 
 def duration(seconds: float | None) -> str:
-    """Seconds with three digits, in a fitting unit."""
+    """A duration with three digits, in a suitable unit."""
     if seconds is None:
         return ""
     unit, size = next(((u, s) for u, s in (("s", 1), ("ms", 1e-3), ("µs", 1e-6)) if seconds >= s), ("ns", 1e-9))
@@ -110,7 +110,7 @@ def duration(seconds: float | None) -> str:
 
 
 def record(topic: str, tables: Iterable[tuple[str, list[Row]]]) -> None:
-    """Shows each table as soon as it is there, and keeps it in `results.json` in place of its older one."""
+    """Prints each table as soon as it is complete, and stores it in `results.json`, replacing the previous one."""
     for task, rows in tables:
         show(f"{topic}: {task}", rows)
         kept = json.loads(RESULTS.read_text()) if RESULTS.exists() else {}

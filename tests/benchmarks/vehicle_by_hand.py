@@ -1,10 +1,10 @@
-"""The lecture's vehicle with equations derived by hand, their exact solution, and what is to be computed of it.
+"""The lecture's vehicle: equations derived by hand, their exact solution, and the tasks of the benchmarks.
 
     M_x ẍ = M₀/r − k w²,   M_x = M + 2m + 2Θ_r/r²,   w = ẋ + v
     M ÿ = −M g − 2c(y − l) − 2b ẏ
     Θ_s φ̈ = −2a²(c φ + b φ̇)
 
-State (x, y, φ, ẋ, ẏ, φ̇); θ = (b, c, k). The vehicle drives forwards against the wind, w > 0, so that |w| is w.
+State (x, y, φ, ẋ, ẏ, φ̇); θ = (b, c, k). The vehicle drives forwards against the wind, so w > 0 and |w| = w.
 """
 
 import math
@@ -31,7 +31,7 @@ SPREAD = THETA * np.random.default_rng(0).uniform(0.8, 1.2, (1024, 3))
 
 
 def rates(x, y, phi, vx, vy, vphi, b, c, k):
-    """ẏ, for numbers and symbols of any kind."""
+    """ẏ, for numbers or symbols of any kind."""
     w = vx + WIND
     drive = (THRUST - k * w * w) / MX
     heave = -G - 2.0 * (c * (y - LENGTH) + b * vy) / MASS
@@ -67,13 +67,13 @@ RECORD = EXACT[:, SEEN] + 1e-3 * np.random.default_rng(1).standard_normal((TS.si
 
 
 def loss_and_gradient(states, sensitivities):
-    """½ Σ (difference from the record)², and its gradient in θ, from the states and their derivatives."""
+    """½ Σ (difference from the record)², and its gradient with respect to θ, from the states and their derivatives."""
     residual, J = states[:, SEEN] - RECORD, sensitivities[:, SEEN]
     return 0.5 * np.sum(residual**2), np.einsum("ij,ijp->p", residual, J)
 
 
 def fitted(sensitive, steps=30):
-    """Least squares by Levenberg and Marquardt, with the parameters scaled; ends where a step moves them by less than 1e-7."""
+    """Levenberg–Marquardt with scaled parameters; stops when a step changes them by less than 1e-7."""
     theta, damping = GUESS, 1e-3
     assess = lambda theta: (lambda y, S: ((y[:, SEEN] - RECORD).ravel(), S[:, SEEN].reshape(-1, 3) * GUESS))(*sensitive(theta))
     residual, J = assess(theta)

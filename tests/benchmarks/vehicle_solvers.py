@@ -1,4 +1,4 @@
-"""The vehicle solved by jaxlag, by JAX written by hand, and by the peers: one `Solver` each.
+"""The vehicle solved by jaxlag, by hand-written JAX, and by other packages: one `Solver` each.
 
 motion(tolerance)                 states (1000, 6) at TS
 sensitive(theta, tolerance)       states (1000, 6) and their derivatives (1000, 6, 3) in θ
@@ -21,7 +21,7 @@ from jaxlag.examples import vehicle
 
 
 class Solver(NamedTuple):
-    """What a candidate can do; None where it cannot."""
+    """The tasks of a candidate; None for those it cannot do."""
 
     motion: Callable[[float], Any]
     sensitive: Callable[[Any, float], Any] | None = None
@@ -29,11 +29,11 @@ class Solver(NamedTuple):
 
 
 def of_jax(motion, motions=None, static=()):
-    """From `motion(theta, ts, tolerance)` in JAX, (samples, 6): derivatives by one vectorised forward pass."""
+    """A `Solver` from `motion(theta, ts, tolerance)` in JAX, (samples, 6); derivatives by one vectorised forward pass."""
 
     def sensitive(theta, ts, tolerance):
-        along = lambda e: jax.jvp(lambda theta: motion(theta, ts, tolerance), (theta,), (e,))
-        return jax.vmap(along, out_axes=(None, -1))(jnp.eye(3))
+        derivative = lambda e: jax.jvp(lambda theta: motion(theta, ts, tolerance), (theta,), (e,))
+        return jax.vmap(derivative, out_axes=(None, -1))(jnp.eye(3))
 
     motions = motions or (lambda spread, ts, tolerance: jax.vmap(lambda theta: motion(theta, ts, tolerance))(spread))
     one, three, all_ = (jax.jit(f, static_argnums=static) for f in (motion, sensitive, motions))
@@ -51,7 +51,7 @@ def jaxlag():
 
 
 def jaxlag_from_python():
-    """As a user calls it, with Python's share of the call."""
+    """As a user calls it, including the overhead of Python."""
     together = jax.jit(stacked)
     return Solver(lambda tolerance: together(*simulated(THETA, TS, tolerance)))
 
@@ -76,7 +76,7 @@ def jaxlag_many(spread, ts, tolerance):
 
 
 def field(t, y, theta):
-    """ẏ as diffrax wants it."""
+    """ẏ with the signature that diffrax expects."""
     return jnp.stack(rates(*y, *theta))
 
 
@@ -93,7 +93,7 @@ def diffrax(solver):
 
 
 def lax():
-    """DOP853 written out; the many share their steps."""
+    """DOP853 written directly in lax; the batch shares its steps."""
     start = jnp.asarray(START)
 
     def motion(theta, ts, tolerance):
@@ -108,7 +108,7 @@ def lax():
 
 
 def heyoka():
-    """Taylor series, compiled; variational equations; as many sets at once as fill a vector register."""
+    """Compiled Taylor series; variational equations; as many parameter sets at once as fit a vector register."""
     import heyoka as hy
 
     state, parameters = hy.make_vars("x", "y", "phi", "vx", "vy", "vphi"), [hy.par[i] for i in range(3)]
@@ -145,7 +145,7 @@ def heyoka():
 
 
 def casadi():
-    """CVODES; derivatives by its forward sensitivities; the many in two threads."""
+    """CVODES; derivatives by its forward sensitivities; the batch in two threads."""
     import casadi as ca
 
     y, p, theta = ca.SX.sym("y", 6), ca.SX.sym("p", 3), ca.MX.sym("theta", 3)
@@ -182,10 +182,14 @@ def with_sensitivities():
 
 
 def numba():
-    """DOP853 of numbalsoda, with symbolic sensitivities; the many on all cores."""
+    """DOP853 of numbalsoda, with symbolic sensitivities; the batch on all cores."""
     import numba as nb
-    import numbalsoda
     import sympy as sp
+
+    try:
+        import numbalsoda
+    except ImportError as error:
+        raise ImportError("numbalsoda is not installed: it is built with a Fortran compiler, then `pip install numbalsoda`") from error
 
     def compiled(size):
         y, theta, expressions = with_sensitivities()

@@ -14,7 +14,7 @@ import pytest
 from PIL import Image
 
 import jaxlag as jl
-from jaxlag._motion.trajectory import Stated
+from jaxlag._motion.trajectory import Provenance
 from jaxlag.examples import pendulum
 
 matplotlib.use("Agg")
@@ -36,9 +36,9 @@ def whirl():
         {"x": jnp.asarray(a), "y": jnp.asarray(b)} for a, b in ((x, y), (-omega * y, omega * x), (-(omega**2) * x, -(omega**2) * y))
     )
     stone = jl.System(lambda qdot, m: 0.5 * m * (qdot["x"] ** 2 + qdot["y"] ** 2), holonomic={"rod": pendulum.cartesian_rod})
-    stated = Stated.of(stone, {"l": jnp.asarray(l), "m": jnp.asarray(m)})
+    provenance = Provenance.of(stone, {"l": jnp.asarray(l), "m": jnp.asarray(m)})
     multipliers = {"rod": jnp.full(TS.shape, -m * l * omega**2)}
-    return jl.Trajectory(jnp.asarray(TS), q, qdot, qddot, multipliers, jl.RESULTS.successful, {}, None, {}, stated)
+    return jl.Trajectory(jnp.asarray(TS), q, qdot, qddot, multipliers, jl.RESULTS.successful, {}, None, {}, provenance)
 
 
 def bob(q):
@@ -55,6 +55,7 @@ def whirling(**options):
     )
 
 
+@pytest.mark.fast
 def test_frames_are_where_the_motion_is():
     moving = whirling(trail=0.5)
     assert moving.frames == 21 and repr(moving) == "Animation(21 frames, 2.1 s)"
@@ -95,17 +96,17 @@ def test_a_rod_between_two_bodies_pulls_at_both():
     ends = lambda x: {"a": jnp.asarray(x), "b": jnp.asarray(-x)}
     energy = lambda qdot, m: 0.5 * m * (qdot["a"] @ qdot["a"] + qdot["b"] @ qdot["b"])
     dumb_bell = jl.System(energy, holonomic={"rod": lambda q, l: jnp.linalg.norm(q["a"] - q["b"]) - l})
-    stated = Stated.of(dumb_bell, {"l": jnp.asarray(l), "m": jnp.asarray(m)})
+    provenance = Provenance.of(dumb_bell, {"l": jnp.asarray(l), "m": jnp.asarray(m)})
     motion = ends(out), ends(aside), ends(-(omega**2) * out), {"rod": jnp.full(TS.shape, -m * l / 2 * omega**2)}
-    turning = jl.Trajectory(jnp.asarray(TS), *motion, jl.RESULTS.successful, {}, None, {}, stated)
+    turning = jl.Trajectory(jnp.asarray(TS), *motion, jl.RESULTS.successful, {}, None, {}, provenance)
     points = {"a": lambda q: q["a"], "b": lambda q: q["b"]}
     moving = jl.animate(turning, points, [("a", "b")], forces={"rod": ("a", "b")}, fps=10)
     one, other = moving.ax.collections
     moving.draw(4)
     np.testing.assert_allclose([one.U[0], one.V[0]], -out[20] * np.hypot(one.U[0], one.V[0]) / (l / 2), atol=1e-6)
     np.testing.assert_allclose([other.U[0], other.V[0]], [-one.U[0], -one.V[0]], rtol=1e-6)
-    (said,) = moving.ax.get_legend().get_texts()
-    assert said.get_text() == f"rod, up to {m * l / 2 * omega**2:.3g}"
+    (entry,) = moving.ax.get_legend().get_texts()
+    assert entry.get_text() == f"rod, up to {m * l / 2 * omega**2:.3g}"
 
 
 @pytest.mark.parametrize(("speed", "frames"), [(1.0, 21), (2.0, 11)])
@@ -150,26 +151,30 @@ def test_a_file_that_cannot_be_written_is_refused(tmp_path, monkeypatch):
     with pytest.raises(ValueError, match=r"`file` must end with \.gif, \.mp4 or \.html, but is 'whirl\.avi'\. Rename it\."):
         whirling().save("whirl.avi")
     monkeypatch.setattr(animation.FFMpegWriter, "isAvailable", lambda: False)
-    with pytest.raises(RuntimeError, match=r"an \.mp4 must be written by ffmpeg, but it is not installed\. Install it, or save a \.gif\."):
+    with pytest.raises(
+        RuntimeError,
+        match=r"`file` must not end with \.mp4 without ffmpeg, but is .*whirl\.mp4'\. Install ffmpeg, or save a \.gif\.",
+    ):
         whirling().save(tmp_path / "whirl.mp4")
 
 
+@pytest.mark.fast
 @pytest.mark.parametrize(
     ("change", "sentence"),
     [
         ({"points": {}}, "`points` must name at least one point, but is empty. Give position maps"),
         ({"points": {"bob": lambda q: q["x"]}}, "`points` 'bob' must return a position (x, y), but returned 1 numbers."),
         ({"links": ["bob"]}, "`links` must be pairs, but hold 'bob'. Give the two ends"),
-        ({"links": [("bob", "pin")]}, "`links` must join points or places (x, y), but one ends at 'pin'. The points are bob."),
+        ({"links": [("bob", "pin")]}, "`links` must join points or positions (x, y), but one ends at 'pin'. The points are bob."),
         ({"links": [("bob", (0.0, 0.0, 0.0))]}, "but one ends at (0.0, 0.0, 0.0). The points are bob."),
         ({"forces": {"string": "bob"}}, "`forces` must be of constraints of the system, but 'string' is not. There are rod."),
         ({"forces": {"rod": "pin"}}, "`forces` must act on points, but 'rod' is to act on 'pin'. The points are bob."),
         ({"forces": {"rod": ("bob", "pin")}}, "`forces` must act on points, but 'rod' is to act on 'pin'."),
         (
             {"points": {"bob": bob, "wall": lambda t: (0.0 * t, 0.0 * t)}, "forces": {"rod": "wall"}},
-            "`forces` must name all points that a constraint acts through, but 'rod' acts not through wall alone. Name the points at both",
+            "`forces` must name all points that a constraint acts through, but 'rod' does not act through wall alone. Name the points",
         ),
-        ({"speed": 1e-3}, "`fps` and `speed` must give 2 to 2000 frames, but this motion of 2 gives 50001. Choose `speed`, now 0.001"),
+        ({"speed": 1e-3}, "`fps` and `speed` must give 2 to 2000 frames, but this motion of 2 gives 50001. Change `speed`, now 0.001"),
     ],
 )
 def test_what_does_not_fit_is_refused(change, sentence):

@@ -16,7 +16,7 @@ from scipy import stats
 
 import jaxlag as jl
 from jaxlag import plot
-from jaxlag._motion.trajectory import Stated
+from jaxlag._motion.trajectory import Provenance
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
@@ -33,8 +33,8 @@ def close_figures():
 def motion(q):
     """A trajectory that was not simulated, so that the tests know every number of it."""
     samples = jax.tree.map(lambda start: jnp.stack([jnp.asarray(start + t) for t in TIMES]), q)
-    stated = Stated.of(jl.System(lambda qdot: qdot), {})
-    return jl.Trajectory(jnp.asarray(TIMES), samples, samples, samples, {}, jl.RESULTS.successful, {}, None, {}, stated)
+    provenance = Provenance.of(jl.System(lambda qdot: qdot), {})
+    return jl.Trajectory(jnp.asarray(TIMES), samples, samples, samples, {}, jl.RESULTS.successful, {}, None, {}, provenance)
 
 
 def fitted(*residuals, of, sigma=0.5):
@@ -52,6 +52,7 @@ def experiment(values, **options):
     return jl.Experiment(TIMES, values, 0.0, 0.0, observe=lambda q: q, **options)
 
 
+@pytest.mark.fast
 def test_motion_has_a_panel_for_each_coordinate():
     axes = plot.motion(motion({"x": 1.0, "phi": 2.0}), units={"t": "s", "phi": "rad"})
     assert [ax.get_ylabel() for ax in axes] == ["phi (rad)", "x"]
@@ -68,6 +69,7 @@ def test_motion_of_one_number_has_one_panel():
     assert (ax.get_xlabel(), ax.get_ylabel()) == ("t", "q")
 
 
+@pytest.mark.fast
 def test_motion_draws_the_entries_of_an_array_in_one_panel():
     axes = plot.motion(motion({"body": {"R": np.arange(4.0).reshape(2, 2)}, "z": 0.0}))
     assert [ax.get_ylabel() for ax in axes] == ["body.R", "z"]
@@ -79,6 +81,7 @@ def test_motion_draws_the_entries_of_an_array_in_one_panel():
     assert len(axes[0].get_legend().get_texts()) == 4
 
 
+@pytest.mark.fast
 def test_motion_draws_the_names_in_their_order():
     axes = plot.motion(motion({"x": 1.0, "y": 2.0, "phi": 3.0}), ("y", "phi"))
     assert [ax.get_ylabel() for ax in axes] == ["y", "phi"]
@@ -187,7 +190,7 @@ def test_parameters_have_bars_in_percent_and_correlations(fall):
     assert {text.get_text() for text in matrix.texts} == {"+1.00", f"{fit.correlation[0, 2]:+.2f}"}
     with pytest.raises(ValueError, match=r"`names` must name fitted parameters, but holds 'M'\. There are b, c, k\."):
         plot.parameters(fit, ("M",))
-    with pytest.raises(ValueError, match=r"`names` must be between 1 and 40, to be readable, but are 0\. Choose"):
+    with pytest.raises(ValueError, match=r"`names` must be 1 to 40, to be readable, but are 0\. Choose"):
         plot.parameters(fit, ())
 
 
@@ -251,7 +254,7 @@ def test_energy_stands_beside_the_works():
     for name in ("dampers", "air", "drive"):
         np.testing.assert_array_equal(lines[f"work of {name}"], trajectory.work()[name])
     assert "work of time" not in lines and ax.get_ylabel() == "energy (J)"
-    np.testing.assert_allclose(lines["energy at the start + works"], lines["energy"], rtol=1e-6)
+    np.testing.assert_allclose(lines["initial energy + work"], lines["energy"], rtol=1e-6)
     plain = example("motion")["trajectory"]
     assert [line.get_label() for line in plot.energy(plain).lines] == ["energy"]
 
@@ -278,20 +281,20 @@ def test_correlations_of_either_sign_look_different(size):
     matrix = plot.parameters(fit)[1]
     plus, minus = matrix.images[0].cmap([1.0, 0.0])
     assert plus[2] - plus[0] > 0.4 and minus[0] - minus[2] > 0.4  # blue, red
-    said = [text.get_text() for text in matrix.texts]
-    assert said == (["+1.00", "-1.00", "-1.00", "+1.00"] if size == 2 else ["+" if r > 0 else "−" for r in rho.flat])
+    signs = [text.get_text() for text in matrix.texts]
+    assert signs == (["+1.00", "-1.00", "-1.00", "+1.00"] if size == 2 else ["+" if r > 0 else "−" for r in rho.flat])
 
 
 def test_forces_are_shaded_where_a_constraint_would_have_to_pull():
     lagrangian = lambda q, qdot: 0.5 * qdot @ qdot - q[1]
     system = jl.System(lagrangian, holonomic={"table": lambda q: q[1], "wall": lambda q: q[0]}, one_sided="table")
     wave = jnp.cos(2 * jnp.pi * jnp.asarray(TIMES))  # negative at 0.3 … 0.7
-    trajectory = dataclasses.replace(motion(np.zeros(2)), multipliers={"table": wave, "wall": wave}, stated=Stated.of(system, None))
+    trajectory = dataclasses.replace(motion(np.zeros(2)), multipliers={"table": wave, "wall": wave}, provenance=Provenance.of(system, None))
     table, wall = plot.forces(trajectory)
     (shade,) = table.patches
     box = shade.get_extents().transformed(table.transData.inverted())
     np.testing.assert_allclose((box.x0, box.x1), (0.25, 0.75))
-    assert [text.get_text() for text in table.get_legend().get_texts()] == ["would have to pull", "λ changes its sign"]
+    assert [text.get_text() for text in table.get_legend().get_texts()] == ["would have to pull", "λ changes sign"]
     assert not wall.patches
 
 
@@ -306,12 +309,12 @@ def test_the_areas_of_the_balance_add_up_to_nothing():
     ax = plot.balance(trajectory, units={"t": "s", "energy": "J"})
     ts, areas = np.asarray(trajectory.ts), ax.collections
     above, below = ([heights(area, ts) for area in areas[k::2]] for k in (0, 1))
-    turned = np.max(np.sum(above, axis=0))
-    np.testing.assert_allclose(np.sum(above, axis=0), np.sum(below, axis=0), atol=1e-6 * turned)
+    exchanged = np.max(np.sum(above, axis=0))
+    np.testing.assert_allclose(np.sum(above, axis=0), np.sum(below, axis=0), atol=1e-6 * exchanged)
     assert [area.get_label() for area in areas[::2]] == ["change of energy", "air", "dampers", "drive"]
-    np.testing.assert_allclose(below[3], trajectory.work()["drive"], atol=1e-9 * turned)
-    np.testing.assert_allclose(above[2], -trajectory.work()["dampers"], atol=1e-9 * turned)
-    with pytest.raises(ValueError, match=re.escape("Ask for them by `simulate(..., audit=True)`.")):
+    np.testing.assert_allclose(below[3], trajectory.work()["drive"], atol=1e-9 * exchanged)
+    np.testing.assert_allclose(above[2], -trajectory.work()["dampers"], atol=1e-9 * exchanged)
+    with pytest.raises(ValueError, match=re.escape("Ask for them with `simulate(..., works=True)`.")):
         plot.balance(example("motion")["trajectory"])
 
 
@@ -329,11 +332,12 @@ def test_friction_is_shaded_where_it_sticks():
     assert plot.friction(trajectory, ("dry",)).shape == (2, 1)
 
 
+@pytest.mark.fast
 @pytest.mark.parametrize(
     ("function", "sentence"),
     [
-        (plot.forces, "`trajectory` must be of a system with constraints, but it has none. State them by"),
-        (plot.friction, "`trajectory` must have dry friction that sticks and slips, but has none. Write it with a kink"),
+        (plot.forces, "`trajectory` must be of a system with constraints, but it has none. State them with"),
+        (plot.friction, "`trajectory` must have dry friction that sticks and slips, but has none. Write it as a nonsmooth term"),
     ],
 )
 def test_what_is_not_there_cannot_be_drawn(function, sentence):
@@ -362,6 +366,7 @@ def test_a_batch_is_refused():
         plot.motion(batch)
 
 
+@pytest.mark.fast
 def test_an_unknown_name_is_refused():
     with pytest.raises(ValueError, match=r"`names` must name coordinates, but holds 'z'\. There are x, y\."):
         plot.motion(motion({"x": 1.0, "y": 2.0}), ("z",))

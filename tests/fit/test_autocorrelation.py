@@ -1,4 +1,4 @@
-"""Residuals that hang together in time, against matrices written down from the noise itself."""
+"""Autocorrelated residuals, against matrices written down from the noise itself."""
 
 import bench_coverage
 import numpy as np
@@ -7,14 +7,14 @@ import pytest
 from scipy import linalg, signal, stats
 
 import jaxlag as jl
-from jaxlag._fit.autocorrelation import autoregression, coloured_information, reach, whiteness
+from jaxlag._fit.autocorrelation import autoregression, coloured_information, correlation_length, whiteness
 
 T = 3000
 SLOPES = np.stack([np.exp(-0.001 * np.arange(T)) * np.cos(0.02 * np.arange(T)), np.linspace(0, 1, T) * np.sin(0.05 * np.arange(T))], axis=1)
 
 
 def noise(rho, seed=0, count=T):
-    """r_t = ρ r_{t−1} + e_t, of variance one, begun long ago."""
+    """r_t = ρ r_{t−1} + e_t, of variance one, stationary."""
     e = np.random.default_rng(seed).standard_normal(count + 3000)
     return signal.lfilter([np.sqrt(1 - rho**2)], [1.0, -rho], e)[3000:]
 
@@ -25,22 +25,24 @@ def exact(rho, J=SLOPES, at=None):
     return J[at].T @ rho ** np.abs(at[:, None] - at) @ J[at]
 
 
+@pytest.mark.fast
 @pytest.mark.parametrize("rho, within", [(0.5, 0.1), (0.8, 0.1), (0.95, 0.15), (0.99, 0.35), (-0.5, 0.1)])
 def test_the_information_is_that_of_the_noise(rho, within):
     """The mean of five recordings; what is estimated from one has an error of its own, the larger the longer the correlation."""
     found = [coloured_information(SLOPES[:, None], noise(rho, seed)[:, None], np.ones(1)) for seed in range(5)]
     np.testing.assert_allclose(np.diag(np.mean(found, axis=0)), np.diag(exact(rho)), rtol=within)
     known = np.log(0.1) / np.log(abs(rho))
-    assert np.median([reach(autoregression(noise(rho, seed)), T) for seed in range(5)]) == pytest.approx(known, rel=0.4, abs=1)
+    assert np.median([correlation_length(autoregression(noise(rho, seed)), T) for seed in range(5)]) == pytest.approx(known, rel=0.4, abs=1)
 
 
-def test_white_residuals_leave_the_information_as_it_is():
+def test_white_residuals_leave_the_information_unchanged():
     r = noise(0.0)
-    assert whiteness(r) > 0.01 and autoregression(r).size == 0 and reach(autoregression(r), T) == 0
+    assert whiteness(r) > 0.01 and autoregression(r).size == 0 and correlation_length(autoregression(r), T) == 0
     found = coloured_information(SLOPES[:, None], r[:, None], np.ones(1))
     np.testing.assert_allclose(found, SLOPES.T @ SLOPES, rtol=1e-12)
 
 
+@pytest.mark.fast
 def test_the_model_of_a_resonance_is_found():
     """An autoregression of order two; its coefficients are known."""
     truth = np.array([2 * 0.9 * np.cos(0.3), -(0.9**2)])
@@ -48,7 +50,7 @@ def test_the_model_of_a_resonance_is_found():
     np.testing.assert_allclose(autoregression(signal.lfilter([1.0], [1.0, *-truth], e)[2000:]), truth, atol=0.03)
 
 
-def test_missing_samples_are_passed_over():
+def test_missing_samples_are_left_out():
     """Half of the samples are missing: every second one, so that the rest is noise of ρ², or at random."""
     every_second, at_random = np.arange(0, T, 2), np.flatnonzero(np.random.default_rng(1).random(T) < 0.5)
     for at, within in ((every_second, 0.2), (at_random, 0.3)):
@@ -60,6 +62,7 @@ def test_missing_samples_are_passed_over():
         np.testing.assert_allclose(np.diag(np.mean(found, axis=0)), np.diag(exact(0.9, at=at)), rtol=within)
 
 
+@pytest.mark.fast
 def test_channels_that_share_their_noise():
     """Two sensors that see one disturbance twice know no more than one; where it has the other sign they know their sum exactly."""
     r = noise(0.9)
@@ -70,6 +73,7 @@ def test_channels_that_share_their_noise():
     np.testing.assert_allclose(opposite, 0 * once, atol=1e-9 * np.max(once))
 
 
+@pytest.mark.fast
 def test_two_different_channels_against_their_covariance():
     """Noise of ρ = 0.9 and 0.6 driven by shocks of correlation ½, channels of size 2 and 1; the covariance by its sum."""
     rng, rhos, sizes = np.random.default_rng(7), (0.9, 0.6), np.array([2.0, 1.0])
@@ -136,23 +140,23 @@ def test_the_covariance_is_the_sandwich_and_all_that_is_made_of_it(one):
 def test_the_card_and_a_comparison_say_so(one):
     times = " to ".join(f"{x:.2g}" for x in sorted(one.inflation))
     assert one.correlated == one.channels[0].correlated > 2 and one.remarks == []
-    said = f"standard errors allow for the residuals' correlation over {one.correlated} samples: {times} times those of white ones"
+    said = f"standard errors account for residuals correlated over {one.correlated} samples: {times} times those for white residuals"
     assert said in repr(one)
     white = fit(osc.record(0))
-    assert white.correlated == 0 and np.all(white.inflation == 1) and "correlation over" not in repr(white)
+    assert white.correlated == 0 and np.all(white.inflation == 1) and "correlated over" not in repr(white)
     assert f"overstated: residuals of 'a' are correlated over {one.correlated} samples" in repr(jl.compare({"a": one, "b": one}))
     assert "overstated" not in repr(jl.compare({"a": white, "b": white}))
 
 
-def test_two_recordings_missing_samples_sigma_and_pieces(one):
+def test_two_recordings_missing_samples_sigma_and_segments(one):
     per_variance = one.covariance / one.sigma**2
     given = fit(coloured(1, sigma=0.02))
     np.testing.assert_allclose(given.covariance, 0.02**2 * per_variance, rtol=1e-4)
     twice = fit([coloured(1), coloured(1)])  # as far as one knows, two independent ones
     np.testing.assert_allclose(twice.covariance / twice.sigma**2, per_variance / 2, rtol=1e-4)
-    in_pieces = fit(coloured(1), pieces=3)
-    np.testing.assert_allclose(in_pieces.covariance, one.covariance, rtol=1e-3)
-    np.testing.assert_allclose(in_pieces.inflation, one.inflation, rtol=1e-3)
+    in_segments = fit(coloured(1), segments=3)
+    np.testing.assert_allclose(in_segments.covariance, one.covariance, rtol=1e-3)
+    np.testing.assert_allclose(in_segments.inflation, one.inflation, rtol=1e-3)
     at = np.r_[3:7, 31]
     z = osc.with_nan(coloured(1).values, *at)
     gaps = fit(jl.Experiment(osc.TIMES, z, 1.0, 0.0))

@@ -87,6 +87,7 @@ class Column(np.ndarray):
         return np.asarray(self)
 
 
+@pytest.mark.fast
 @pytest.mark.parametrize("case", BAD)
 def test_bad_data_are_refused_with_the_cure(case):
     make, said = BAD[case]
@@ -103,7 +104,7 @@ BAD_FITS = {
     "nothing free": (lambda: fit(free=()), "must name at least one entry"),
     "more unknowns than measurements": (
         lambda: fit(experiments=jl.Experiment([0.0, 1.0], [1.0, np.nan], 1.0, 0.0)),
-        "2 unknowns stand against 1 measurements",
+        "there are 2 unknowns and 1 measurements",
     ),
     "a start outside its bounds": (
         lambda: fit(bounds={"c": (5.0, None)}),
@@ -120,7 +121,7 @@ BAD_FITS = {
     "no params": (lambda: fit(params=None), "`params` must have entries that `free` can name, but is a NoneType"),
     "params of its own over no mapping": (
         lambda: jl.fit(BY_FIELD, experiment(params={"c": 4.0}), Oscillator(3.0, Damper(0.2)), free=("c",)),
-        "`params` must be a mapping where an experiment has params of its own to be put over them, but is a Oscillator",
+        "`params` must be a mapping where an experiment has params of its own that override them, but is a Oscillator",
     ),
     "an integer to be fitted": (lambda: fit(params=osc.START | {"c": np.array(3)}), "must name real numbers, but 'c' holds none"),
     "sensors that see something else": (
@@ -165,6 +166,7 @@ def test_what_cannot_be_fitted_is_refused_with_the_cure(case):
     assert said in str(error.value) and str(error.value).endswith(".")
 
 
+@pytest.mark.fast
 def test_a_table_in_a_file(tmp_path):
     file = tmp_path / "drive.csv"
     file.write_text("time [s]; x [m]; note\n0; 1.0; 7\n0.5; ; 7\n1; 0.5; 7\n")
@@ -177,6 +179,7 @@ def test_a_table_in_a_file(tmp_path):
         jl.Experiment.from_csv(file, 1.0, 0.0, time="t", observe=lambda q: {"x": q})
 
 
+@pytest.mark.fast
 def test_a_data_frame():
     e = jl.Experiment.from_dataframe(Frame(t=T, x=X, y=2 * X), {"x": 1.0, "y": 2.0}, {"x": 0.0, "y": 0.0}, time="t")
     np.testing.assert_allclose(e.values["y"], 2 * X)

@@ -11,7 +11,7 @@ from scipy.optimize import curve_fit, least_squares
 
 import jaxlag as jl
 from jaxlag._fit.levenberg_marquardt import CONVERGED, levenberg_marquardt
-from jaxlag._fit.result import plus_minus
+from jaxlag._fit.rounding import plus_minus
 from jaxlag.examples import vehicle
 
 GUESS = vehicle.params | {"b": 6000.0, "c": 20000.0, "k": 0.3}
@@ -29,6 +29,7 @@ def experiment(seed, **more):
     return jl.Experiment(*drive(seed, **more), vehicle.q0, vehicle.qdot0, observe=vehicle.observe)
 
 
+@pytest.mark.fast
 def test_the_shipped_recording_is_what_its_script_makes(tmp_path, monkeypatch):
     monkeypatch.setattr(make_drive, "FILE", tmp_path / "again.csv")
     make_drive.main()
@@ -140,6 +141,7 @@ def test_a_second_fit_traces_nothing(monkeypatch):
     assert traces == []
 
 
+@pytest.mark.fast
 @pytest.mark.parametrize(
     "value, error, said", [(2998.4, 12.3, "2998 ± 12"), (0.600029, 2.1e-5, "0.600029 ± 0.000021"), (41234.0, 310.0, "41230 ± 310")]
 )
@@ -147,17 +149,18 @@ def test_plus_minus(value, error, said):
     assert plus_minus(value, error) == said
 
 
+@pytest.mark.fast
 def test_a_step_too_small_to_be_seen_is_taken():
     """Where each look at the residuals adds 1e-9 of them, no last step lowers the cost. It ends all the same; against SciPy."""
     ts, looks = np.linspace(0.0, 1.0, 50), []
     data = np.exp(-1.3 * ts) + 0.01 * np.sin(40 * ts)
 
-    def seen(y):
+    def linearise(y):
         looks.append(1)
         model = jnp.exp(-y[0] * ts)
         return (model - data) * (1 + 1e-9 * len(looks)), (-ts * model)[:, None], None
 
-    outcome = levenberg_marquardt(seen, jnp.array([3.0]), freedom=49, max_steps=50, tolerance=1e-6)
+    outcome = levenberg_marquardt(linearise, jnp.array([3.0]), freedom=49, max_steps=50, tolerance=1e-6)
     expected = least_squares(lambda y: np.exp(-y[0] * ts) - data, [3.0], xtol=1e-15, ftol=1e-15, gtol=1e-15)
     error = np.sqrt(2 * expected.cost / 49 / (expected.jac.T @ expected.jac)[0, 0])
     assert int(outcome.best.status) == CONVERGED and len(looks) <= 9

@@ -90,7 +90,7 @@ def test_sums_and_idle_parameters_are_named():
     )
     found = jl.fit(system, osc.record(0), {"c": 3.0, "b1": 0.2, "b2": 0.1, "idle": 2.0}, free=("c", "b1", "b2", "idle"))
     assert found.remarks[0] == "idle has no influence on these measurements"
-    assert found.remarks[1] in ("only b1 + 2 b2 is determined; b1 and b2 one by one are not",)
+    assert found.remarks[1] in ("only b1 + 2 b2 is determined; b1 and b2 individually are not",)
     assert np.isfinite(found.standard_errors["c"]) and np.isinf(found.standard_errors["b1"])
 
 
@@ -103,18 +103,20 @@ def test_sums_and_idle_parameters_are_named():
 )
 def test_other_combinations(change, said):
     """In closed form: what does not show are the changes along which a function of the parameters is constant."""
-    from jaxlag._fit.identifiability import in_words
+    from jaxlag._fit.identifiability import undetermined
+    from jaxlag._fit.remarks import on_undetermined
 
     def null(theta):
         slope = np.array(jax.grad(lambda t: change(*t))(jnp.asarray(theta)))[None, :]
         return np.linalg.svd(slope)[2][1:].T
 
     places = [np.array([2.0, 3.0, 5.0]), np.array([2.2, 2.5, 5.5])]
-    words = in_words(("a", "b", "c"), places[0], [null(p) for p in places], places, [2] if said else [])
+    found = undetermined(places[0], [null(p) for p in places], places, [2] if said else [])
+    words = on_undetermined(("a", "b", "c"), found)
     if said:
-        assert words == ["c has no influence on these measurements", f"{said}; a and b one by one are not"]
+        assert words == ["c has no influence on these measurements", f"{said}; a and b individually are not"]
     else:
-        assert "a, b and c are not determined one by one: they can change together without showing" in words[0]
+        assert "a, b and c are not determined individually: they can change together without visible effect" in words[0]
 
 
 def test_bounds_hold_and_the_inside_is_unchanged(plain):
@@ -271,10 +273,10 @@ def test_a_profile_ends_at_a_bound():
 def test_a_hopeless_end_is_not_called_converged():
     """A start from which the motion explodes, and a record in other units than the model's."""
     exploding = fit(osc.record(0, ts=osc.TIMES / 4), osc.START | {"c": -1e4})
-    assert not exploding.converged and any("times as large as the measurements: look at the units" in said for said in exploding.remarks)
+    assert not exploding.converged and any("times as large as the measurements: check the units" in said for said in exploding.remarks)
     assert max(len(line) for line in repr(exploding).splitlines()) < 180
     other_units = fit(jl.Experiment(osc.TIMES, 1e-3 * osc.noisy(0), 1.0, 0.0))
-    assert not other_units.converged and "nothing to do with the measurements" in other_units.reason
+    assert not other_units.converged and "unrelated to the measurements" in other_units.reason
 
 
 def test_optimisers_of_optax(plain):
@@ -290,7 +292,7 @@ def test_optimisers_of_optax(plain):
 
 def test_an_interrupted_fit_returns_the_best_so_far(monkeypatch):
     calls = []
-    original = levenberg_marquardt.ONE[1]
+    original = levenberg_marquardt.SINGLE[1]
 
     def interrupting(*args):
         calls.append(1)
@@ -298,15 +300,15 @@ def test_an_interrupted_fit_returns_the_best_so_far(monkeypatch):
             raise KeyboardInterrupt
         return original(*args)
 
-    monkeypatch.setattr(levenberg_marquardt, "ONE", (levenberg_marquardt.ONE[0], interrupting))
+    monkeypatch.setattr(levenberg_marquardt, "SINGLE", (levenberg_marquardt.SINGLE[0], interrupting))
     found = fit(osc.record(0))
-    assert not found.converged and "interrupted by the keyboard" in found.reason and "interrupted" in repr(found)
+    assert not found.converged and "interrupted (Ctrl-C)" in found.reason and "interrupted" in repr(found)
     assert found.cost < found.costs[0]
 
 
 def test_interrupted_starts_are_not_called_converged(monkeypatch):
     """Though the best of them had converged by then."""
-    original, calls = levenberg_marquardt.MANY[1], []
+    original, calls = levenberg_marquardt.BATCHED[1], []
 
     def interrupting(*args):
         now, trial = original(*args)
@@ -317,9 +319,9 @@ def test_interrupted_starts_are_not_called_converged(monkeypatch):
             raise KeyboardInterrupt
         return now, trial
 
-    monkeypatch.setattr(levenberg_marquardt, "MANY", (levenberg_marquardt.MANY[0], interrupting))
+    monkeypatch.setattr(levenberg_marquardt, "BATCHED", (levenberg_marquardt.BATCHED[0], interrupting))
     found = fit(osc.record(0), osc.START | {"c": 3.5}, bounds={"c": (1.0, 60.0), "b": (0.01, 0.6)}, starts=24)
-    assert calls.count("converged") == 2 and not found.converged and "interrupted by the keyboard" in found.reason
+    assert calls.count("converged") == 2 and not found.converged and "interrupted (Ctrl-C)" in found.reason
 
 
 def test_a_start_without_a_motion_is_refused():
@@ -363,17 +365,17 @@ def test_single_precision(single_precision):
     np.testing.assert_allclose([found.estimates[name] for name in FREE], by_scipy(osc.noisy(0)).x, rtol=2e-3)
 
 
-def test_robust_pieces_are_the_robust_whole():
+def test_a_robust_fit_in_segments_is_the_robust_fit():
     z = osc.noisy(2)
     z[::7] += 0.5
     e = jl.Experiment(osc.TIMES, z, 1.0, 0.0)
-    whole, pieces = (fit(e, loss=jl.Huber(), pieces=n) for n in (1, 3))
-    np.testing.assert_allclose([pieces.estimates[name] for name in FREE], [whole.estimates[name] for name in FREE], rtol=1e-3)
+    whole, segments = (fit(e, loss=jl.Huber(), segments=n) for n in (1, 3))
+    np.testing.assert_allclose([segments.estimates[name] for name in FREE], [whole.estimates[name] for name in FREE], rtol=1e-3)
 
 
 def test_an_estimate_at_a_bound_is_remarked():
     found = fit(osc.record(0), bounds={"c": (None, 3.5)})
-    assert found.remarks == ["c is at its bound 3.5, which the measurements would have it cross"]
+    assert found.remarks == ["c is at its bound 3.5; the measurements favour values beyond it"]
     assert found.interval("c").upper <= 3.5
 
 
@@ -384,9 +386,7 @@ def test_a_model_that_does_not_explain_the_data_is_remarked():
     assert without.sigma > 10 and "does not explain the measurements" in repr(without)
     assert not any("explain" in remark for remark in jl.fit(osc.SYSTEM, record, osc.START, free=("c", "b")).remarks)
     (said,) = jl.fit(osc.SYSTEM, osc.record(0), osc.START | {"b": 0.0}, free=("c",)).remarks  # nor where sigma is not known
-    assert re.fullmatch(
-        "the model misses something, or the sensors' noise is not white: residuals of z are correlated over \\d+ samples", said
-    )
+    assert re.fullmatch("the model misses something, or the noise is not white: residuals of z are correlated over \\d+ samples", said)
     assert fit(osc.record(0)).remarks == []
 
 
@@ -396,7 +396,7 @@ def test_what_trades_with_the_unknown_start_is_said():
     ts = osc.TIMES
     e = jl.Experiment(ts, (1 - np.exp(-0.4 * ts)) / 0.4, 0.0, 1.0, observe=lambda q, offset: q + offset, unknown=("q0",))
     found = jl.fit(system, e, {"b": 0.5, "offset": 0.1}, free=("b", "offset"))
-    assert found.remarks == ["offset cannot be told from the unknown starts"]
+    assert found.remarks == ["offset cannot be distinguished from the unknown starts"]
     np.testing.assert_allclose(found.estimates["b"], 0.4, rtol=1e-6)
 
 
@@ -411,19 +411,21 @@ def test_one_of_many_without_a_motion_is_marked():
         fits[0].predict(bad)
 
 
-def test_prediction_with_a_late_sensor(plain):
-    late = plain.predict(jl.Experiment(osc.TIMES, None, 1.0, 0.0, delay=0.5))
+def test_prediction_with_a_delayed_sensor(plain):
+    shown = plain.predict(jl.Experiment(osc.TIMES, None, 1.0, 0.0, delay=0.5))
     theta = [plain.estimates[name] for name in FREE]
-    np.testing.assert_allclose(late.values, np.where(osc.TIMES > 0.5, osc.position(np.maximum(osc.TIMES - 0.5, 0), *theta), 1.0), atol=1e-6)
+    np.testing.assert_allclose(
+        shown.values, np.where(osc.TIMES > 0.5, osc.position(np.maximum(osc.TIMES - 0.5, 0), *theta), 1.0), atol=1e-6
+    )
 
 
 MORE_BAD = {
     "a prior against unknown noise": (
         lambda: fit(osc.record(0), priors={"b": (0.3, 0.1)}),
-        "`priors` must stand against noise that is known",
+        "`priors` must be weighed against known noise",
     ),
     "sigma of some only": (lambda: fit([osc.record(0), osc.record(1, sigma=0.01)]), "must all have a `sigma` or none"),
-    "pieces and an optimiser": (lambda: fit(osc.record(0), pieces=3, method=optax.lbfgs()), "must be used one at a time"),
+    "segments and an optimiser": (lambda: fit(osc.record(0), segments=3, method=optax.lbfgs()), "must be used one at a time"),
     "NaN where it is not free": (lambda: fit(osc.record(0), osc.START | {"m": np.nan}), "'m' is NaN. Give it a value, or free it."),
     "a parameter of each one's own": (lambda: fit(osc.record(0, params={"b": 0.3})), "each has a 'b' of its own"),
     "everything free, with bounds": (
@@ -432,7 +434,7 @@ MORE_BAD = {
     ),
     "a regression of nothing": (lambda: jl.regress(osc.SYSTEM, [], osc.START, free=FREE), "`experiments` must be an `Experiment`"),
     "a regression with nothing free": (lambda: jl.regress(osc.SYSTEM, osc.record(0), osc.START, free=()), "at least one entry"),
-    "a regression with a delay": (lambda: jl.regress(osc.SYSTEM, osc.record(0, delay=0.1), osc.START, free=FREE), "`delay` must be none"),
+    "a regression with a delay": (lambda: jl.regress(osc.SYSTEM, osc.record(0, delay=0.1), osc.START, free=FREE), "`delay` must be None"),
     "a time that is missing": (lambda: jl.Experiment([0.0, 0.1, np.nan], np.ones(3), 1.0, 0.0), "`ts` must be finite"),
     "a start that is missing": (lambda: jl.Experiment([0.0, 0.1], np.ones(2), np.nan, 0.0), "`q0` must be finite"),
 }
@@ -446,7 +448,7 @@ def test_what_would_give_wrong_numbers_is_refused(case):
     assert said in str(error.value) and str(error.value).endswith(".")
 
 
-def test_a_start_that_is_not_known_is_found_within_its_bounds():
+def test_an_unknown_start_is_found_within_its_bounds():
     found = fit(osc.record(0), osc.START | {"b": np.nan}, bounds={"b": (0, 0.5)})
     np.testing.assert_allclose(found.estimates["b"], by_scipy(osc.noisy(0)).x[1], rtol=1e-4)
 

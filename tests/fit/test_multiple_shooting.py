@@ -1,4 +1,4 @@
-"""A constrained double pendulum seen by cameras: masses, rod lengths and joint damping from its markers; a chaotic record in pieces."""
+"""A constrained double pendulum seen by cameras: masses, rod lengths and joint damping from its markers; a chaotic record in segments."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -110,30 +110,39 @@ def test_gaps_that_the_integration_leaves_end_the_rounds():
     angle = solve_ivp(swing, (0, 50), [2.5, 0], t_eval=ts, rtol=1e-11, atol=1e-12).y[0]
     e = jl.Experiment(ts, angle + 0.01 * np.random.default_rng(0).standard_normal(500), 2.5, 0.0)
     pendulum = jl.System(lambda q, qdot, g: 0.5 * qdot**2 + g * jnp.cos(q), dissipation=lambda qdot, b: 0.5 * b * qdot**2)
-    found = jl.fit(pendulum, e, {"g": 8.0, "b": 0.1}, free=("g", "b"), pieces=20, rtol=1e-3, atol=1e-4)
-    assert found.converged and abs(found.costs[-1] / found.cost - 1) < 0.02  # what the gaps weigh is nothing beside it
+    found = jl.fit(pendulum, e, {"g": 8.0, "b": 0.1}, free=("g", "b"), segments=20, rtol=1e-3, atol=1e-4)
+    assert found.converged and abs(found.costs[-1] / found.cost - 1) < 0.02  # the gaps contribute next to nothing
     for name, value in {"g": 9.81, "b": 0.05}.items():
         assert abs(found.estimates[name] - value) < 3 * found.standard_errors[name], name
 
 
-def test_ends_that_do_not_meet_are_said(monkeypatch):
+def test_gaps_that_do_not_close_are_reported(monkeypatch):
     """An iteration that goes nowhere."""
 
-    def stuck(seen, x, **_):
-        r, J, rows = seen(x)
+    def stuck(linearise, x, **_):
+        r, J, found = linearise(x)
         nothing = jnp.zeros(0)
-        return Outcome(Iterate(x, r, J, rows, float(r @ r) / 2, nothing, nothing, np.asarray(STALLED)), 1, np.ones(1))
+        return Outcome(Iterate(x, r, J, found, float(r @ r) / 2, nothing, nothing, np.asarray(STALLED)), 1, np.ones(1))
 
     monkeypatch.setattr(multiple_shooting, "levenberg_marquardt", stuck)
-    found = jl.fit(osc.SYSTEM, osc.record(0), osc.START, free=("c", "b"), pieces=3)
-    assert not found.converged and "the pieces' ends do not meet" in found.reason and found.steps < 10
+    found = jl.fit(osc.SYSTEM, osc.record(0), osc.START, free=("c", "b"), segments=3)
+    assert not found.converged and "the segments do not join" in found.reason and found.steps < 10
+
+
+def test_the_old_name_of_segments_still_works():
+    e = osc.record(0)
+    with pytest.warns(DeprecationWarning, match="`pieces` is now called `segments`. Write `segments`.") as warned:
+        old = jl.fit(osc.SYSTEM, e, osc.START, free=("c", "b"), pieces=3)
+    assert warned[0].filename == __file__
+    new = jl.fit(osc.SYSTEM, e, osc.START, free=("c", "b"), segments=3)
+    assert old.problem.continuity is not None and old.estimates == new.estimates
 
 
 @pytest.mark.slow
-def test_a_chaotic_record_in_pieces():
-    """20 s with overturning: one shot from the given start loses the motion; 40 pieces find it, and their ends meet."""
+def test_a_chaotic_record_in_segments():
+    """20 s with overturning: single shooting from the given start loses the motion; 40 segments find it, and the gaps close."""
     e = record(20.0, 1000, 2.2, 1)
-    found = jl.fit(PENDULUM, e, START, free=tuple(START), pieces=40, max_steps=150, **LOOSE)
+    found = jl.fit(PENDULUM, e, START, free=tuple(START), segments=40, max_steps=150, **LOOSE)
     assert found.converged and abs(found.sigma - 1) < 0.05
     for name, value in TRUE.items():
         assert abs(found.estimates[name] - value) < 4 * found.standard_errors[name], name

@@ -47,7 +47,7 @@ def closed_loop(noise, seed=0, T=8.0, dt=0.01):
 def axis():
     ts, q, v, u = closed_loop(noise=2e-6)
     assert np.sum(v == 0) > 20  # it sticks at times
-    return jl.Experiment(ts, q, 0.0, 0.0, params={"u": jl.Signal(ts, u, "hold")})
+    return jl.Experiment(ts, q, 0.0, 0.0, params={"u": jl.Signal(ts, u)})
 
 
 FREE = tuple(TRUE)
@@ -68,6 +68,7 @@ def test_the_friction_of_a_drive_axis_by_fit_with_exact_stick_slip(axis):
         assert abs(found.estimates[name] / TRUE[name] - 1) < 0.005, name
 
 
+@pytest.mark.fast
 def test_a_linear_regression_needs_no_start_and_is_exact_on_exact_data():
     """What is left is the error of the splines."""
     found = jl.regress(osc.SYSTEM, jl.Experiment(osc.TIMES, osc.position(osc.TIMES), 1.0, 0.0), osc.START | {"c": np.nan}, free=("c", "b"))
@@ -75,6 +76,7 @@ def test_a_linear_regression_needs_no_start_and_is_exact_on_exact_data():
     np.testing.assert_allclose([found.estimates["c"], found.estimates["b"]], [4.0, 0.3], rtol=1e-4)
 
 
+@pytest.mark.fast
 def test_velocities_or_accelerations_are_enough():
     ts = np.linspace(0, 10, 200)
     h = 1e-4
@@ -86,7 +88,7 @@ def test_velocities_or_accelerations_are_enough():
 
 
 def test_equations_in_which_everything_is_free_have_no_scale():
-    with pytest.raises(ValueError, match="only their ratios are determined. Hold one of them."):
+    with pytest.raises(ValueError, match="only their ratios are determined. Fix one of them."):
         jl.regress(osc.SYSTEM, osc.record(0), osc.START, free=("m", "c", "b"))
 
 
@@ -112,6 +114,7 @@ def test_an_estimate_at_its_bound_is_a_start():
     assert fitted.converged and fitted.estimates["b"] == 0 and "b is at its bound 0" in fitted.remarks[0]
 
 
+@pytest.mark.fast
 def test_what_no_sensor_sees_is_refused():
     e = jl.Experiment(osc.TIMES, osc.position(osc.TIMES), 1.0, 0.0, observe=lambda multipliers: multipliers["rod"])
     with pytest.raises(ValueError, match="must see positions, velocities or accelerations, but sees none"):

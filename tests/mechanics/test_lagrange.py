@@ -9,6 +9,8 @@ from jax.flatten_util import ravel_pytree
 import jaxlag as jl
 from jaxlag.examples import pendulum, vehicle
 
+pytestmark = pytest.mark.fast
+
 
 def vehicle_by_hand(q, qdot, p):
     """The lecture's three equations of motion, solved for the accelerations."""

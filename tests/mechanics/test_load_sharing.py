@@ -9,7 +9,7 @@ from scipy.linalg import null_space
 from scipy.optimize import minimize
 
 import jaxlag as jl
-from jaxlag._mechanics.friction_terms import Kinks
+from jaxlag._mechanics.friction_elements import FrictionElements
 from jaxlag._mechanics.load_sharing import shared
 
 LEGS = {
@@ -52,8 +52,8 @@ def test_the_most_loaded_element_is_used_as_little_as_can_be(seed):
     elements = rng.integers(3, 6)
     of = np.repeat(np.arange(elements), rng.integers(1, 3, elements))
     J, given, bound = rng.normal(size=(of.size, 3)), rng.normal(size=of.size), rng.uniform(0.5, 2, elements)
-    kinks = Kinks(lambda t, q, v: J @ v, {}, of, {"all": np.arange(of.size)})
-    left = jax.jit(lambda given: shared(kinks, jnp.asarray(J), given, jnp.asarray(bound), jnp.ones(elements, bool)))
+    elements = FrictionElements(lambda t, q, v: J @ v, {}, of, {"all": np.arange(of.size)})
+    left = jax.jit(lambda given: shared(elements, jnp.asarray(J), given, jnp.asarray(bound), jnp.ones(elements, bool)))
     share = left(given)
     np.testing.assert_allclose(J.T @ share.multipliers, J.T @ given, atol=1e-13)
     N = null_space(J.T)

@@ -1,4 +1,4 @@
-"""Energy, power and work; the check-up."""
+"""Energy, power and work; the pre-flight check."""
 
 import jax
 import jax.numpy as jnp
@@ -19,7 +19,7 @@ def test_powers_add_up_to_the_rate_of_the_energy():
     )
     p = {"m": 1.7, "b": 0.4}
     ts = jnp.array([0.0, 0.499, 0.5, 0.501])
-    motion = jl.simulate(system, jnp.array([0.3, 0.1, 0.3]), jnp.array([1.0, -0.5, 4.0]), ts, p, rtol=1e-11, atol=1e-12, audit=True)
+    motion = jl.simulate(system, jnp.array([0.3, 0.1, 0.3]), jnp.array([1.0, -0.5, 4.0]), ts, p, rtol=1e-11, atol=1e-12, works=True)
     named = jl.powers(system, motion.q[2], motion.qdot[2], p, t=0.5)
     assert set(named) == {"oil", "air", "push", "wall", "time"}
     energy = motion.energy()
@@ -34,7 +34,7 @@ def test_powers_add_up_to_the_rate_of_the_energy():
 def test_works_of_the_vehicle_in_closed_form():
     """The drive does M₀ x/r, whatever else happens; dampers take what the springs and the body lose."""
     ts, p = jnp.linspace(0, 20, 101), vehicle.params
-    motion = jl.simulate(vehicle.system, vehicle.q0, vehicle.qdot0, ts, p, audit=True)
+    motion = jl.simulate(vehicle.system, vehicle.q0, vehicle.qdot0, ts, p, works=True)
     np.testing.assert_allclose(motion.work()["drive"], p["M0"] / p["r"] * motion.q["x"], rtol=1e-8, atol=1e-6)
     assert np.max(np.abs(motion.balance())) < 1e-8
     assert "energy balance" in repr(motion) and "off by" in repr(motion)
@@ -46,7 +46,7 @@ def test_works_of_the_vehicle_in_closed_form():
 def test_the_work_of_projection_is_listed_apart():
     ts, p = jnp.linspace(0, 10, 51), pendulum.params
     run = lambda how: jl.simulate(
-        pendulum.cartesian, *pendulum.cartesian_state(2.0, 0.0, 1.0), ts, p, rtol=1e-5, atol=1e-7, audit=True, stabilisation=how
+        pendulum.cartesian, *pendulum.cartesian_state(2.0, 0.0, 1.0), ts, p, rtol=1e-5, atol=1e-7, works=True, stabilisation=how
     )
     projected, drifting = run(jl.Projection()), run(jl.NoStabilisation())
     assert set(projected.work()) == {"rod", "time", "projection"}
@@ -57,7 +57,7 @@ def test_the_work_of_projection_is_listed_apart():
 
 def test_works_that_were_not_asked_for():
     motion = jl.simulate(pendulum.polar, *pendulum.polar_state(1.0, 0.0, 1.0), [0, 1.0], pendulum.params)
-    with pytest.raises(ValueError, match=r"must be computed with its works, but was computed without.*audit=True"):
+    with pytest.raises(ValueError, match=r"must be computed with its works, but was computed without.*works=True"):
         motion.work()
     np.testing.assert_allclose(motion.energy(), -9.81 * np.cos(1.0), rtol=1e-7)
 
@@ -65,14 +65,14 @@ def test_works_that_were_not_asked_for():
 def test_gradient_of_a_work():
     """Work of a damper on a decaying oscillator, against finite differences, forward and reverse."""
     system = jl.System(lambda q, qdot: 0.5 * qdot**2 - 2 * q**2, dissipation={"oil": lambda qdot, b: 0.5 * b * qdot**2})
-    lost = lambda b: jl.simulate(system, 1.0, 0.0, jnp.linspace(0, 2, 5), {"b": b}, rtol=1e-11, atol=1e-12, audit=True).work()["oil"][-1]
+    lost = lambda b: jl.simulate(system, 1.0, 0.0, jnp.linspace(0, 2, 5), {"b": b}, rtol=1e-11, atol=1e-12, works=True).work()["oil"][-1]
     h = 1e-3
     expected = (8 * (lost(0.3 + h) - lost(0.3 - h)) - lost(0.3 + 2 * h) + lost(0.3 - 2 * h)) / (12 * h)
     np.testing.assert_allclose([jax.grad(lost)(0.3), jax.jacfwd(lost)(0.3)], expected, rtol=1e-8)
 
 
 def test_names_are_one_name_each():
-    with pytest.raises(ValueError, match="terms must be named differently, but two are called 'air'"):
+    with pytest.raises(ValueError, match="terms must have different names, but two are called 'air'"):
         jl.System(lambda qdot: 0.5 * qdot**2, dissipation={"air": lambda qdot: qdot**2}, force={"air": lambda: 1.0})
 
 
@@ -81,7 +81,7 @@ def test_a_check_up_that_finds_nothing():
     assert (found.degrees_of_freedom, found.rank, found.rows, found.redundant, found.findings) == (1, 1, 1, {}, ())
     # linearised about φ = 0.3: ω² = (g/l) cos φ
     np.testing.assert_allclose(found.time_constants, 1 / np.sqrt(9.81 * np.cos(0.3)), rtol=1e-10)
-    assert "nothing to mend" in repr(found) and "phi, r" in repr(found)
+    assert "no issues found" in repr(found) and "phi, r" in repr(found)
 
 
 def test_a_check_up_that_finds_everything():
@@ -100,7 +100,7 @@ def test_a_check_up_that_finds_everything():
         "of constraint 'again' 2 of the rows follow from those before",
         "the position is off constraint 'rod'",
         "the velocity is off constraint 'rod'",
-        "dissipation 'wrong' feeds energy in",
+        "dissipation 'wrong' adds energy",
         "the motion is stiff",
     ):
         assert finding in said, finding

@@ -294,7 +294,7 @@ def run(name, q0, qdot0, end, **changes):
     """201 samples with the works; other numbers than the example's cost no compilation."""
     x = EXAMPLES[name]
     ts = jnp.linspace(0, end, 201)
-    return jl.simulate(x.system, q0, qdot0, ts, {**x.params, **changes}, rtol=RTOL, atol=1e-2 * RTOL, audit=True)
+    return jl.simulate(x.system, q0, qdot0, ts, {**x.params, **changes}, rtol=RTOL, atol=1e-2 * RTOL, works=True)
 
 
 @functools.cache
@@ -378,7 +378,7 @@ def test_balance_sees_a_wrong_gradient_of_the_dissipation(error, monkeypatch):
         lambda t, q, qdot, m, c: 0.5 * m * qdot**2 - 0.5 * c * (1 + 0.5 * jnp.sin(3 * t)) * q**2,
         dissipation={"oil": lambda qdot, b: 0.5 * b * qdot**2},
     )
-    motion = jl.simulate(system, 1.0, 0.0, jnp.linspace(0, 2, 21), {"m": 1.0, "c": 4.0, "b": 0.5}, rtol=RTOL, atol=1e-2 * RTOL, audit=True)
+    motion = jl.simulate(system, 1.0, 0.0, jnp.linspace(0, 2, 21), {"m": 1.0, "c": 4.0, "b": 0.5}, rtol=RTOL, atol=1e-2 * RTOL, works=True)
     scale = np.max(motion.qdot**2) + sum(np.max(np.abs(work)) for work in motion.work().values())  # m = 1: q̇ ∂L/∂q̇
     assert np.max(np.abs(motion.work()["time"])) > 0.1 * scale
     np.testing.assert_allclose(motion.balance(), error * motion.work()["oil"] / scale, rtol=0, atol=BALANCE)

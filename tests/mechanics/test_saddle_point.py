@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 import jaxlag as jl
-from jaxlag._mechanics.saddle_point import pseudo_inverse, saddle_point
+from jaxlag._mechanics.pseudo_inverse import pseudo_inverse
+from jaxlag._mechanics.saddle_point import saddle_point
 from jaxlag.examples import pendulum
 
 

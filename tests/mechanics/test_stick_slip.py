@@ -40,9 +40,10 @@ def exact_rest(x0, F, c=4.0):
 @functools.cache
 def long_oscillation():
     ts = np.concatenate([np.linspace(0, 14, 57), [1014.0]])
-    return jl.simulate(oscillator, 1.0, 0.0, ts, {"c": 4.0, "F": 0.3}, audit=True, **SHARP)
+    return jl.simulate(oscillator, 1.0, 0.0, ts, {"c": 4.0, "F": 0.3}, works=True, **SHARP)
 
 
+@pytest.mark.fast
 def test_an_oscillator_comes_to_rest_and_stays_there():
     motion = long_oscillation()
     np.testing.assert_allclose(motion.q[-1], 0.05, atol=1e-8)
@@ -236,7 +237,7 @@ def test_two_blocks_on_a_shaken_floor():
         },
     )
     ts = np.linspace(0, 10, 101)
-    motion = jl.simulate(blocks, {"a": 0.0, "b": 0.0}, {"a": 1.0, "b": 0.0}, ts, {"F1": 3.5, "F2": 1.0}, audit=True, **SHARP)
+    motion = jl.simulate(blocks, {"a": 0.0, "b": 0.0}, {"a": 1.0, "b": 0.0}, ts, {"F1": 3.5, "F2": 1.0}, works=True, **SHARP)
     steep = lambda s: s / np.sqrt(s**2 + 1e-14)
 
     def rates(t, y):
@@ -263,7 +264,7 @@ chain = jl.System(chain_energy, dissipation={"floor": lambda qdot, F: F * jnp.su
 @pytest.mark.slow
 def test_a_chain_of_twenty_rubbing_blocks_runs_to_rest():
     start = np.zeros(20), np.r_[np.zeros(19), 3.0]
-    motion = jl.simulate(chain, *start, np.linspace(0, 60, 61), {"c": 10.0, "F": 0.2}, audit=True)
+    motion = jl.simulate(chain, *start, np.linspace(0, 60, 61), {"c": 10.0, "F": 0.2}, works=True)
     assert np.all(motion.qdot[-1] == 0) and np.all(motion.friction["floor"].sticking[-1])
     assert np.max(np.abs(motion.balance())) <= 1e-6
     assert np.all(np.abs(motion.friction["floor"].force) <= 0.2 * (1 + 1e-9))
@@ -306,7 +307,7 @@ def test_regularised_friction_creeps_as_its_docstring_says():
     motion = jl.simulate(by_formula, 0.0, 0.0, [0.0, 5.0, 10.0], {"m": 2.0, "alpha": alpha, "mu": 0.4}, friction=jl.Regularised(w))
     f, F = np.sin(alpha), 0.4 * np.cos(alpha)
     np.testing.assert_allclose(motion.qdot[1:], w * f / np.sqrt(F**2 - f**2), rtol=1e-5)
-    assert motion.friction == {} and "made smooth below a slip velocity of 0.001, where it creeps" in repr(motion)
+    assert motion.friction == {} and "regularised below a slip velocity of 0.001, where it creeps" in repr(motion)
     end = lambda w: jl.simulate(oscillator, 1.0, 0.0, [0.0, 8.0], {"c": 4.0, "F": 0.3}, friction=jl.Regularised(w)).q[-1]
     sharp = jl.simulate(oscillator, 1.0, 0.0, [0.0, 8.0], {"c": 4.0, "F": 0.3}).q[-1]
     assert abs(end(1e-4) - sharp) < 0.2 * abs(end(1e-2) - sharp)
@@ -314,12 +315,12 @@ def test_regularised_friction_creeps_as_its_docstring_says():
 
 def test_clear_errors():
     ts = [0.0, 20.0]
-    with pytest.raises(ValueError, match="must have bounds of friction that are not negative, but one is"):
+    with pytest.raises(ValueError, match="must have friction bounds that are not negative, but one is"):
         jl.simulate(oscillator, 1.0, 0.0, ts, {"c": 4.0, "F": -0.3})
     with pytest.raises(RuntimeError, match="changed between sliding and sticking more than `max_transitions` times: it chatters"):
         jl.simulate(oscillator, 1.0, 0.0, ts, {"c": 4.0, "F": 0.3}, friction=jl.StickSlip(max_transitions=3))
     bent = jl.System(oscillator_energy, dissipation={"odd": lambda q, qdot, F: F * jnp.abs(qdot**2 - 0.1 * q)})
-    with pytest.raises(ValueError, match="`dissipation` 'odd' must have its kinks in slip velocities that are affine in qdot"):
+    with pytest.raises(ValueError, match="`dissipation` 'odd' must be nonsmooth only in slip velocities that are affine in qdot"):
         jl.simulate(bent, 1.0, 0.5, ts, {"c": 4.0, "F": 0.3})
 
 
@@ -389,3 +390,13 @@ def test_the_capstan():
     np.testing.assert_allclose(steady.qddot[:, 1], 0, atol=1e-6)
     np.testing.assert_allclose(np.asarray(steady.multipliers["rope"])[[0, -1]], [-m2 * ratio * G, -m2 * G], rtol=1e-6)
     assert run(1.1 * m2 * ratio).qddot[0, 1] < -0.1  # heavier, it runs down
+
+
+def test_friction_beside_a_constraint_of_constant_rows():
+    """Up and down a slope x = y of constant rows, whose factors are plain numbers: closed form."""
+    slope = jl.System(
+        lambda q, qdot: 0.5 * qdot @ qdot - q[1], dissipation=lambda qdot: 0.1 * jnp.abs(qdot[0]), holonomic=lambda q: q[1] - q[0]
+    )
+    motion = jl.simulate(slope, np.zeros(2), np.ones(2), np.linspace(0.0, 3.0, 31))
+    top, turn = 1 / 1.1, 1 / 0.55
+    np.testing.assert_allclose(motion.q[-1], np.full(2, top - 0.5 * 0.45 * (3 - turn) ** 2), rtol=1e-9)

@@ -44,6 +44,7 @@ def all_equal(found, expected):
         np.testing.assert_allclose(np.concatenate([np.ravel(leaf) for leaf in leaves]), expected, atol=1e-14, err_msg=name)
 
 
+@pytest.mark.fast
 def test_energies():
     energies = lambda x: jl.System({"T": kinetic, "V": lambda: x}, dissipation=lambda: x)
     all_equal(each(lambda x: (jl.acceleration(energies(x), 1.0, 3.0).qddot, jl.energy(energies(x), 1.0, 3.0)), NUMBERS), [0.0, 4.5 - 2.0])
@@ -73,6 +74,7 @@ def test_constraints():
     all_equal(each(lambda x: (rolling(x).qddot, rolling(x).multipliers["nonholonomic"][1]), NUMBERS), [0.0, 5.0, -3.0])
 
 
+@pytest.mark.fast
 def test_points_and_efforts():
     """δW = F · δx of a point (q₀, 3): the second component does none."""
     working = lambda point, effort: accelerated(ONES, REST, force=jl.virtual_work(point, effort)).qddot
@@ -134,9 +136,9 @@ def test_coordinates_of_a_precision_that_cannot_be_computed_in(dtype):
 
 def test_derivatives_pass():
     force = lambda F: [F, 0]
-    pushed = lambda F: jl.acceleration(jl.System(kinetic, force=force), ONES, REST, {"F": F}).qddot
-    np.testing.assert_array_equal(jax.jacfwd(pushed)(2.0), [1, 0])
-    np.testing.assert_array_equal(jax.vmap(pushed)(jnp.arange(3.0)), [[0, 0], [1, 0], [2, 0]])
+    accelerated_by = lambda F: jl.acceleration(jl.System(kinetic, force=force), ONES, REST, {"F": F}).qddot
+    np.testing.assert_array_equal(jax.jacfwd(accelerated_by)(2.0), [1, 0])
+    np.testing.assert_array_equal(jax.vmap(accelerated_by)(jnp.arange(3.0)), [[0, 0], [1, 0], [2, 0]])
 
 
 REFUSED = {
@@ -165,6 +167,7 @@ def accelerate(system):
     return jl.acceleration(system, ONES, REST)
 
 
+@pytest.mark.fast
 @pytest.mark.parametrize("slot", SLOTS)
 @pytest.mark.parametrize("kind", REFUSED)
 def test_what_is_no_real_number_is_refused(slot, kind):
@@ -186,6 +189,7 @@ OF_ANOTHER_SHAPE = {
 }
 
 
+@pytest.mark.fast
 @pytest.mark.parametrize("case", OF_ANOTHER_SHAPE)
 def test_a_force_of_another_shape_is_refused(case):
     force, said = OF_ANOTHER_SHAPE[case]

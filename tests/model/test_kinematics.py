@@ -70,6 +70,7 @@ def turning(t, q, r):
     return r * jnp.stack([jnp.cos(t), jnp.sin(t)]) + q * jnp.stack([jnp.sin(2 * t), jnp.cos(q)])
 
 
+@pytest.mark.fast
 def test_rate_of_a_moving_point():
     t, q, v, r = 0.4, 0.7, -1.1, 2.0
     expected = [-r * np.sin(t) + v * np.sin(2 * t) + 2 * q * np.cos(2 * t), r * np.cos(t) + v * np.cos(q) - q * v * np.sin(q)]
@@ -78,6 +79,7 @@ def test_rate_of_a_moving_point():
     np.testing.assert_allclose(jax.jacfwd(in_body)(v), [np.sin(0.8), np.cos(q) - q * np.sin(q)], rtol=1e-13)
 
 
+@pytest.mark.fast
 def test_virtual_work_of_vectors_constants_and_several_forces():
     """A double pendulum's tip is pulled by a constant force, and its elbow turned by a moment that depends on the state."""
     tip = lambda q, l: l * jnp.stack([jnp.sin(q["a"]) + jnp.sin(q["b"]), -jnp.cos(q["a"]) - jnp.cos(q["b"])])
@@ -121,6 +123,7 @@ def test_a_force_that_depends_on_a_reaction_does_virtual_work():
     np.testing.assert_allclose(found.qddot, [-0.25 * 9.81, 0.0], rtol=1e-13, atol=1e-13)
 
 
+@pytest.mark.fast
 def test_substitute_with_time_in_the_map():
     """A bead on a wire that turns with Ω: r̈ = Ω² r − g sin Ωt, and L has explicit time."""
     plane = jl.System(

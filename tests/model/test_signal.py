@@ -12,7 +12,7 @@ from scipy.interpolate import CubicSpline, interp1d
 from scipy.linalg import expm
 
 import jaxlag as jl
-from jaxlag import Signal
+from jaxlag import Cubic, Linear, Signal, ZeroOrderHold
 from jaxlag._motion import integrate, simulate
 
 RNG = np.random.default_rng(3)
@@ -20,29 +20,29 @@ TS = np.cumsum(RNG.uniform(0.05, 0.4, 40)) - 0.3
 VALUES = RNG.normal(size=(40, 2))
 EVERYWHERE = np.concatenate([np.linspace(TS[0] - 1, TS[-1] + 1, 300), TS])
 OF_SCIPY = {
-    "hold": lambda ts, x: interp1d(ts, x, "previous", axis=0),
-    "linear": lambda ts, x: interp1d(ts, x, "linear", axis=0),
-    "cubic": lambda ts, x: CubicSpline(ts, x, bc_type="natural"),
+    ZeroOrderHold(): lambda ts, x: interp1d(ts, x, "previous", axis=0),
+    Linear(): lambda ts, x: interp1d(ts, x, "linear", axis=0),
+    Cubic(): lambda ts, x: CubicSpline(ts, x, bc_type="natural"),
 }
-KINDS = list(OF_SCIPY)
+every_interpolation = pytest.mark.parametrize("interpolation", OF_SCIPY, ids=repr)
 IDENTITY = np.eye(TS.size)
 
 
-@pytest.mark.parametrize("kind", KINDS)
-def test_values_agree_with_scipy_and_the_ends_are_held(kind):
-    expected = OF_SCIPY[kind](TS, VALUES)(np.clip(EVERYWHERE, TS[0], TS[-1]))
-    vectors, scalars = Signal(TS, VALUES, kind), Signal(list(TS), list(VALUES[:, 0]), kind)
+@every_interpolation
+def test_values_agree_with_scipy_and_the_ends_are_held(interpolation):
+    expected = OF_SCIPY[interpolation](TS, VALUES)(np.clip(EVERYWHERE, TS[0], TS[-1]))
+    vectors, scalars = Signal(TS, VALUES, interpolation), Signal(list(TS), list(VALUES[:, 0]), interpolation)
     np.testing.assert_allclose(vectors(EVERYWHERE), expected, rtol=1e-12, atol=1e-13)
     np.testing.assert_allclose(jax.jit(jax.vmap(scalars))(EVERYWHERE), expected[:, 0], rtol=1e-12, atol=1e-13)
     assert vectors(0.3).shape == (2,) and scalars(1).shape == ()
     np.testing.assert_array_equal(vectors(TS[-1]), VALUES[-1])
 
 
-@pytest.mark.parametrize("kind", KINDS)
-def test_the_derivative_by_the_values_is_the_interpolation_of_unit_vectors(kind):
+@every_interpolation
+def test_the_derivative_by_the_values_is_the_interpolation_of_unit_vectors(interpolation):
     """u is linear in its values."""
-    expected = OF_SCIPY[kind](TS, IDENTITY)(np.clip(EVERYWHERE, TS[0], TS[-1]))
-    u = lambda x: Signal(TS, x, kind)(EVERYWHERE)
+    expected = OF_SCIPY[interpolation](TS, IDENTITY)(np.clip(EVERYWHERE, TS[0], TS[-1]))
+    u = lambda x: Signal(TS, x, interpolation)(EVERYWHERE)
     for derivative in (jax.jacfwd, jax.jacrev):
         np.testing.assert_allclose(derivative(u)(jnp.asarray(VALUES[:, 0])), expected, rtol=1e-11, atol=1e-12)
 
@@ -50,7 +50,7 @@ def test_the_derivative_by_the_values_is_the_interpolation_of_unit_vectors(kind)
 @pytest.mark.parametrize("order", [1, 2])
 def test_derivatives_of_a_cubic_signal_by_time(order):
     """At both ends as well, where a motion starts and stops."""
-    u, exact = Signal(TS, VALUES, "cubic"), CubicSpline(TS, VALUES, bc_type="natural")
+    u, exact = Signal(TS, VALUES, Cubic()), CubicSpline(TS, VALUES, bc_type="natural")
     inside = np.linspace(TS[0], TS[-1], 101)
     derivative = jax.jacfwd(u) if order == 1 else jax.jacfwd(jax.jacfwd(u))
     np.testing.assert_allclose(jax.vmap(derivative)(inside), exact(inside, order), rtol=1e-10, atol=1e-10)
@@ -59,20 +59,20 @@ def test_derivatives_of_a_cubic_signal_by_time(order):
 
 def test_the_derivative_of_a_cubic_signal_by_its_times():
     at = EVERYWHERE[:300]  # not the times themselves: at the ends u has a kink
-    u = lambda ts: jnp.sum(Signal(ts, VALUES, "cubic")(at) ** 2)
+    u = lambda ts: jnp.sum(Signal(ts, VALUES, Cubic())(at) ** 2)
     direction, step = np.random.default_rng(2).normal(size=TS.size), 1e-6
     exact = lambda ts: np.sum(CubicSpline(ts, VALUES, bc_type="natural")(np.clip(at, ts[0], ts[-1])) ** 2)
     slope = (exact(TS + step * direction) - exact(TS - step * direction)) / (2 * step)
     np.testing.assert_allclose(jax.grad(u)(jnp.asarray(TS)) @ direction, slope, rtol=1e-6)
 
 
-@pytest.mark.parametrize("kind", KINDS)
-def test_signals_of_different_lengths_are_filled_up_with_the_last_row(kind):
+@every_interpolation
+def test_signals_of_different_lengths_are_filled_up_with_the_last_row(interpolation):
     lengths, at = [40, 25, 2], np.linspace(-1, 12, 200)
     filled = np.minimum(np.arange(40), np.array(lengths)[:, None] - 1)
-    together = jax.vmap(lambda ts, x: Signal(ts, x, kind)(at))(TS[filled], VALUES[filled])
+    together = jax.vmap(lambda ts, x: Signal(ts, x, interpolation)(at))(TS[filled], VALUES[filled])
     for found, n in zip(together, lengths, strict=True):
-        np.testing.assert_allclose(found, Signal(TS[:n], VALUES[:n], kind)(at), rtol=1e-12, atol=1e-12)
+        np.testing.assert_allclose(found, Signal(TS[:n], VALUES[:n], interpolation)(at), rtol=1e-12, atol=1e-12)
 
 
 # --- an oscillator under a force
@@ -166,14 +166,14 @@ def test_other_solvers_step_on_jumps(solver):
     assert motion.stats["num_rejected_steps"] < 24
 
 
-@pytest.mark.parametrize("kind", ["linear", "cubic"])
-def test_an_oscillator_under_a_smooth_force(kind):
-    samples, u = np.linspace(0, 5, 21), OF_SCIPY[kind](TS, FORCE)
+@pytest.mark.parametrize("interpolation", [Linear(), Cubic()], ids=repr)
+def test_an_oscillator_under_a_smooth_force(interpolation):
+    samples, u = np.linspace(0, 5, 21), OF_SCIPY[interpolation](TS, FORCE)
     rates = lambda t, y: [y[1], u(t) - C * y[0] - B * y[1]]
     exact = solve_ivp(rates, (0, 5), [1, 0], method="DOP853", t_eval=samples, rtol=1e-12, atol=1e-13, max_step=0.02).y
-    motion = driven(Signal(TS, FORCE, kind), samples)
+    motion = driven(Signal(TS, FORCE, interpolation), samples)
     np.testing.assert_allclose(motion.q, exact[0], atol=1e-6)  # a linear signal has kinks, which the steps go over
-    np.testing.assert_allclose(driven(Signal(TS, FORCE, kind), samples, **SHARP).qdot, exact[1], atol=1e-8)
+    np.testing.assert_allclose(driven(Signal(TS, FORCE, interpolation), samples, **SHARP).qdot, exact[1], atol=1e-8)
 
 
 @pytest.mark.parametrize("derivative, count", [(jax.jacrev, 12), (jax.jacfwd, 40), (jax.jacrev, 40)])
@@ -271,7 +271,7 @@ def test_a_prescribed_speed_that_jumps_is_an_impulse():
     times = np.array([0.0, 1.0, 1.5, 3.0])
     carriages = jl.System(lambda qdot, m: 0.5 * m @ qdot**2, nonholonomic={"winch": lambda t, qdot, u: qdot[1] - qdot[0] - u(t)})
     samples = np.union1d(np.linspace(0, 4, 9), times)
-    motion = jl.simulate(carriages, np.zeros(2), np.ones(2), samples, {"m": m, "u": Signal(times, speeds)}, audit=True)
+    motion = jl.simulate(carriages, np.zeros(2), np.ones(2), samples, {"m": m, "u": Signal(times, speeds)}, works=True)
     u = speeds[np.searchsorted(times, samples, side="right") - 1]
     shares = np.array([-m[1], m[0]]) / m.sum()
     np.testing.assert_allclose(motion.qdot, 1 + shares * u[:, None], atol=1e-12)
@@ -284,7 +284,7 @@ def test_the_energy_that_a_jump_brings_in_is_counted():
     """A spring whose other end is moved at once: V jumps."""
     spring = jl.System(lambda t, q, qdot, c, u: 0.5 * qdot**2 - 0.5 * c * (q - u(t)) ** 2)
     samples = np.union1d(np.linspace(0, 5, 11), TS[(TS > 0) & (TS < 5)])
-    motion = jl.simulate(spring, 1.0, 0.0, samples, {"c": C, "u": Signal(TS, FORCE)}, audit=True)
+    motion = jl.simulate(spring, 1.0, 0.0, samples, {"c": C, "u": Signal(TS, FORCE)}, works=True)
     assert np.ptp(motion.energy()) > 1 and np.max(np.abs(motion.balance())) < 1e-8
 
 
@@ -292,7 +292,7 @@ def test_a_prescribed_position_is_followed_and_its_force_measured():
     """q = u(t), a cubic signal: λ = m ü, with ü by SciPy."""
     follower = jl.System(lambda qdot, m: 0.5 * m * qdot**2, holonomic={"drive": lambda t, q, u: q - u(t)})
     samples, exact = np.linspace(0, 5, 41), CubicSpline(TS, FORCE, bc_type="natural")
-    motion = jl.simulate(follower, exact(0.0), exact(0.0, 1), samples, {"m": 2.0, "u": Signal(TS, FORCE, "cubic")})
+    motion = jl.simulate(follower, exact(0.0), exact(0.0, 1), samples, {"m": 2.0, "u": Signal(TS, FORCE, Cubic())})
     np.testing.assert_allclose(motion.q, exact(samples), atol=1e-12)
     np.testing.assert_allclose(motion.qdot, exact(samples, 1), atol=1e-11)
     np.testing.assert_allclose(motion.multipliers["drive"], 2 * exact(samples, 2), rtol=1e-9, atol=1e-9)
@@ -301,16 +301,18 @@ def test_a_prescribed_position_is_followed_and_its_force_measured():
 # --- composition with JAX
 
 
-@pytest.mark.parametrize("kind", KINDS)
-def test_vmap_over_signals_with_times_of_their_own_equals_the_loop(kind):
+@every_interpolation
+def test_vmap_over_signals_with_times_of_their_own_equals_the_loop(interpolation):
     rng = np.random.default_rng(4)
     times, values = np.cumsum(rng.uniform(0.1, 0.6, (4, 12)), axis=1), rng.normal(size=(4, 12))
     samples = np.linspace(0, 5, 6)
-    end = lambda times, values: driven(Signal(times, values, kind), samples).q
+    end = lambda times, values: driven(Signal(times, values, interpolation), samples).q
     together = jax.jit(jax.vmap(end))(times, values)
-    tolerance = {"hold": 1e-9, "linear": 1e-5, "cubic": 1e-6}[kind]  # of the integration, whose steps rounding shifts across kinks
+    tolerance = {ZeroOrderHold(): 1e-9, Linear(): 1e-5, Cubic(): 1e-6}[
+        interpolation
+    ]  # of the integration, whose steps rounding shifts across kinks
     np.testing.assert_allclose(together, [end(*each) for each in zip(times, values, strict=True)], atol=tolerance)
-    signals = jax.vmap(lambda times, values: Signal(times, values, kind))(times, values)
+    signals = jax.vmap(lambda times, values: Signal(times, values, interpolation))(times, values)
     np.testing.assert_array_equal(jax.jit(jax.vmap(lambda u: driven(u, samples).q))(signals), together)
 
 
@@ -333,26 +335,26 @@ def test_new_values_trace_nothing(monkeypatch):
 
 
 def test_without_held_signals_nothing_changes(monkeypatch):
-    monkeypatch.setattr(integrate, "Resuming", None)
-    monkeypatch.setattr(integrate, "behind_a_jump", None)
+    monkeypatch.setattr(integrate, "ResumingController", None)
+    monkeypatch.setattr(integrate, "after_jump", None)
     cart = jl.System(lambda qdot: 0.5 * qdot**2, force={"linear": lambda t, u: u(t)})
-    end = jl.simulate(cart, 0.0, 0.0, [0.0, 1.0], {"u": Signal([0, 1], [0, 6], "linear")}).q[-1]
+    end = jl.simulate(cart, 0.0, 0.0, [0.0, 1.0], {"u": Signal([0, 1], [0, 6], Linear())}).q[-1]
     np.testing.assert_allclose(end, 1.0, rtol=1e-12)
 
 
 @pytest.mark.filterwarnings("ignore:jaxlag runs in single precision")
-@pytest.mark.parametrize("kind", KINDS)
-def test_single_precision_coordinates_and_double_precision_signals(kind):
+@every_interpolation
+def test_single_precision_coordinates_and_double_precision_signals(interpolation):
     """And the other way about: u(t) has the precision of the values."""
     samples = np.linspace(0, 5, 11, dtype=np.float32)
     start = np.float32(1), np.float32(0)
-    motion = jl.simulate(oscillator, *start, samples, {"c": C, "b": B, "u": Signal(TS, FORCE, kind)})
+    motion = jl.simulate(oscillator, *start, samples, {"c": C, "b": B, "u": Signal(TS, FORCE, interpolation)})
     assert motion.q.dtype == jnp.float32
-    np.testing.assert_allclose(motion.q, driven(Signal(TS, FORCE, kind), samples.astype(float)).q, atol=5e-3)
-    assert kind != "hold" or motion.stats["num_rejected_steps"] <= 5
-    single = Signal(TS, FORCE.astype(np.float32), kind)
-    assert single(0.5).dtype == jnp.float32 and Signal(TS, FORCE, kind)(np.float32(0.5)).dtype == jnp.float64
-    np.testing.assert_allclose(single(0.5), Signal(TS, FORCE, kind)(0.5), rtol=1e-5)
+    np.testing.assert_allclose(motion.q, driven(Signal(TS, FORCE, interpolation), samples.astype(float)).q, atol=5e-3)
+    assert interpolation != ZeroOrderHold() or motion.stats["num_rejected_steps"] <= 5
+    single = Signal(TS, FORCE.astype(np.float32), interpolation)
+    assert single(0.5).dtype == jnp.float32 and Signal(TS, FORCE, interpolation)(np.float32(0.5)).dtype == jnp.float64
+    np.testing.assert_allclose(single(0.5), Signal(TS, FORCE, interpolation)(0.5), rtol=1e-5)
 
 
 @pytest.mark.filterwarnings("ignore:jaxlag runs in single precision")
@@ -366,7 +368,8 @@ def test_single_precision_alone(single_precision):
 # --- what is refused
 
 WRONG = {
-    "unknown kind": (lambda: Signal(TS, FORCE, "spline"), "`kind` must be one of 'hold', 'linear', 'cubic', but is 'spline'"),
+    "unknown interpolation": (lambda: Signal(TS, FORCE, "spline"), r"`interpolation` must be .*`Cubic\(\)`, but is 'spline'. Take"),
+    "a class": (lambda: Signal(TS, FORCE, Linear), r"`interpolation` must be `ZeroOrderHold\(\)`.*, but is <class"),
     "one time": (lambda: Signal([0.0], [1.0]), r"`ts` must be a list of at least two times, but has shape \(1,\)"),
     "a table of times": (lambda: Signal(np.ones((3, 2)), np.ones(3)), r"`ts` must be a list of .* times, but has shape \(3, 2\)"),
     "times that go back": (lambda: Signal([0, 2, 1], np.ones(3)), r"`ts` must increase, but ts\[1\] = 2 is followed by ts\[2\] = 1"),
@@ -400,3 +403,19 @@ def test_under_jit_missing_values_are_a_result():
     samples = np.linspace(0, 10, 41)
     motion = jax.jit(lambda values: driven(Signal(TS, values), samples))(np.where(TS > 3, np.nan, FORCE))
     assert motion.result == jl.RESULTS.not_finite and np.all(np.isnan(motion.q))
+
+
+# --- old names
+
+
+@pytest.mark.parametrize("kind, new", [("hold", ZeroOrderHold()), ("linear", Linear()), ("cubic", Cubic())])
+def test_the_old_kinds_still_work_and_name_the_new_objects(kind, new):
+    with pytest.warns(DeprecationWarning, match=rf"`kind='{kind}'` is now called `interpolation=jaxlag.*Write `interpolation=jaxlag"):
+        old = Signal(TS, VALUES, kind=kind)
+    with pytest.warns(DeprecationWarning, match="is now called"):
+        by_position = Signal(TS, VALUES, kind)
+    assert jax.tree.structure(old) == jax.tree.structure(by_position) == jax.tree.structure(Signal(TS, VALUES, new))
+    with pytest.warns(DeprecationWarning, match=r"`Signal.kind` is now called `Signal.interpolation`"):
+        assert old.kind == kind
+    with pytest.warns(DeprecationWarning, match=r"`Signal.bends` is now called `Signal.second_derivatives`"):
+        assert old.bends is None

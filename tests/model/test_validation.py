@@ -50,7 +50,7 @@ WRONG = {
     "mismatched shapes": (lambda: run(q0=np.ones(2), qdot0=np.ones(3)), r"`qdot0` must have the shape of `q0`, \(2,\), but has \(3,\)"),
     "unknown argument name": (lambda: run(jl.System(lambda q, qdto, c: 0.5 * qdto**2)), "`lagrangian` must name arguments that exist, but it names 'qdto'. There are t, q, qdot, params; the entries of params: c. Did you mean 'qdot'"),
     "misspelt coordinate in q0": (lambda: run(jl.System(lambda q, qdot: 0.5 * qdot["theta"] ** 2), {"teta": 0.0}, {"teta": 0.0}), "`lagrangian` must ask for entries that exist, but asks for 'theta'. q has teta; params has c. Did you mean 'teta'?"),
-    "entry of params that is not there": (lambda: run(jl.System(energy, dissipation={"oil": lambda qdot, params: params["b"] * qdot**2})), "`dissipation` 'oil' must ask for entries that exist, but asks for 'b'. params has c. Add 'b' where it belongs"),
+    "entry of params that is not there": (lambda: run(jl.System(energy, dissipation={"oil": lambda qdot, params: params["b"] * qdot**2})), "`dissipation` 'oil' must ask for entries that exist, but asks for 'b'. params has c. Add 'b' to q or params"),
     "missing parameter": (lambda: run(params={"b": 1.0}), "it names 'c'. There are .*; the entries of params: b. Add 'c' to params"),
     "no params": (lambda: run(params=None), "it names 'c'.*params was not given"),
     "velocity in g": (lambda: run(jl.System(energy, holonomic=lambda q, qdot: q)), "`holonomic` must name arguments that exist, but it names 'qdot'"),
@@ -66,7 +66,7 @@ WRONG = {
     "contradicting constraints": (lambda: run(jl.System(energy, holonomic={"a": lambda q: q - 1.0, "b": lambda q: q - 2.0})), "must be satisfied by some state near the start"),
     "no function": (lambda: jl.System(energy, dissipation=0.5), "`dissipation` must be a function or a mapping from names to functions, but it holds 0.5"),
     "no lagrangian": (lambda: jl.System(None), r"`lagrangian` must be a function L\(q, qdot\)"),
-    "constraints of one name": (lambda: jl.System(energy, holonomic={"a": lambda q: q}, nonholonomic={"a": lambda qdot: qdot}), "terms must be named differently, but two are called 'a'"),
+    "constraints of one name": (lambda: jl.System(energy, holonomic={"a": lambda q: q}, nonholonomic={"a": lambda qdot: qdot}), "terms must have different names, but two are called 'a'"),
     "fixed coordinate that is none": (lambda: jl.consistent_state(pendulum.polar, {"r": 1.0, "phi": 0.0}, {"r": 0.0, "phi": 0.0}, pendulum.params, fixed=("psi",)), r"`fixed` must name coordinates of q, but holds 'psi'. The coordinates are \['phi', 'r'\]"),
     "consistent state that is impossible": (lambda: jl.consistent_state(jl.System(energy, holonomic=lambda q: q**2 + 1.0), 1.0, 0.0, {"c": 1.0}), "none was found"),
 }  # fmt: skip
@@ -107,17 +107,17 @@ def sprung(params, **terms):
     return jl.acceleration(jl.System(lambda qdot: 0.5 * qdot**2, force=force, **terms), 2.0, 0.0, params).qddot
 
 
-TRACED = "must be written in operations that JAX can trace, for it is differentiated and compiled, but line"
-HERE = r"\d+ of .*test_bad_input\.py"
+TRACED = "must be written in operations that JAX can trace, since it is differentiated and compiled, but line"
+HERE = r"\d+ of .*test_validation\.py"
 BORDER = {
     "NumPy's sine": (lambda: sprung({"c": 1.0}, holonomic={"rod": of_python}), rf"^`holonomic` 'rod' {TRACED} {HERE}, `return np.sin\(q\)`, is not. Write `jnp.sin` for `np.sin`"),
     "NumPy's sine in a lambda": (lambda: run(jl.System(lambda q, qdot: 0.5 * qdot**2 + np.cos(q))), rf"^`lagrangian` {TRACED} {HERE}.*Write `jnp.sin` for `np.sin`"),
     "a choice": (lambda: sprung({"c": 1.0}, dissipation=with_a_choice), rf"^`dissipation` {TRACED} {HERE}, `return q if q > 0 else -q`, is not. Write `jnp.where\(condition, a, b\)` for `if`"),
     "a mask": (lambda: jl.acceleration(jl.System(lambda q, qdot: qdot @ qdot + jnp.sum(q[q > 0])), VECTOR, VECTOR), rf"^`lagrangian` {TRACED} {HERE}.*Write `jnp.where"),
-    "a count": (lambda: sprung({"c": 1.0, "n": 3}, dissipation=counting), rf"^`dissipation` {TRACED} {HERE}, `return sum\(q for _ in range\(n\)\)`, is not.*Keep a whole number apart from params: as a default value"),
-    "a size": (lambda: sprung({"c": 1.0, "n": 3}, dissipation=lambda n: jnp.sum(jnp.zeros(n))), rf"^`dissipation` {TRACED} {HERE}.*Keep a whole number apart"),
-    "a range of JAX": (lambda: sprung({"c": 1.0, "n": 3}, dissipation=lambda n: jnp.sum(jnp.arange(n))), rf"^`dissipation` {TRACED} {HERE}.*Keep a whole number apart"),
-    "an index": (lambda: sprung({"c": 1.0, "n": 1}, dissipation=lambda n: jnp.ones(3)[n]), rf"^`dissipation` {TRACED} {HERE}.*Keep a whole number apart"),
+    "a count": (lambda: sprung({"c": 1.0, "n": 3}, dissipation=counting), rf"^`dissipation` {TRACED} {HERE}, `return sum\(q for _ in range\(n\)\)`, is not.*Keep an integer out of params: pass it as a default value"),
+    "a size": (lambda: sprung({"c": 1.0, "n": 3}, dissipation=lambda n: jnp.sum(jnp.zeros(n))), rf"^`dissipation` {TRACED} {HERE}.*Keep an integer out"),
+    "a range of JAX": (lambda: sprung({"c": 1.0, "n": 3}, dissipation=lambda n: jnp.sum(jnp.arange(n))), rf"^`dissipation` {TRACED} {HERE}.*Keep an integer out"),
+    "an index": (lambda: sprung({"c": 1.0, "n": 1}, dissipation=lambda n: jnp.ones(3)[n]), rf"^`dissipation` {TRACED} {HERE}.*Keep an integer out"),
     "Python's sine": (lambda: jl.acceleration(jl.System(energy, force={"wind": lambda q: math.sin(q)}), 1.0, 0.0, {"c": 1.0}), rf"^`force` 'wind' {TRACED} {HERE}.*Write `jnp.sin` for `math.sin`"),
     "a point": (lambda: jl.acceleration(jl.System(energy, force=jl.virtual_work(of_python, 1.0)), 1.0, 0.0, {"c": 1.0}), rf"^`coordinate` {TRACED} {HERE}"),
     "a callable that changes": (lambda: jl.System(energy, force=Spring(4.0)), r"^`force` must be a hashable function, but is a Spring that cannot be hashed. Make it immutable, `@dataclass\(frozen=True\)`"),
@@ -128,24 +128,24 @@ BORDER = {
     "a point of a reaction that changes": (lambda: jl.constraint_force(jl.System(energy, holonomic=lambda q: q), 0.0, 0.0, {"c": 1.0}, at=Spring(4.0)), "^`at` must be a hashable function, but is a Spring"),
     "an effort of text": (lambda: jl.virtual_work(energy, "2"), "^`effort` must be an array of real numbers, but is a str that is text"),
     "an effort of truth": (lambda: jl.virtual_work(energy, True), "^`effort` must be real, but has dtype bool"),
-    "a traced effort": (lambda: jax.jit(lambda F: sprung({"c": F}) + jl.virtual_work(energy, F)(0.0, 1.0, 1.0, {}))(1.0), "^`effort` must be known when it is stated, but is traced. Make it an entry of params"),
+    "a traced effort": (lambda: jax.jit(lambda F: sprung({"c": F}) + jl.virtual_work(energy, F)(0.0, 1.0, 1.0, {}))(1.0), "^`effort` must be known when it is given, but is traced. Make it an entry of params"),
     "a rate without its time": (lambda: jl.rate(lambda t, q: t * q)(q=1.0, qdot=0.0), r"^a rate must be given t, q and qdot, but `t` is missing. Call it `rate\(x\)\(t, q, qdot, params\)`"),
     "a rate without velocity": (lambda: jl.rate(lambda q: q)(0.0, 1.0), "^a rate must be given t, q and qdot, but `qdot` is missing"),
     "a set": (lambda: sprung({"c": 4.0, "gears": {1, 2}}), r"^`params\['gears'\]` must be numbers in some order, but is a set, which has none. Write a list or a tuple"),
-    "a dataclass": (lambda: sprung(dataclasses.make_dataclass("Parameters", ["stiffness"])(4.0)), r"^`params` must be numbers, arrays, or a pytree of them, but is a Parameters, in which JAX sees none. Register its class, `jax.tree_util.register_dataclass\(Parameters\)`"),
+    "a dataclass": (lambda: sprung(dataclasses.make_dataclass("Parameters", ["stiffness"])(4.0)), r"^`params` must be numbers, arrays, or a pytree of them, but is a Parameters, whose numbers JAX cannot see. Register its class, `jax.tree_util.register_dataclass\(Parameters\)`"),
     "a frozen dataclass with arrays": (lambda: sprung(Held(VECTOR)), "^`params` must be numbers, arrays, or a pytree of them, but is a Held"),
     "an object": (lambda: sprung({"c": 4.0, "spring": Plain()}), r"^`params\['spring'\]` must be numbers, arrays, or a pytree of them, but is a Plain"),
     "a date in params": (lambda: sprung({"c": 4.0, "day": np.datetime64("2024-01-01")}), r"^`params\['day'\]` must be an array of real numbers, but is a datetime64 that is a date"),
     "a parameter of a NamedTuple": (lambda: jl.acceleration(jl.System(energy), 1.0, 0.0, collections.namedtuple("P", "c")(4.0)), r"it names 'c'.*params is not a mapping, so its parts have no names. Write `params.c`"),
     "a time of text": (lambda: jl.mass_matrix(jl.System(energy), 1.0, 0.0, {"c": 1.0}, t="0.1"), "^`t` must be an array of real numbers, but is a str that is text"),
     "a time of truth": (lambda: jl.energy(jl.System(energy), 1.0, 0.0, {"c": 1.0}, t=True), "^`t` must be real, but has dtype bool"),
-    "several times": (lambda: jl.powers(jl.System(energy), 1.0, 0.0, {"c": 1.0}, t=np.ones(3)), r"^`t` must be one number, but has shape \(3,\). Take one time, and `jax.vmap`"),
+    "several times": (lambda: jl.powers(jl.System(energy), 1.0, 0.0, {"c": 1.0}, t=np.ones(3)), r"^`t` must be one number, but has shape \(3,\). Pass one time, and use `jax.vmap`"),
     "a time that is NaN": (lambda: jl.acceleration(jl.System(energy), 1.0, 0.0, {"c": 1.0}, t=np.nan), "^`t` must be finite, but is nan"),
     "ts as text": (lambda: run(ts=["0", "1"]), "^`ts` must be an array of real numbers, but is a list that is text"),
     "ts as truth": (lambda: run(ts=[False, True]), "^`ts` must be real, but has dtype bool"),
     "ts as dates": (lambda: run(ts=np.array(["2024-01-01", "2024-01-02"], "datetime64[s]")), "^`ts` must be an array of real numbers, but is a ndarray that is a date. Count the time from a start"),
     "ts with a mask": (lambda: run(ts=np.ma.masked_array([0.0, 1.0, 2.0], [0, 1, 0])), "^`ts` must be finite, but has a NaN"),
-    "ts and params swapped": (lambda: run(ts={"c": 4.0}, params=TS), "^`ts` must be a list of times, but is a dict. Hand over `ts` before `params`"),
+    "ts and params swapped": (lambda: run(ts={"c": 4.0}, params=TS), "^`ts` must be a list of times, but is a dict. Pass `ts` before `params`"),
     "complex ts": (lambda: run(ts=[0.0, 1j]), "^`ts` must be real, but has dtype complex128"),
     "a signal's times as text": (lambda: jl.Signal(["0", "1"], [1.0, 2.0]), "^`ts` must be an array of real numbers, but is a list that is text"),
     "a signal's times as truth": (lambda: jl.Signal([False, True], [1.0, 2.0]), "^`ts` must be real, but has dtype bool"),
@@ -165,6 +165,7 @@ BORDER = {
 }  # fmt: skip
 
 
+@pytest.mark.fast
 @pytest.mark.parametrize("case", BORDER)
 def test_what_is_refused_at_the_border(case):
     action, sentence = BORDER[case]
@@ -185,7 +186,7 @@ OF_A_WRONG_TYPE = {
     'jl.simulate(system, 1.0, 0.0, [0, 1], friction="x")': "`friction` must be an object that makes the choice, but is 'x'. Take e.g. `StickSlip()`",
     "jl.simulate(system, 1.0, 0.0, [0, 1], friction=None)": "`friction` must be an object that makes the choice, but is None",
     'jl.simulate(system, 1.0, 0.0, [0, 1], adjoint="x")': "`adjoint` must be an object that makes the choice, but is 'x'. Take e.g. `diffrax",
-    "jl.simulate(system, 1.0, 0.0, [0, 1], max_steps=1e4)": "`max_steps` must be a whole number, but is 10000.0. The default is 100_000.",
+    "jl.simulate(system, 1.0, 0.0, [0, 1], max_steps=1e4)": "`max_steps` must be an integer, but is 10000.0. The default is 100_000.",
     'jl.simulate(system, 1.0, 0.0, [0, 1], rtol="1e-3")': "`rtol` must be an array of real numbers, but is a str that is text",
     'jl.simulate_many(system, jnp.ones(2), jnp.zeros(2), [0, 1], over=("q0", "qdot0"), solver="rk4")': "`solver` must be an object",
     'jl.Experiment([0, 1], [1.0, 2.0], 1.0, 0.0, delay="0.1")': "`delay` must be an array of real numbers, but is a str that is text",
@@ -193,8 +194,8 @@ OF_A_WRONG_TYPE = {
     'jl.Experiment([0, 1], [1.0, 2.0], 1.0, 0.0, observe="x")': "`observe` must be a function, but is 'x'",
     "jl.Experiment([0, 1], [1.0, 2.0], 1.0, 0.0, params=[1.0])": "`params` of an experiment must be a mapping, but is a list",
     'jl.Regularised("x")': "`width` must be an array of real numbers, but is a str that is text",
-    "jl.Projection(1.5)": "`iterations` must be a whole number, but is 1.5",
-    "jl.StickSlip(True)": "`max_transitions` must be a whole number, but is True",
+    "jl.Projection(1.5)": "`iterations` must be an integer, but is 1.5",
+    "jl.StickSlip(True)": "`max_transitions` must be an integer, but is True",
 }  # fmt: skip
 WITHOUT_HOOK = """
 import json, sys
@@ -268,7 +269,7 @@ def test_traced_times_that_decrease_are_a_result():
 
 
 @pytest.mark.parametrize("case", WRONG)
-def test_bad_input_gets_a_sentence_with_the_cure(case):
+def test_validation_gets_a_sentence_with_the_cure(case):
     action, sentence = WRONG[case]
     with pytest.raises((ValueError, TypeError), match=sentence):
         action()
@@ -323,6 +324,7 @@ EXPERIMENT = {
 }  # fmt: skip
 
 
+@pytest.mark.fast
 @pytest.mark.parametrize("case", EXPERIMENT)
 def test_bad_experiments(case):
     action, sentence = EXPERIMENT[case]
@@ -342,6 +344,7 @@ FITS = {
 }  # fmt: skip
 
 
+@pytest.mark.fast
 @pytest.mark.parametrize("case", FITS)
 def test_bad_fits(case):
     experiment, how, sentence = FITS[case]

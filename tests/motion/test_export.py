@@ -19,10 +19,10 @@ from oscillator import START, SYSTEM, TRUE, record
 from scipy.interpolate import BPoly, CubicHermiteSpline
 
 import jaxlag as jl
-from jaxlag._motion.provenance import Stated
+from jaxlag._motion.provenance import Provenance
 
 TS = np.array([0.0, 0.1, 0.25, 0.3, 0.55, 0.7])
-STILL = Stated.of(jl.System(lambda qdot: qdot), {})
+STILL = Provenance.of(jl.System(lambda qdot: qdot), {})
 
 
 def given(ts, q, qdot, qddot):
@@ -41,6 +41,7 @@ def waves(ts, omega=3.0):
 # Between the samples.
 
 
+@pytest.mark.fast
 def test_between_samples_it_is_hermites():
     motion, at = waves(TS), np.linspace(0.0, 0.7, 41)
     q, v, a = (np.asarray(tree["x"]) for tree in (motion.q, motion.qdot, motion.qddot))
@@ -146,7 +147,7 @@ def rubbed():
     v = np.where(stuck, 0, -2 * side * size * np.sin(phase))
     path = np.concatenate([[0], np.cumsum(2 * (0.925 - 0.15 * np.arange(7)))])[k.astype(int)] + size * (1 - np.cos(phase))
     x, x_end = side * (0.075 + size * np.cos(phase)), side[-1] * (0.075 - size[-1])
-    rubbing = jl.Rubbing(jnp.asarray(np.where(stuck, c * x_end, -F * np.sign(v))), jnp.asarray(stuck))
+    rubbing = jl.FrictionState(jnp.asarray(np.where(stuck, c * x_end, -F * np.sign(v))), jnp.asarray(stuck))
     flat = lambda y: np.stack([y, 0 * y], axis=1)
     system = jl.System(
         lambda q, qdot, c: 0.5 * qdot["x"] ** 2 + 0.5 * qdot["r"] @ qdot["r"] - 0.5 * c * q["x"] ** 2,
@@ -165,7 +166,7 @@ def rubbed():
     counts = {"transitions": k + stuck, "time_stuck": np.maximum(ts - 3.5 * np.pi, 0)[:, None], "start_moved": np.float64(0)}
     works = {"dry": -F * path, "push": 0.5 * np.sin(ts) ** 2, "table": 0 * ts, "time": 0 * ts, "projection": 0 * ts}
     ts, states, stats, works = jax.tree.map(jnp.asarray, (ts, states, steps | counts, works))
-    stated = Stated.of(system, jax.tree.map(jnp.asarray, {"c": c, "F": F, "label": {"spring": [1.0, 2.0]}}) | {"net": jnp.sin})
+    stated = Provenance.of(system, jax.tree.map(jnp.asarray, {"c": c, "F": F, "label": {"spring": [1.0, 2.0]}}) | {"net": jnp.sin})
     return jl.Trajectory(ts, *states, jl.RESULTS.successful, stats, works, {"dry": rubbing}, stated)
 
 
@@ -231,11 +232,12 @@ def many():
         w = jnp.sqrt(c)
         states = jnp.cos(w * ts), -w * jnp.sin(w * ts), -c * jnp.cos(w * ts)
         stats = {"num_steps": 3, "num_rejected_steps": 0}
-        return jl.Trajectory(ts, *states, {}, jl.RESULTS.successful, stats, None, {}, Stated.of(free, {"c": c}))
+        return jl.Trajectory(ts, *states, {}, jl.RESULTS.successful, stats, None, {}, Provenance.of(free, {"c": c}))
 
     return jax.vmap(one)(jnp.array([1.0, 4.0, 9.0]))
 
 
+@pytest.mark.fast
 def test_of_many_motions_one_is_taken_by_its_number(many):
     assert len(many) == 3 and many[1:].q.shape == (2, 5)
     one = many[1]
@@ -257,6 +259,7 @@ class Plane(NamedTuple):
     y: float
 
 
+@pytest.mark.fast
 @pytest.mark.parametrize(
     "q, names",
     [
@@ -277,7 +280,7 @@ def test_names_are_paths(q, names):
 
 def test_names_that_become_one_are_refused():
     q = {"a.b": TS, "a": {"b": TS}}
-    with pytest.raises(ValueError, match="names must differ in a table, but two entries are called 'q.a.b'. Do without points in names."):
+    with pytest.raises(ValueError, match="names must differ in a table, but two entries are called 'q.a.b'. Avoid dots in names."):
         given(TS, q, q, q).to_dict()
 
 
@@ -335,7 +338,7 @@ def test_a_motion_comes_back_from_its_file(rubbed, tmp_path):
     np.testing.assert_array_equal(loaded.slip()["dry"], rubbed.slip()["dry"])
     np.testing.assert_array_equal(loaded.pulling()["table"], rubbed.pulling()["table"])
     np.testing.assert_array_equal(loaded.at(1.05).q["x"], rubbed.at(1.05).q["x"])
-    assert loaded.stated.params == {"c": 4.0, "F": 0.3, "label": {"spring": [1.0, 2.0]}, "net": None}
+    assert loaded.provenance.params == {"c": 4.0, "F": 0.3, "label": {"spring": [1.0, 2.0]}, "net": None}
     late = loaded[100:]
     np.testing.assert_array_equal(late.energy(), rubbed.energy()[100:])
     np.testing.assert_array_equal(late.slip()["dry"], rubbed.slip()["dry"][100:])
@@ -372,9 +375,10 @@ def test_a_named_tuple_comes_back_as_the_dict_of_its_fields(tmp_path):
     motion.save(tmp_path / "motion.npz")
     loaded = jl.load(tmp_path / "motion.npz")
     np.testing.assert_array_equal(loaded.qdot["x"], motion.qdot.x)
-    assert loaded.works is None and loaded.friction == {} and loaded.stated.params is None
+    assert loaded.works is None and loaded.friction == {} and loaded.provenance.params is None
 
 
+@pytest.mark.fast
 @pytest.mark.parametrize("content", [b"", b"PK no archive", b"{}", b"[1]", b"\xff\xfe", b'{"jaxlag": "Trajectory", "format": 1}'])
 def test_other_files_are_refused(content, tmp_path):
     file = tmp_path / "file"
@@ -414,23 +418,23 @@ def test_a_system_of_named_functions_is_pickled():
     system = jl.System({"T": free, "V": Spring(4.0)}, holonomic={"table": jnp.sin}, one_sided="table")
     assert pickle.loads(pickle.dumps(system)) == system
     motion = given(TS, TS, TS, TS)
-    motion = dataclasses.replace(motion, stated=Stated.of(system, {"c": jnp.ones(())}))
+    motion = dataclasses.replace(motion, provenance=Provenance.of(system, {"c": jnp.ones(())}))
     back = pickle.loads(pickle.dumps(motion))
     jax.tree.map(np.testing.assert_array_equal, motion, back)
-    assert back.stated.system == system and jax.tree.structure(back) == jax.tree.structure(motion)
+    assert back.provenance.system == system and jax.tree.structure(back) == jax.tree.structure(motion)
 
 
 @pytest.mark.parametrize("function, called", [(lambda q, qdot: qdot**2, "<lambda>"), (functools.partial(lambda a, q: q, 1), "partial")])
 def test_a_pickle_without_a_name_says_how_results_are_saved(function, called):
     system = jl.System({"T": free, "V": function})
-    motion = dataclasses.replace(waves(TS), stated=Stated.of(system, None))
+    motion = dataclasses.replace(waves(TS), provenance=Provenance.of(system, None))
     sentence = (
-        f"`lagrangian` 'V' must be a function of a module for a pickle, but '.*{called}' is not to be found by its name. Define .*jl.load"
+        f"`lagrangian` 'V' must be a function of a module to be pickled, but '.*{called}' cannot be found by its name. Define .*jl.load"
     )
     for what in (system, motion):
         with pytest.raises(pickle.PicklingError, match=sentence):
             pickle.dumps(what)
-    assert copy.deepcopy(system) is system and copy.copy(system) is system and copy.deepcopy(motion).stated.system is system
+    assert copy.deepcopy(system) is system and copy.copy(system) is system and copy.deepcopy(motion).provenance.system is system
 
 
 def test_a_pickler_that_takes_functions_along_is_let(monkeypatch):
@@ -442,7 +446,7 @@ def test_a_pickler_that_takes_functions_along_is_let(monkeypatch):
 def test_a_pickle_whose_functions_are_gone_says_so(monkeypatch):
     dumped = pickle.dumps(jl.System(free))
     monkeypatch.delattr(sys.modules[__name__], "free")
-    with pytest.raises(pickle.UnpicklingError, match="must be where they were when it was pickled, but there is no 'free' in module"):
+    with pytest.raises(pickle.UnpicklingError, match="must be importable as when it was pickled, but there is no 'free' in module"):
         pickle.loads(dumped)
 
 
@@ -517,7 +521,7 @@ def test_where_a_stone_would_leave_the_dome(slid):
 
 
 def test_two_sided_constraints_say_nothing(slid):
-    plain = dataclasses.replace(slid, stated=Stated.of(dome(()), None))
+    plain = dataclasses.replace(slid, provenance=Provenance.of(dome(()), None))
     assert plain.pulling() == {} and "pull" not in str(plain)
 
 

@@ -158,7 +158,7 @@ def test_a_bound_that_turns_negative_ends_the_motion(wave, rate, F, v0):
     t = np.asarray(found.ts)
     bad = np.argmax(1 - rate * t + wave * np.cos(6 * t) < 0)
     assert not found.succeeded and np.all(np.isnan(found.q[bad:])) and np.all(np.isfinite(found.q[:4]))
-    with pytest.raises(ValueError, match="bounds of friction that are not negative"):
+    with pytest.raises(ValueError, match="friction bounds that are not negative"):
         jl.simulate(turning, 0.0, v0, jnp.linspace(0, 4, 41), {"wave": wave, "rate": rate, "F": F})
 
 

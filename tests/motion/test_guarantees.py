@@ -10,9 +10,9 @@ import jaxlag as jl
 from jaxlag._motion.results import reason_of
 
 TS = np.linspace(0, 1, 11)
-UNDEFINED = "the functions of the system must give finite numbers"
+UNDEFINED = "the functions of the system must return finite numbers"
 CONTRADICTORY = "the constraints are not satisfied there: they contradict each other"
-LOCKED = "the constraints leave the motion no way on"
+LOCKED = "the constraints leave no way to continue"
 
 
 def kinetic(qdot):

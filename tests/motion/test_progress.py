@@ -40,6 +40,7 @@ def hundred_seconds(clock):
     bar.end()
 
 
+@pytest.mark.fast
 @pytest.mark.parametrize("stream", [Terminal, OfANotebook])
 def test_one_line_is_rewritten_where_somebody_watches(monkeypatch, clock, stream):
     monkeypatch.setattr(sys, "stderr", stream())
@@ -52,6 +53,7 @@ def test_one_line_is_rewritten_where_somebody_watches(monkeypatch, clock, stream
     assert len(states[-1]) == max(map(len, states))  # so that nothing of a longer one is left
 
 
+@pytest.mark.fast
 def test_a_log_gets_few_lines(monkeypatch, clock):
     monkeypatch.setattr(sys, "stderr", io.StringIO())
     hundred_seconds(clock)

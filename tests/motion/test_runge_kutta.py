@@ -17,6 +17,7 @@ def full(rows, width):
     return np.array([[*row, *[0.0] * (width - len(row))] for row in rows])
 
 
+@pytest.mark.fast
 def test_numbers_are_those_of_scipy():
     of_8 = jl.Dop853.tableau
     np.testing.assert_array_equal(full(of_8.a[:11], 12), DOP853.A[1:])

@@ -11,6 +11,7 @@ from scipy.special import ellipj, ellipk
 
 import jaxlag as jl
 from jaxlag._motion import integrate, simulate
+from jaxlag._motion.results import RESULTS, from_diffrax, reason_of, under_diffrax
 from jaxlag.examples import pendulum, vehicle
 
 SHARP = {"solver": diffrax.Dopri8(), "rtol": 1e-11, "atol": 1e-12}
@@ -29,6 +30,7 @@ def test_polar_and_cartesian_pendulum_are_the_same_motion():
     np.testing.assert_allclose(polar.q["phi"], 2 * np.arcsin(k * cn / dn), atol=1e-8)
 
 
+@pytest.mark.fast
 @pytest.mark.parametrize("amplitude", [0.1, np.pi / 2, 3.0])
 def test_period_of_the_pendulum(amplitude):
     """Back at the start after T = 4 √(l/g) K(sin²(φ₀/2)): φ − φ₀ is of second order there, so φ̇ measures the period."""
@@ -147,6 +149,7 @@ def drift_and_error(stabilisation):
     return drift, np.max(np.abs(motion.q - np.stack([-np.sin(theta), -np.cos(theta)], axis=1)))
 
 
+@pytest.mark.fast
 def test_projection_holds_what_drifts_without_it():
     projected, fed_back, nothing = map(drift_and_error, (jl.Projection(), jl.Baumgarte(20.0, 20.0), jl.NoStabilisation()))
     assert projected[0] < 1e-15 and projected[1] < 2e-3
@@ -271,6 +274,7 @@ def test_coordinates_of_every_kind():
     assert isinstance(motion.q, Point)
 
 
+@pytest.mark.fast
 def test_functions_of_every_kind_get_what_they_name():
     class Damper:
         def __init__(self, b):
@@ -316,3 +320,26 @@ def test_systems_are_compared_by_their_functions():
     with pytest.raises(AttributeError):
         make().lagrangian = ()
     assert repr(pendulum.polar) == "System(lagrangian; holonomic: rod)"
+
+
+def test_old_spellings_work_and_say_the_new_ones():
+    spring = jl.System(lambda q, qdot: 0.5 * qdot**2 - 0.5 * q**2)
+    with pytest.warns(DeprecationWarning, match="`audit` is now called `works`. Write `works`."):
+        motion = jl.simulate(spring, 1.0, 0.0, jnp.linspace(0, 1, 3), audit=True)
+    assert motion.works is not None
+    with pytest.warns(DeprecationWarning, match="`stated` is now called `provenance`"):
+        assert motion.stated is motion.provenance
+    with pytest.warns(DeprecationWarning, match="`Rubbing` is now called `FrictionState`"):
+        assert jl.Rubbing is jl.FrictionState
+    with pytest.raises(AttributeError, match="has no attribute 'Rubber'"):
+        jl.Rubber  # noqa: B018
+
+
+def test_reasons_of_failure_travel_through_diffrax():
+    """Its own reasons have the same numbers in both enumerations, ours are beyond them."""
+    for name in diffrax.RESULTS._name_to_item:
+        assert from_diffrax(diffrax.RESULTS._name_to_item[name])._value == RESULTS._name_to_item[name]._value
+        assert reason_of(from_diffrax(diffrax.RESULTS._name_to_item[name])) == diffrax.RESULTS[diffrax.RESULTS._name_to_item[name]]
+    for reason in (RESULTS.no_friction, RESULTS.chattering, RESULTS.negative_bound, RESULTS.undefined):
+        assert under_diffrax(reason) != diffrax.RESULTS.successful
+        assert reason_of(from_diffrax(under_diffrax(reason))) == RESULTS[reason]

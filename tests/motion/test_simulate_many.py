@@ -34,10 +34,10 @@ def test_parameters_and_starts_that_differ():
 CARTESIAN = {"x": 1.0, "y": 0.0}, {"x": 0.0, "y": 0.0}
 
 
-def rods(lengths, g, end, steps=None):
+def rods(lengths, g, end, common=None):
     """Where pendulums are at the end, and the forces in their rods."""
     ts, params = end * jnp.linspace(0, 1, 4), pendulum.params | {"g": g, "l": lengths}
-    found = jl.simulate_many(pendulum.cartesian, *CARTESIAN, ts, params, over=("l",), steps=steps, rtol=1e-10)
+    found = jl.simulate_many(pendulum.cartesian, *CARTESIAN, ts, params, over=("l",), common_steps=common, rtol=1e-10)
     return jnp.concatenate([found.q["x"][:, -1], found.multipliers["rod"][:, -1] / 10])
 
 
@@ -52,8 +52,8 @@ def test_constraints_and_steps():
         return found.q["x"][-1], found.multipliers["rod"][-1] / 10
 
     one_by_one = np.transpose([alone(l) for l in AT[0]]).ravel()
-    for steps in ("common", "own"):
-        np.testing.assert_allclose(rods(*AT, steps=steps), one_by_one, rtol=1e-7)
+    for common in (True, False):
+        np.testing.assert_allclose(rods(*AT, common=common), one_by_one, rtol=1e-7)
 
 
 def test_gradients():
@@ -75,20 +75,29 @@ def test_dry_friction_takes_steps_of_its_own():
     found = jl.simulate_many(block, 0.0, 2.0, jnp.linspace(0, 3, 4), {"mu": mu}, over=("mu",))
     np.testing.assert_allclose(found.q[:, -1], 4 / (2 * mu * 9.81), rtol=1e-8)
     with pytest.raises(ValueError, match="Leave it out"):
-        jl.simulate_many(block, 0.0, 2.0, TS, {"mu": mu}, over=("mu",), steps="common")
+        jl.simulate_many(block, 0.0, 2.0, TS, {"mu": mu}, over=("mu",), common_steps=True)
 
 
 @pytest.mark.parametrize(
-    "over, steps, message",
+    "over, common_steps, message",
     [
         (("k",), None, "`over` must name q0, qdot0 or entries of params, but holds 'k'"),
         (("b", "c"), None, r"first axes are b: \[\(3,\)\], c: \[\(\)\]"),
-        (("b",), "both", '`steps` must be "common" or "own"'),
+        (("b",), "both", "`common_steps` must be True or False, but is 'both'"),
     ],
 )
-def test_bad_input(over, steps, message):
+def test_bad_input(over, common_steps, message):
     with pytest.raises(ValueError, match=message):
-        jl.simulate_many(OSCILLATOR, 1.0, 0.0, TS, {"m": 2.0, "c": 3.0, "b": jnp.ones(3)}, over=over, steps=steps)
+        jl.simulate_many(OSCILLATOR, 1.0, 0.0, TS, {"m": 2.0, "c": 3.0, "b": jnp.ones(3)}, over=over, common_steps=common_steps)
+
+
+def test_the_old_spelling_of_common_steps():
+    one = lambda **how: jl.simulate_many(OSCILLATOR, 1.0, 0.0, TS, {"m": 2.0, "c": 3.0, "b": jnp.ones(3)}, over=("b",), **how).q
+    with pytest.warns(DeprecationWarning, match="`steps` is now called `common_steps`. Write `common_steps`."):
+        old = one(steps="own")
+    np.testing.assert_array_equal(old, one(common_steps=False))
+    with pytest.raises(ValueError, match='`steps` must be "common" or "own", but is \'both\''):
+        one(steps="both")
 
 
 def test_a_failure_is_raised_with_its_reason():

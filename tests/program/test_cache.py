@@ -1,4 +1,4 @@
-"""JAX's persistent cache: a second process compiles nothing that the first one did. A program with a callback in it would not be kept."""
+"""JAX's persistent cache: a second process compiles nothing that the first one did. A program with a callback would not be cached."""
 
 import os
 import subprocess

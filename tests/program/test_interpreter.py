@@ -1,4 +1,4 @@
-"""Evaluation entry by entry: every kind of primitive against plain evaluation, derivatives, what is folded, what stays whole."""
+"""Programs as scalar code: every kind of primitive against plain evaluation, derivatives, constant folding, what stays whole."""
 
 import operator
 import re
@@ -13,12 +13,12 @@ from operations import doubled_slope, tripled_slope
 
 import jaxlag as jl
 from jaxlag._mechanics.saddle_point import constrained_acceleration
-from jaxlag._model.system import bind
+from jaxlag._model.flat import bind
 from jaxlag._program import constants
 from jaxlag._program.constants import folded
+from jaxlag._program.expressions import Algebra, TooLong, UnknownPrimitive, filled
 from jaxlag._program.interpreter import evaluate
-from jaxlag._program.scalar_graph import Algebra, TooLong, UnknownPrimitive, filled
-from jaxlag._program.scalarise import JAX_ALGEBRA, _apart, scalarised
+from jaxlag._program.scalarise import JAX_ALGEBRA, _scalars, scalarised
 from jaxlag.examples import pendulum, vehicle
 
 ROUNDING = 1e-12  # relative: sums are taken in another order, nothing else differs
@@ -154,7 +154,7 @@ SOLVING = (
 
 
 class Scalars(Algebra):
-    """NumPy scalars, which cost no compilation: what is tested is how programs are taken apart."""
+    """NumPy scalars, which cost no compilation: what is tested is the rules."""
 
     def function(self, primitive, params, dtype):
         if primitive.name == "convert_element_type":
@@ -163,7 +163,7 @@ class Scalars(Algebra):
 
 
 def taken_apart(function, *arguments):
-    """The values of a function whose arguments are not numbers to the reader."""
+    """The values of a function whose arguments are unknown to the interpreter."""
     closed, shape = jax.make_jaxpr(function, return_shape=True)(*arguments)
     unknown = [filled(np.shape(a), map(np.asarray, np.ravel(a))) for a in arguments]
     outputs = evaluate(closed, Scalars(), *unknown)
@@ -199,6 +199,7 @@ def test_linear_algebra():
     close(scalarised(every, limit=100_000)(spd), every(spd), 1e-11)
 
 
+@pytest.mark.fast
 @pytest.mark.parametrize("function", [*UNARY, *MOVING, *REDUCING, *CALLING])
 def test_numbers_are_folded_as_jax_computes_them(function):
     closed, shape = jax.make_jaxpr(function, return_shape=True)(x)
@@ -207,6 +208,7 @@ def test_numbers_are_folded_as_jax_computes_them(function):
     close(jax.tree.unflatten(jax.tree.structure(shape), folded), jax.tree.map(np.asarray, function(x)))
 
 
+@pytest.mark.fast
 @pytest.mark.parametrize(
     "function", [jnp.add, jnp.subtract, jnp.multiply, lax.div, lax.rem, jnp.maximum, lambda k, n: k**3 - n, operator.and_]
 )
@@ -217,13 +219,14 @@ def test_whole_numbers(function):
     close(evaluate(jax.make_jaxpr(function)(k, n), JAX_ALGEBRA, k, n)[0], want)
 
 
-def test_infinities_among_numbers_are_no_warning():
+def test_infinities_among_numbers_give_no_warning():
     f = lambda x: jax.jit(lambda y: x + jnp.where(x > 0, 1 / y[0], (y[1] - y[1]) / 0 * y[1]))(jnp.array([0.0, jnp.inf]))
     closed = jax.make_jaxpr(lambda y: jax.jit(lambda y: 1 / y * y - jnp.log(y))(y))(jnp.zeros(2))
     close(evaluate(closed, JAX_ALGEBRA, np.array([0.0, np.inf]))[0], np.array([np.nan, np.nan]))
     close(scalarised(f)(x), f(x))
 
 
+@pytest.mark.fast
 def test_single_precision_stays_single():
     f = lambda x: jnp.linalg.norm(0.5 * x**2 + jnp.arange(4, dtype=jnp.float32)[None]) / 3
     close(scalarised(f)(x.astype(np.float32)), f(jnp.asarray(x, jnp.float32)), 1e-6)
@@ -233,7 +236,7 @@ def test_single_precision_stays_single():
 
 
 def held_factor(x):
-    """A solve whose factor is held: without the rule of `custom_linear_solve` the derivative were another."""
+    """A solve with a constant factor: without the rule of `custom_linear_solve` its derivative would be wrong."""
     A = x @ x.T + jnp.eye(len(x))
     factor = jnp.linalg.cholesky(lax.stop_gradient(A))
     solve = lambda _, b: jax.scipy.linalg.cho_solve((factor, True), b)
@@ -327,6 +330,7 @@ def test_structural_zeros_are_dropped():
     assert {name: names.count(name) for name in ("exp", "sqrt", "mul", "add", "div")} == {"exp": 4, "sqrt": 4, "mul": 4, "add": 0, "div": 0}
 
 
+@pytest.mark.fast
 def test_the_mass_matrix_of_the_vehicle_is_seen_to_be_diagonal():
     system, q0, params = SYSTEMS["vehicle"]
     like, params = jax.tree.map(jnp.asarray, (q0, params))
@@ -355,12 +359,12 @@ def test_the_same_operation_is_made_once():
 
 
 def test_numbers_are_computed_without_being_compiled(monkeypatch):
-    """Also those of a function with a derivative rule of its own, which numbers have no need of."""
+    """Also those of a function with a derivative rule of its own, which numbers do not need."""
     cube = jax.custom_jvp(lambda x: x**3)
     cube.defjvp(lambda primals, tangents: (cube(*primals), 3 * primals[0] ** 2 * tangents[0]))
     scaled = lambda x: lax.optimization_barrier(x) * jnp.sqrt(cube(jnp.arange(1.0, 5.0)))
     with monkeypatch.context() as patched:
-        patched.setattr(constants, "on_arrays", None)
+        patched.setattr(constants, "as_function", None)
         names = operations(scalarised(scaled), v)
     assert {name: names.count(name) for name in ("mul", "sqrt", "integer_pow")} == {"mul": 3, "sqrt": 0, "integer_pow": 0}
     close(scalarised(scaled)(v), scaled(v))
@@ -373,7 +377,7 @@ def test_the_acceleration_is_scalar_code_throughout(mechanics):
 
 
 def test_a_batch_of_accelerations_is_one_kernel():
-    """Also what says that inertia is missing, which would otherwise split it and take twice the time."""
+    """It includes the check for missing inertia, which would otherwise split it and take twice the time."""
     double = jl.System(
         lambda q, qdot: 0.5 * jnp.sum(jnp.cumsum(jnp.cos(q) * qdot) ** 2 + jnp.cumsum(jnp.sin(q) * qdot) ** 2) + jnp.sum(jnp.cos(q))
     )
@@ -389,7 +393,7 @@ def test_above_the_limit_the_function_stays_as_it_is():
     assert "dot_general" not in operations(scalarised(f), x)
     close(scalarised(f, limit=20)(x), f(x))
     with pytest.raises(TooLong):
-        evaluate(jax.make_jaxpr(f)(x), JAX_ALGEBRA, *[_apart(jnp.asarray(x))], limit=20)
+        evaluate(jax.make_jaxpr(f)(x), JAX_ALGEBRA, *[_scalars(jnp.asarray(x))], limit=20)
 
 
 def test_effects_and_keys_stay_as_they_are(capfd):
@@ -408,6 +412,6 @@ def test_an_unknown_primitive_is_named_with_its_line():
         return jnp.sum(jnp.linalg.eigvalsh(x))  # the line in question
 
     line = energy.__code__.co_firstlineno + 1
-    message = rf"must use known operations only, but uses `eigh` at .*test_entries\.py:{line}\b.*Write it in elementary"
+    message = rf"must use known operations only, but uses `eigh` at .*test_interpreter\.py:{line}\b.*Write it in elementary"
     with pytest.raises(UnknownPrimitive, match=re.compile(message)):
         taken_apart(energy, spd)

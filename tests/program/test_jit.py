@@ -1,4 +1,4 @@
-"""Programs that Python calls are compiled with the CPU's older emitters: the same numbers, and a JAX without them does as well."""
+"""Programs called from Python are compiled with the older CPU emitters: the same numbers, and a JAX without them works as well."""
 
 import jax
 import jax.numpy as jnp
@@ -27,7 +27,7 @@ def swing(x):
     return jnp.concatenate([motion.q[:, 0], motion.multipliers["rod"], motion.friction["joint"].force])
 
 
-@pytest.mark.skipif(jax.default_backend() != "cpu", reason="the choice is one for CPUs")
+@pytest.mark.skipif(jax.default_backend() != "cpu", reason="the option is for CPUs")
 @pytest.mark.parametrize("function, x", [(ride, 3000.0), (swing, 0.7), (jax.jacfwd(ride), 3000.0)], ids=["ride", "swing", "slope"])
 def test_both_emitters_give_the_same(function, x):
     program = jax.jit(function).lower(x)
@@ -37,10 +37,10 @@ def test_both_emitters_give_the_same(function, x):
 
 @pytest.mark.parametrize("known", [True, False])
 def test_it_may_be_called_from_anywhere(known, monkeypatch):
-    """From Python, under transformations, within other programs; and where XLA does not know the options."""
+    """From Python, under transformations, within other programs, and where XLA does not know the options."""
     if not known:
-        monkeypatch.setattr(jit, "QUICK", {"xla_cpu_no_such_option": False})
-    for cached in (jit._quick, jit._options):
+        monkeypatch.setattr(jit, "OLD_EMITTERS", {"xla_cpu_no_such_option": False})
+    for cached in (jit._jitted_with_options, jit._options):
         cached.cache_clear()
     traced = []
 
@@ -58,13 +58,13 @@ def test_it_may_be_called_from_anywhere(known, monkeypatch):
     np.testing.assert_array_equal(jax.vmap(jax.grad(lambda x: program(x, "cube")))(x), 3 * x**2)
     assert jax.grad(lambda y: y * program(2.0, "cube"))(1.0) == 8.0
     assert jax.eval_shape(lambda: program(x, "square")).shape == (3,)
-    for cached in (jit._quick, jit._options):
+    for cached in (jit._jitted_with_options, jit._options):
         cached.cache_clear()
 
 
-@pytest.mark.skipif(jax.default_backend() != "cpu", reason="the choice is one for CPUs")
-def test_the_choice_reaches_the_compiler_where_python_calls_alone(monkeypatch):
-    """An option that XLA does not know, left in, is refused."""
+@pytest.mark.skipif(jax.default_backend() != "cpu", reason="the option is for CPUs")
+def test_the_options_reach_the_compiler_only_in_calls_from_python(monkeypatch):
+    """XLA refuses an option that it does not know."""
     monkeypatch.setattr(jit, "_options", lambda: {"xla_cpu_no_such_option": False})
     program = jit.compiled(lambda x: 2 * x)
     with pytest.raises(jax.errors.JaxRuntimeError, match="xla_cpu_no_such_option"):

@@ -1,6 +1,6 @@
-"""The rewritten program equals the user's: random programs over the operations of `jax.lax`, each kind of number, what stays plain JAX.
+"""The rewritten program equals the user's: random programs over the operations of `jax.lax`, every dtype, and what stays plain JAX.
 
-The programs are those of `programs.py`, which runs by hand over as many seeds as there is time for.
+The programs are those of `programs.py`, which can be run by hand over as many seeds as there is time for.
 """
 
 import inspect
@@ -11,14 +11,14 @@ import numpy as np
 import pytest
 from jax import lax
 from operations import NOT_COVERED, OPERATIONS
-from programs import FORMS, compared, plain, program, rewritten
+from programs import FORMS, compared, random_program, run_plain, run_rewritten
 
 import jaxlag as jl
-from jaxlag._program.interpreter import Reader, evaluate
-from jaxlag._program.scalar_graph import SIMPLER, Folding
+from jaxlag._program.interpreter import Interpreter, evaluate
+from jaxlag._program.scalar_graph import SIMPLIFICATIONS, ScalarGraph
 from jaxlag._program.scalarise import JAX_ALGEBRA, scalarised
-from jaxlag._program.sparse_jacobian import dependence
-from jaxlag._program.structured_jacobian import matrix
+from jaxlag._program.sparse_jacobian import sparsity_pattern
+from jaxlag._program.structured_jacobian import structured_jacobian
 
 SEEDS, BLOCKS = 320, 4
 Q, V = np.array([0.3, 0.5, -0.2]), np.array([1.0, -0.5, 0.2])
@@ -37,8 +37,8 @@ def test_random_programs_are_the_plain_ones(block):
 
 @pytest.mark.parametrize("seed", [18])
 def test_accelerations_and_reactions_of_random_energies(seed):
-    """With constraint and dissipation, compiled, and their derivatives: against a dense solve in plain JAX."""
-    run, x, v = program(seed)
+    """With a constraint and dissipation, compiled, and their derivatives, against a dense solve in plain JAX."""
+    run, x, v = random_program(seed)
     wave = lambda q, v: 0.1 * jnp.sin(run.scalar(q, v) / 10)
     L, D = lambda q, qdot: qdot @ qdot + wave(q, qdot), lambda q, qdot: 0.5 * (1 + wave(q, q)) * qdot @ qdot
     g = lambda q: q @ q + wave(q, q)
@@ -57,7 +57,7 @@ def test_accelerations_and_reactions_of_random_energies(seed):
         np.testing.assert_allclose(a, b, rtol=1e-10, atol=1e-10)
 
 
-def test_every_documented_operation_is_among_them_or_said_why_not():
+def test_every_documented_operation_is_covered_or_excluded_with_a_reason():
     public = {
         name for name, f in inspect.getmembers(lax, callable) if name.islower() and not name.startswith("_") and not name.endswith("_p")
     }
@@ -67,7 +67,7 @@ def test_every_documented_operation_is_among_them_or_said_why_not():
     assert len(FORMS) > 5
 
 
-# Complex numbers, half precision, and what NumPy and XLA take differently.
+# Complex numbers, half precision, and where NumPy and XLA differ.
 
 
 POTENTIALS = {
@@ -84,7 +84,7 @@ HALF = {"half precision": lambda q: jnp.sum((q.astype(jnp.bfloat16) * q.astype(j
 
 
 def test_complex_numbers_are_those_of_jax():
-    """Accelerations −∂V/∂q and their derivatives, of all in one program."""
+    """Accelerations −∂V/∂q and their derivatives, all in one program."""
     every = lambda q: jnp.stack([V(q) for V in POTENTIALS.values()])
     system = jl.System(lambda q, qdot, weights: 0.5 * jnp.sum(qdot**2) - weights @ every(q))
     weights = np.eye(len(POTENTIALS))
@@ -100,16 +100,16 @@ def test_programs_with_other_numbers_are_left_to_jax(name):
     programs = [jax.make_jaxpr(f)(Q).jaxpr for f in (scalarised(potential), jax.jit(potential))]
     rewritten, plain = (program.eqns[0].params["jaxpr"].jaxpr for program in programs)
     assert [e.primitive.name for e in rewritten.eqns] == [e.primitive.name for e in plain.eqns]
-    assert dependence(lambda q: jnp.stack([potential(q)]), jnp.asarray(Q)).all()
+    assert sparsity_pattern(lambda q: jnp.stack([potential(q)]), jnp.asarray(Q)).all()
     gradient = jax.grad(potential)
-    columns = matrix(gradient, jnp.asarray(Q))
+    columns = structured_jacobian(gradient, jnp.asarray(Q))
     assert columns is None or np.allclose(columns, jax.jacfwd(gradient)(Q), rtol=1e-12)
 
 
-EXACT = {  # at each of the arguments, and equation by equation: XLA too multiplies factors far from 1
-    "a function of what stands there": (lambda x: x.at[np.array([0, 2])].apply(jnp.negative), [Q]),
+EXACT = {  # at each of the arguments, and equation by equation: XLA merges factors as well
+    "a function of an element in place": (lambda x: x.at[np.array([0, 2])].apply(jnp.negative), [Q]),
     "an angle to the left": (lambda x: jnp.arctan2(x[2] - x[0], x[1]), [np.array([1.0, -1.0, 1.0]), np.array([0.0, -2.0, 0.0])]),
-    "an angle of a difference turned round": (lambda x: jnp.arctan2(-(x[2] - x[0]), x[1]), [np.array([1.0, -1.0, 1.0])]),
+    "an angle of a negated difference": (lambda x: jnp.arctan2(-(x[2] - x[0]), x[1]), [np.array([1.0, -1.0, 1.0])]),
     "an angle from nothing": (lambda x: jnp.arctan2(0 - x[2], x[1]), [np.array([1.0, -1.0, 0.0])]),
     "factors far from 1": (lambda x: (1e200 * x) * (1e200 * x) * 1e-100, [np.full(3, 1e-180)]),
     "a factor that vanishes": (lambda x: (x * 1e-200) * 1e-200 * 1e300, [np.full(3, 1e120)]),
@@ -126,7 +126,7 @@ def test_it_is_exact_where_jax_is(name):
     function, arguments = EXACT[name]
     for x in arguments:
         closed = jax.make_jaxpr(function)(jnp.asarray(x))
-        (expected,), (found,) = plain(closed, x), rewritten(closed, x)[0]
+        (expected,), (found,) = run_plain(closed, x), run_rewritten(closed, x)[0]
         np.testing.assert_array_equal(found, expected)
         np.testing.assert_array_equal(evaluate(closed, JAX_ALGEBRA, x)[0], expected)  # of numbers
 
@@ -142,12 +142,12 @@ def test_numbers_out_of_range_become_whole_as_in_jax():
         np.testing.assert_array_equal(scalarised(lambda x, dtype=dtype: (x * 1, given.astype(dtype)))(Q)[1], given.astype(dtype))
 
 
-# Numbers are computed at once, and long programs given up soon.
+# Numbers are folded at once, and long programs are given up soon.
 
 
 K, TABLE = rng.normal(size=(150, 150)), jnp.asarray(rng.normal(size=100_000))
 INDICES = rng.integers(0, 100_000, 100_000)
-LONG = {  # taken apart into Python's objects, the first of each kind took 9, 14, 5 and 5 s
+LONG_PROGRAMS = {  # as Python objects, the first of each kind took 9, 14, 5 and 5 s
     "a trace": lambda x: jnp.trace(K @ K.T) * x,
     "a loop": lambda x: lax.fori_loop(0, 100_000, lambda i, c: c * 0.99999, 1.0) * x,
     "a loop until": lambda x: lax.while_loop(lambda c: c < 1e5, lambda c: c + 1.0, 0.0) * x,
@@ -160,27 +160,27 @@ LONG = {  # taken apart into Python's objects, the first of each kind took 9, 14
 }
 
 
-@pytest.mark.parametrize("name", LONG)
+@pytest.mark.parametrize("name", LONG_PROGRAMS)
 def test_numbers_take_no_longer_than_in_jax(name, monkeypatch):
-    """How much is done in Python, which was three million multiplications for the trace: JAX computes what is known."""
+    """Few steps are done in Python, where the trace once took three million multiplications: JAX computes what is known."""
     done = []
     for step in ("apply", "equation"):
-        counted = lambda *given, step=getattr(Reader, step), **named: done.append(step) or step(*given, **named)
-        monkeypatch.setattr(Reader, step, counted)
-    closed = jax.make_jaxpr(scalarised(LONG[name]))(Q)
+        counted = lambda *given, step=getattr(Interpreter, step), **named: done.append(step) or step(*given, **named)
+        monkeypatch.setattr(Interpreter, step, counted)
+    closed = jax.make_jaxpr(scalarised(LONG_PROGRAMS[name]))(Q)
     assert 0 < len(done) < 15_000
-    np.testing.assert_allclose(jax.jit(jax.extend.core.jaxpr_as_fun(closed))(Q)[0], jax.jit(LONG[name])(Q), rtol=1e-10)
+    np.testing.assert_allclose(jax.jit(jax.extend.core.jaxpr_as_fun(closed))(Q)[0], jax.jit(LONG_PROGRAMS[name])(Q), rtol=1e-10)
 
 
-# Where it does not, `examine` says so.
+# Where the rewritten program differs, `examine` says so.
 
 
 def test_examine_compares_with_plain_jax(monkeypatch):
     energy = lambda q, qdot: 0.5 * (1 + q[0] ** 2) * qdot[0] ** 2 + 0.5 * qdot[1] ** 2 - jnp.cos(3 * q[0] - q[1])
     examined = lambda L: jl.examine(jl.System(L, holonomic=lambda q: q[0] * q[1] - 0.12), np.array([0.3, 0.4]), np.array([0.3, -0.4]))
     assert examined(lambda q, qdot: energy(q, qdot)).findings == ()
-    monkeypatch.setattr(Folding, "power", lambda folding, x, n: x)
-    monkeypatch.setitem(SIMPLER, "mul", lambda folding, x, y: Folding.mul(folding, x, y) if x is not y else x)
+    monkeypatch.setattr(ScalarGraph, "power", lambda graph, x, n: x)
+    monkeypatch.setitem(SIMPLIFICATIONS, "mul", lambda graph, x, y: ScalarGraph.mul(graph, x, y) if x is not y else x)
     assert "miss Lagrange's equations" in examined(lambda q, qdot: energy(q, qdot)).findings[0]
 
 

@@ -1,4 +1,4 @@
-"""Programs in a loop that turns once: the same values and derivatives, and only where it pays."""
+"""Programs in a loop of one iteration: the same values and derivatives, and only where it pays."""
 
 import jax
 import jax.numpy as jnp
@@ -39,25 +39,25 @@ def test_members_of_a_batch():
     np.testing.assert_allclose(each(in_one_kernel(long)), each(long), rtol=1e-14)
 
 
-def test_a_number_that_is_none_gives_none_and_ends():
+def test_nan_gives_nan_and_the_loop_ends():
     assert jnp.isnan(in_one_kernel(long)(jnp.array(jnp.nan), *GIVEN[1:])).all()
 
 
 @pytest.mark.parametrize(
-    "function, y, turns",
+    "function, y, is_looped",
     [
         (long, jnp.arange(4.0), True),
         (lambda t, y, args: t * y, jnp.arange(4.0), False),
         (lambda t, y, args: t * y, jnp.arange(16.0), True),
         (long, jnp.arange(200.0), False),
     ],
-    ids=["long", "short", "of many rows", "of too many numbers"],
+    ids=["long", "short", "many rows", "too many numbers"],
 )
-def test_only_programs_that_gain_by_it_turn(function, y, turns):
-    assert loops(in_one_kernel(function), GIVEN[0], y, GIVEN[2]) == turns
+def test_only_programs_that_gain_are_looped(function, y, is_looped):
+    assert loops(in_one_kernel(function), GIVEN[0], y, GIVEN[2]) == is_looped
 
 
-def test_elsewhere_than_on_a_cpu_nothing_changes(monkeypatch):
+def test_nothing_changes_on_a_gpu(monkeypatch):
     monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
     assert not loops(in_one_kernel(long), *GIVEN)
 
@@ -73,16 +73,16 @@ def links(n):
 
 
 @pytest.mark.parametrize("n", [2, 5])
-def test_a_motion_and_its_derivatives_are_those_without(monkeypatch, n):
-    """Forward and reverse; the gradient of two links and the motion of five are among those that turn."""
+def test_a_motion_and_its_derivatives_are_those_without_loops(monkeypatch, n):
+    """Forward and reverse; the gradient of two links and the motion of five are among the looped programs."""
     motion = lambda b: jl.simulate(links(n), jnp.linspace(0.3, 0.8, n), jnp.zeros(n), TS, {"b": b}).q
     results = []
-    for shortest in (single_kernel.LONG, 10**9):
-        monkeypatch.setattr(single_kernel, "LONG", shortest)
+    for shortest in (single_kernel.MIN_OPERATIONS, 10**9):
+        monkeypatch.setattr(single_kernel, "MIN_OPERATIONS", shortest)
         jax.clear_caches()
         program = jax.jit(lambda b: (motion(b), jax.jacfwd(motion)(b), jax.jacrev(lambda b: motion(b)[-1])(b)))
         results.append((program.lower(0.1).as_text().count("stablehlo.while"), program(0.1)))
-    (turning, with_loops), (plain, without) = results
-    assert turning > plain
+    (looped, with_loops), (plain, without) = results
+    assert looped > plain
     for found, expected in zip(with_loops, without, strict=True):
         np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-11)

@@ -1,4 +1,4 @@
-"""Zeros of Jacobians seen in programs, and constrained solves with a mass matrix seen to be diagonal; against dense matrices and NumPy."""
+"""Zeros of Jacobians read from programs, and constrained solves with a mass matrix recognised as diagonal, against dense ones and NumPy."""
 
 import jax
 import jax.numpy as jnp
@@ -7,36 +7,37 @@ import numpy as np
 import pytest
 
 import jaxlag as jl
-from jaxlag._mechanics.saddle_point import everywhere, saddle_point
-from jaxlag._program.sparse_jacobian import dependence, jacobian
+from jaxlag._mechanics.pseudo_inverse import everywhere
+from jaxlag._mechanics.saddle_point import saddle_point
+from jaxlag._program.sparse_jacobian import jacobian, sparsity_pattern
 
 G = 9.81
 
 
 def squares(x):
-    """Neighbours in a ring, and one entry that depends on nothing."""
+    """Neighbours in a ring, and one element that depends on nothing."""
     return jnp.append((x - jnp.roll(x, 1)) ** 2 * jnp.sin(x), 3.0)
 
 
-def test_the_pattern_is_that_of_the_entries():
+def test_the_pattern_of_a_ring():
     n = 30
     x = jnp.asarray(np.random.default_rng(0).normal(size=n))
     expected = np.vstack([np.eye(n) + np.roll(np.eye(n), -1, axis=1), np.zeros(n)]) > 0
-    np.testing.assert_array_equal(dependence(squares, x), expected)
+    np.testing.assert_array_equal(sparsity_pattern(squares, x), expected)
 
 
-def test_what_cancels_is_no_dependence():
+def test_terms_that_cancel_are_no_dependence():
     x = jnp.arange(20.0)
-    np.testing.assert_array_equal(dependence(lambda x: x + (jnp.sum(x) - jnp.sum(x[::-1][::-1])), x), np.eye(20))
+    np.testing.assert_array_equal(sparsity_pattern(lambda x: x + (jnp.sum(x) - jnp.sum(x[::-1][::-1])), x), np.eye(20))
 
 
 @pytest.mark.parametrize("function", [lambda x: jnp.linalg.solve(jnp.eye(x.size) + jnp.outer(x, x), x), lambda x: jax.lax.sort(x)])
-def test_what_is_not_taken_apart_depends_on_all(function):
-    assert dependence(function, jnp.arange(14.0)).all()
+def test_an_equation_kept_whole_depends_on_all(function):
+    assert sparsity_pattern(function, jnp.arange(14.0)).all()
 
 
 def test_a_program_too_long_depends_on_all():
-    assert dependence(lambda x: jax.lax.fori_loop(0, 3000, lambda _, x: jnp.sin(x), x), jnp.arange(14.0)).all()
+    assert sparsity_pattern(lambda x: jax.lax.fori_loop(0, 3000, lambda _, x: jnp.sin(x), x), jnp.arange(14.0)).all()
 
 
 @pytest.mark.parametrize("n", [2, 30])
@@ -47,14 +48,14 @@ def test_jacobian_is_that_of_all_columns(n):
     np.testing.assert_allclose(J.as_matrix(), jax.jacrev(squares)(x), rtol=1e-14, atol=1e-14)
 
 
-def test_few_directions_do_where_columns_share_no_row():
-    """Of 30 columns in a ring each meets its two neighbours: two directions, in place of 30, are multiplied."""
+def test_columns_that_share_no_row_share_a_direction():
+    """Of 30 columns in a ring each shares a row with its two neighbours: two directions are enough in place of 30."""
     program = jax.make_jaxpr(lambda x: jacobian(lambda x: x * jnp.roll(x, 1), x)[1].as_matrix())(jnp.arange(30.0))
     assert {v.aval.size for eqn in program.jaxpr.eqns if eqn.primitive.name == "mul" for v in eqn.outvars} == {30, 60}
 
 
 @pytest.mark.parametrize("function, diagonal", [(jnp.sin, True), (squares, False), (lambda x: x[::-1], False), (lambda x: 0 * x, False)])
-def test_a_diagonal_is_seen(function, diagonal):
+def test_a_diagonal_is_recognised(function, diagonal):
     _, J = jacobian(function, jnp.linspace(0.1, 1.0, 20))
     assert isinstance(J, lx.DiagonalLinearOperator) == diagonal
 
@@ -70,7 +71,7 @@ def two_ways(masses, seed=0):
 
 @pytest.mark.parametrize("massless", [0, 2])
 def test_diagonal_and_full_inertia_agree(massless):
-    """Also where masses are zero and the constraints hold what has none; with derivatives in everything."""
+    """Also where masses are zero and constraints hold the massless coordinates; with all derivatives."""
     masses = jnp.asarray(np.r_[np.zeros(massless), np.linspace(0.5, 3.0, 14 - massless)])
     diagonal, full, rows, f = two_ways(masses)
     for one, other in zip(diagonal(masses), full(masses), strict=True):
@@ -82,7 +83,7 @@ def test_diagonal_and_full_inertia_agree(massless):
 
 
 def test_members_of_a_batch_choose_together():
-    """One member without a mass takes all to the full solve, which is right for all."""
+    """One member without a mass sends all to the full solve, which is right for all."""
     masses = jnp.asarray(np.random.default_rng(3).uniform(0.5, 2.0, (5, 14))).at[2, 0].set(0.0)
     diagonal, full, *_ = two_ways(masses[0])
     found, expected = jax.jit(jax.vmap(diagonal))(masses), jax.vmap(full)(masses)
@@ -90,6 +91,7 @@ def test_members_of_a_batch_choose_together():
     assert jax.vmap(everywhere)(jnp.array([True, False])).tolist() == [False, False]
 
 
+@pytest.mark.fast
 def test_no_branch_is_taken_twice_in_a_batch():
     """A `cond` on what holds everywhere stays a `cond` in a batch."""
     function = lambda x: jax.lax.cond(everywhere(x > 0), lambda: jnp.sqrt(x), lambda: x)

@@ -1,4 +1,4 @@
-"""Jacobians read as products of diagonal matrices and matrices of numbers, against JAX's own."""
+"""Jacobians as sums of products of diagonal matrices and matrices of numbers, against JAX's own."""
 
 import jax
 import jax.numpy as jnp
@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import jaxlag as jl
-from jaxlag._program.structured_jacobian import matrix
+from jaxlag._program.structured_jacobian import structured_jacobian
 
 rng = np.random.default_rng(0)
 A, W = rng.normal(size=(5, 6)), rng.normal(size=(6, 6))
@@ -31,7 +31,7 @@ PROGRAMS = {
 }
 
 
-UNREAD = {
+NOT_COVERED = {
     "a network": lambda x: jnp.tanh(W @ jnp.tanh(W @ x)),
     "a loop": lambda x: jax.lax.fori_loop(0, 3, lambda i, x: jnp.sin(x) + x[::-1], x),
     "a choice": lambda x: jax.lax.cond(x[0] > 0, jnp.sin, jnp.cos, x * C),
@@ -43,10 +43,10 @@ UNREAD = {
 
 
 @pytest.mark.parametrize("name", PROGRAMS)
-def test_the_matrix_is_jaxs(name):
+def test_the_jacobian_is_that_of_jax(name):
     """With c a vector of numbers, and one that varies."""
     function = PROGRAMS[name]
-    found, expected = lambda x, c: matrix(lambda x: function(x, c), x), jax.jacfwd(function)
+    found, expected = lambda x, c: structured_jacobian(lambda x: function(x, c), x), jax.jacfwd(function)
     np.testing.assert_allclose(found(X, C), expected(X, C), rtol=1e-13, atol=1e-13)
     np.testing.assert_allclose(jax.jit(found)(X, C), expected(X, C), rtol=1e-13, atol=1e-13)
     np.testing.assert_allclose(jax.vmap(found)(X[None], C[None])[0], expected(X, C), rtol=1e-13, atol=1e-13)
@@ -55,10 +55,10 @@ def test_the_matrix_is_jaxs(name):
             np.testing.assert_allclose(a, b, rtol=1e-12, atol=1e-12)
 
 
-@pytest.mark.parametrize("name", UNREAD)
-def test_what_is_no_product_is_left_to_jax(name):
+@pytest.mark.parametrize("name", NOT_COVERED)
+def test_other_programs_are_left_to_jax(name):
     found = []
-    jax.make_jaxpr(lambda x: found.append(matrix(UNREAD[name], x)))(X)
+    jax.make_jaxpr(lambda x: found.append(structured_jacobian(NOT_COVERED[name], x)))(X)
     assert found == [None]
 
 
@@ -69,7 +69,7 @@ def chain(q, qdot, l, m):
 
 @pytest.mark.parametrize("n", [9, 16])
 def test_a_chain_takes_no_sums_over_columns(n):
-    """M_ij = l_i l_j cos(φ_i − φ_j) Σ_{k ≥ max(i, j)} m_k; with known masses a few operations on n × n numbers."""
+    """M_ij = l_i l_j cos(φ_i − φ_j) Σ_{k ≥ max(i, j)} m_k; with known masses, a few operations on n × n numbers."""
     q, l, m = rng.uniform(-1, 1, n), rng.uniform(0.5, 1.5, n), rng.uniform(0.5, 1.5, n)
     hung = np.cumsum(m[::-1])[::-1]
     expected = np.outer(l, l) * np.cos(np.subtract.outer(q, q)) * hung[np.maximum.outer(np.arange(n), np.arange(n))]
@@ -82,6 +82,7 @@ def test_a_chain_takes_no_sums_over_columns(n):
     assert f"f64[{n},{n}]" in text and "reduce-window" not in text and " dot(" not in text
 
 
+@pytest.mark.fast
 def test_single_precision_stays_single(single_precision):
     q, m = np.linspace(-1, 1, 9, dtype=np.float32), np.ones(9, np.float32)
     found = jl.mass_matrix(jl.System(lambda q, qdot, l: chain(q, qdot, l, m)), q, 0 * q, {"l": 0.5})

@@ -7,9 +7,9 @@ import pytest
 
 import jaxlag as jl
 from jaxlag import dissipation
-from jaxlag._mechanics.friction_terms import kinks_of
-from jaxlag._model.system import bind
-from jaxlag._motion.integrate import How
+from jaxlag._mechanics.friction_elements import find_elements
+from jaxlag._model.flat import bind
+from jaxlag._motion.integrate import SolverOptions
 
 T = lambda qdot: 0.5 * jnp.sum(qdot**2)
 POINTS = np.array([[1.0, 0.0], [0.0, 2.0], [3.0, 4.0]])
@@ -22,13 +22,13 @@ def read(D, v, params):
     def found(v, params):
         flat = bind(jl.System(T, dissipation=D), v, params)
         flat_v, rest = jnp.ravel(v), (jnp.zeros(()), jnp.zeros(v.size), jnp.zeros(v.size), jnp.zeros(0))
-        kinks = kinks_of(flat, *rest[:3])
-        if kinks is None:
+        elements = find_elements(flat, *rest[:3])
+        if elements is None:
             return None
-        (lifted,) = kinks.lifted.values()
-        slip = lambda v: kinks.slip(*rest[:2], v)
-        force = -jax.grad(lambda v: lifted(*rest[:2], v, rest[3], kinks.norms(slip(v))))(flat_v)
-        bounds = jax.grad(lifted, argnums=4)(*rest, jnp.zeros(kinks.elements))
+        (lifted,) = elements.potentials.values()
+        slip = lambda v: elements.slip(*rest[:2], v)
+        force = -jax.grad(lambda v: lifted(*rest[:2], v, rest[3], elements.norms(slip(v))))(flat_v)
+        bounds = jax.grad(lifted, argnums=4)(*rest, jnp.zeros(elements.size))
         return force.reshape(v.shape), bounds, slip(flat_v)
 
     return found(jnp.asarray(v, float), params)
@@ -70,6 +70,7 @@ THREE_POINTS = {
 }
 
 
+@pytest.mark.fast
 @pytest.mark.parametrize("D", THREE_POINTS.values(), ids=THREE_POINTS)
 def test_three_sliding_points(D):
     """Each has a force of its own, −k s/‖s‖; written on arrays, they were taken for one point in six dimensions, or refused."""
@@ -180,15 +181,17 @@ SMOOTH = {
 }
 
 
+@pytest.mark.fast
 @pytest.mark.parametrize("D", SMOOTH.values(), ids=SMOOTH)
 def test_what_is_smooth_stays_smooth(D):
     assert read(D, 0.7, {"F": 0.7, "w": 0.1, "p": 1.8}) is None
 
 
+@pytest.mark.fast
 @pytest.mark.parametrize("beside", [jnp.exp, jnp.tanh])
 def test_a_sign_beside_the_absolute_value_that_is_not_read_is_refused(beside):
     """The bound at rest would be that of a sign of zero, which is neither side's."""
-    with pytest.raises(ValueError, match="`dissipation` must depend on the sign of a slip velocity in a way that is read"):
+    with pytest.raises(ValueError, match="`dissipation` must depend on the sign of a slip velocity in a recognised way"):
         read(lambda qdot, F: F * beside(2 + jnp.sign(qdot)) * jnp.abs(qdot), 0.7, {"F": 0.7})
 
 
@@ -260,12 +263,12 @@ def test_failures_name_friction_that_was_not_read():
     run = lambda **terms: jl.simulate(jl.System(spring, **terms), 1.0, 0.0, [0.0, 20.0], {"F": 0.3, "p": 1.0}, max_steps=1000)
     with pytest.raises(RuntimeError, match=r"`force` jumps with a velocity.*write it as `dissipation`, D = F \* jnp.abs\(v\)"):
         run(force=JUMPING["sign"])
-    with pytest.raises(RuntimeError, match=r"`dissipation` is dry friction for these parameters alone.*write F \* jnp.abs\(v\)"):
+    with pytest.raises(RuntimeError, match=r"`dissipation` is dry friction for these parameters only.*write F \* jnp.abs\(v\)"):
         run(dissipation=SMOOTH["an exponent"])
     with pytest.raises(RuntimeError, match=r"`dissipation` depends on the sign or the root of a velocity.*write F \* jnp.abs\(v\)"):
         run(dissipation=lambda qdot, F: F * jnp.exp(jnp.sign(qdot)) * qdot)
     with pytest.raises(TypeError, match="`friction` must be an object that makes the choice, but is None"):
-        How.of(None, jl.Projection(), None, 1000)
+        SolverOptions.of(None, jl.Projection(), None, 1000)
 
 
 @pytest.mark.parametrize("off, end", [(False, np.cos(2 * 5.0)), (True, 0.05)])

@@ -1,4 +1,4 @@
-"""Functions made anew: compiled anew each time, which is said once; and let go of with what they hold."""
+"""Recreated functions: compiled anew each time, of which one warning tells; and freed together with what they close over."""
 
 import gc
 import json
@@ -20,7 +20,7 @@ def spring(stiffness):
     return lambda q: 0.5 * stiffness * q**2
 
 
-def said(action, times):
+def warnings_of(action, times):
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         for i in range(times):
@@ -28,31 +28,31 @@ def said(action, times):
     return [str(warning.message) for warning in caught if "must be made once" in str(warning.message)]
 
 
-def test_a_lambda_made_anew_in_a_loop_is_said_once():
-    found = said(lambda i: jl.mass_matrix(jl.System(lambda qdot: 0.5 * (1 + i) * qdot**2), 0.0, 0.0), 5)
+def test_a_lambda_recreated_in_a_loop_is_warned_of_once():
+    found = warnings_of(lambda i: jl.mass_matrix(jl.System(lambda qdot: 0.5 * (1 + i) * qdot**2), 0.0, 0.0), 5)
     assert len(found) == 1
     assert found[0].startswith("`lagrangian` must be made once to be compiled once, but `<lambda>`, line ")
-    assert "test_made_anew.py, was made anew 3 times" in found[0] and found[0].endswith("let what changes be an entry of params.")
+    assert "test_recreated_functions.py, was created 3 times" in found[0] and found[0].endswith("make what changes an entry of params.")
 
 
-def test_what_a_function_is_made_from_counts_too():
+def test_what_a_function_is_composed_of_counts_too():
     point = lambda i: jl.virtual_work(lambda q: (1 + i) * q, 1.0)
     system = lambda i: jl.System({"T": kinetic}, force={"wind": point(i)})
-    assert said(lambda i: jl.powers(system(i), 0.0, 0.0), 3)[0].startswith("`force` 'wind' must be made once to be compiled once")
+    assert warnings_of(lambda i: jl.powers(system(i), 0.0, 0.0), 3)[0].startswith("`force` 'wind' must be made once to be compiled once")
 
 
 def kinetic(qdot):
     return 0.5 * jnp.sum(qdot**2)
 
 
-def test_what_is_no_loop_is_not_warned_of():
+def test_systems_that_differ_are_not_warned_of():
     one = jl.System({f"V{i}": spring(i) for i in range(5)} | {"T": kinetic})  # several from one factory, in one system
-    assert not said(lambda i: jl.mass_matrix(one, 0.0, 0.0), 5)
-    assert not said(lambda i: jl.mass_matrix(jl.System(kinetic), *np.zeros((2, 1 + i))), 4)  # one function, of other shapes
+    assert not warnings_of(lambda i: jl.mass_matrix(one, 0.0, 0.0), 5)
+    assert not warnings_of(lambda i: jl.mass_matrix(jl.System(kinetic), *np.zeros((2, 1 + i))), 4)  # one function, of other shapes
     chains = lambda i: jl.System(lambda qdot: 0.5 * (1 + i) * qdot @ qdot)
-    assert not said(lambda i: jl.mass_matrix(chains(i), *np.zeros((2, 1 + i))), 4)  # each compiled anew for its shapes anyway
+    assert not warnings_of(lambda i: jl.mass_matrix(chains(i), *np.zeros((2, 1 + i))), 4)  # each compiled anew for its shapes anyway
     terms = [jl.System({"T": kinetic, name: spring(1.0)}) for name in ("a", "b")]
-    assert not said(lambda i: jl.mass_matrix(terms[i], 0.0, 0.0), 2)
+    assert not warnings_of(lambda i: jl.mass_matrix(terms[i], 0.0, 0.0), 2)
 
 
 SCRIPT = """
@@ -67,14 +67,14 @@ print(json.dumps([(w.filename, w.lineno) for w in caught if "must be made once" 
 """
 
 
-def test_the_warning_is_of_the_line_of_the_user():
-    """Seen from a script, for here the annotations are checked in between."""
+def test_the_warning_names_the_line_of_the_user():
+    """Seen from a script, since here the checks of annotations stand in between."""
     run = subprocess.run([sys.executable, "-c", SCRIPT], capture_output=True, text=True)
     assert json.loads(run.stdout) == [["<string>", 8]]
 
 
 class Held:
-    """Stands for what a function holds: a table, a recording."""
+    """Stands for what a function closes over: a table, a recording."""
 
     stiffness = 4.0
 
@@ -88,7 +88,7 @@ CALLS = {
 
 
 @pytest.mark.parametrize("call", CALLS)
-def test_what_a_function_holds_is_let_go_of(call):
+def test_what_a_function_closes_over_is_freed(call):
     held = Held()
     alive = weakref.ref(held)
     system = jl.System({"T": kinetic, "V": lambda q: -0.5 * held.stiffness * q**2})  # noqa: F821
@@ -99,9 +99,9 @@ def test_what_a_function_holds_is_let_go_of(call):
     assert alive() is None
 
 
-def test_what_is_counted_holds_no_function():
-    before = len(user_errors._met)
-    said(lambda i: jl.mass_matrix(jl.System(lambda qdot: 0.5 * (3 + i) * qdot**2), 0.0, 0.0), 3)
+def test_counting_keeps_no_function_alive():
+    before = len(user_errors._seen)
+    warnings_of(lambda i: jl.mass_matrix(jl.System(lambda qdot: 0.5 * (3 + i) * qdot**2), 0.0, 0.0), 3)
     jax.clear_caches()
     gc.collect()
-    assert len(user_errors._met) <= before
+    assert len(user_errors._seen) <= before

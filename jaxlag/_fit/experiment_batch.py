@@ -1,0 +1,152 @@
+"""Experiments of one kind as a batch: padded to equal length, and distributed over the devices."""
+
+import dataclasses
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.flatten_util import ravel_pytree
+from jax.sharding import Mesh, NamedSharding, PartitionSpec
+from jaxtyping import Array, Float, PyTree
+
+from .._mechanics.lagrange import constraint_rows, position_residual
+from .._mechanics.projection import consistent_state
+from .._model.paths import is_within
+from .._model.system import System
+from .._model.validation import at_state
+from .._motion.simulate_many import of_each, padded
+from .._program.jit import is_concrete
+from .experiment import Experiment, start_entries, with_own
+
+EXPERIMENTS_AXIS = PartitionSpec("experiments")
+
+
+class ExperimentBatch(eqx.Module):
+    """Experiments of one kind: each array has them as its first axis. Shorter records are padded with missing samples.
+
+    `tangent_basis`: (experiments, 2n, k), directions in which the flat start (q0, qdot0) moves with the first k of an experiment's own
+    unknowns z; the other entries of z are its unknown parameters.
+    """
+
+    ts: Any
+    values: PyTree
+    sigma: PyTree
+    q0: PyTree
+    qdot0: PyTree
+    params: dict[str, Any]
+    tangent_basis: Any
+    observe: Callable = eqx.field(static=True)
+    delay: Any = eqx.field(static=True)
+    own: tuple[str, ...] = eqx.field(static=True)  # entries of params that are unknown
+    members: tuple[int, ...] = eqx.field(static=True)  # indices of the experiments
+    mesh: Mesh | None = eqx.field(static=True, default=None)  # the devices they are distributed over
+
+    @property
+    def unknowns(self) -> int:
+        """The number of unknowns of each experiment."""
+        of_params = (int(np.prod(leaf.shape[1:])) for name in self.own for leaf in jax.tree.leaves(self.params[name]))
+        return self.tangent_basis.shape[-1] + sum(of_params)
+
+    def start(self, z: Float[Array, " d"]) -> tuple[PyTree, PyTree, dict[str, Any]]:
+        """q0, qdot0 and the own parameters of one experiment (a batch without its first axis) at its unknowns z."""
+        if self.unknowns == 0:  # what depends on no unknown is not to be differentiated
+            return self.q0, self.qdot0, self.params
+        start, unravel = ravel_pytree((self.q0, self.qdot0))
+        k = self.tangent_basis.shape[-1]
+        q0, qdot0 = unravel(start + self.tangent_basis @ z[:k])
+        own, unravel_own = ravel_pytree({name: self.params[name] for name in self.own})
+        return q0, qdot0, self.params | unravel_own(own + jnp.where(own == 0, 1, jnp.abs(own)) * z[k:])
+
+
+def batches_of(system: System, params: PyTree, experiments: Sequence[Experiment]) -> tuple[ExperimentBatch, ...]:
+    """One batch for each kind of experiment, distributed over the devices where there are several."""
+    kinds: dict[Any, list[int]] = {}
+    bases = [_tangent_basis(system, params, e) for e in experiments]
+    for i, e in enumerate(experiments):
+        rest = (e.q0, e.qdot0, e.params, bases[i])
+        shapes = [jnp.shape(x)[1:] for x in jax.tree.leaves(e.values)], [jnp.shape(x) for x in jax.tree.leaves(rest)]
+        kind = e.observe, e.delay, _unknown_params(e), jax.tree.structure((e.values, rest)), str(shapes)
+        kinds.setdefault(kind, []).append(i)
+    return tuple(_batch([experiments[i] for i in members], [bases[i] for i in members], members) for members in kinds.values())
+
+
+def _unknown_params(e):
+    return tuple(name for name in e.unknown if name in e.params)
+
+
+def _batch(experiments, bases, members):
+    longest = max(e.ts.size for e in experiments)
+    xnp: Any = np if is_concrete(experiments, bases) else jnp  # NumPy is faster where nothing is traced
+
+    def pad(x, e, padding=None):
+        x = xnp.asarray(x)
+        return xnp.concatenate([x, xnp.broadcast_to(x[-1] if padding is None else padding, (longest - e.ts.size, *x.shape[1:]))])
+
+    sigma = lambda e: e.sigma if e.sigma is not None else jax.tree.map(jnp.ones_like, e.values)
+    padded = [
+        (
+            pad(e.ts, e),
+            jax.tree.map(lambda v, e=e: pad(v, e, jnp.nan), e.values),
+            jax.tree.map(lambda s, e=e: pad(s, e, 1.0), sigma(e)),
+            e.q0,
+            e.qdot0,
+            e.params,
+            basis,
+        )
+        for e, basis in zip(experiments, bases, strict=True)
+    ]
+    arrays, others = eqx.partition(padded, lambda x: isinstance(x, (np.ndarray, jax.Array)))
+    together = eqx.combine(jax.tree.map(lambda *leaves: jnp.asarray(xnp.stack(leaves)), *arrays), others[0])
+    first = experiments[0]
+    return _distributed(ExperimentBatch(*together, first.observe, first.delay, _unknown_params(first), tuple(members)))
+
+
+def _distributed(batch):
+    """Over all devices, padded with copies of the last experiment so that each device has equally many."""
+    count, devices = len(batch.members), jax.device_count()
+    if min(count, devices) == 1:
+        return batch
+    batch = dataclasses.replace(batch, mesh=Mesh(np.array(jax.devices()), "experiments"))
+    sharding = NamedSharding(batch.mesh, EXPERIMENTS_AXIS)
+    return jax.tree.map(lambda x: jax.device_put(padded(x, devices), sharding) if eqx.is_array(x) else x, batch)
+
+
+def _tangent_basis(system, params, e):
+    """Directions in which the start of an experiment may move: its unknown entries, within the constraints."""
+    entries = start_entries(e)
+    n = len(entries) // 2
+    free = [[i for i in part if any(is_within(entries[i], name) for name in e.unknown)] for part in (range(n), range(n, 2 * n))]
+    blocks = [np.eye(2 * n)[:, part] for part in free]
+    if system.constraints and any(free):
+        params = with_own(params, e.params)
+        q, qdot = consistent_state(system, e.q0, e.qdot0, params, t=e.ts[0])
+        for k, jacobian in enumerate(at_state(_constraint_jacobians, system, q, qdot, params, e.ts[0])):
+            columns = np.array(free[k], int) - k * n
+            _, s, Vt = np.linalg.svd(np.asarray(jacobian)[:, columns])
+            rank = int(np.sum(s > 1e-9 * s[:1]))
+            blocks[k] = blocks[k] @ Vt[rank:].T
+    return jnp.asarray(np.hstack(blocks), jax.tree.leaves(e.q0)[0].dtype)
+
+
+def _constraint_jacobians(flat, t, q, v):
+    """Of the constraints on positions, and of all constraints on velocities."""
+    return position_residual(flat, t, q)[1], constraint_rows(flat, t, q, v)[1]
+
+
+def map_batch(of_one: Callable[..., Any], batch: ExperimentBatch, z: Any, *common: Any) -> Any:
+    """`of_one(e, z, *common)` for each experiment of a batch; each device computes its share of them."""
+    arrays, others = eqx.partition(batch, eqx.is_array)
+    if len(z) == 1:  # avoids a batch of one
+        first = lambda tree: jax.tree.map(lambda x: x[0], tree)
+        return jax.tree.map(lambda x: x[None], of_one(eqx.combine(first(arrays), others), z[0], *common))
+    numbers, rest = eqx.partition(common, eqx.is_array)
+    one = lambda given, numbers: of_one(eqx.combine(given[0], others), given[1], *eqx.combine(numbers, rest))
+    mapped = lambda arrays, z, numbers: of_each(lambda given: one(given, numbers), (arrays, z))
+    if batch.mesh is None:
+        return mapped(arrays, z, numbers)
+    specs = (EXPERIMENTS_AXIS, EXPERIMENTS_AXIS, PartitionSpec())
+    mapped = jax.shard_map(mapped, mesh=batch.mesh, in_specs=specs, out_specs=EXPERIMENTS_AXIS, check_vma=False)
+    return jax.tree.map(lambda x: x[: len(z)], mapped(arrays, padded(z, batch.mesh.size), numbers))

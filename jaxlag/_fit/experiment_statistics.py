@@ -1,0 +1,100 @@
+"""Statistics that belong to each experiment: its own estimates, its predictions and residuals, with their errors."""
+
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.flatten_util import ravel_pytree
+from jaxtyping import PyTree
+
+from .._model.paths import is_within
+from .experiment import Experiment
+from .identifiability import Determined
+from .minimum import Minimum
+
+
+def own_estimates(minimum: Minimum, known: Determined, scale: float) -> list[tuple[dict[str, Any], dict[str, Any]]]:
+    """For each experiment its unknowns and their standard errors, by name."""
+    firsts = (segments[0] for segments in minimum.segments_of_each())
+    return [_own_estimates(minimum, k, row, e, known, scale) for (k, row, _), e in zip(firsts, minimum.experiments, strict=True)]
+
+
+def _own_estimates(minimum, k, row, e, known, scale):
+    if not e.unknown:
+        return {}, {}
+    batch, part, p = minimum.problem.batches[k], minimum.found.batches[k], minimum.size
+    own_columns = minimum.problem.own_columns(k, np.array([row]))[0]
+    z, columns = minimum.x[own_columns], np.r_[0:p, own_columns]
+
+    def errors(J):
+        variance = np.einsum("ij,jk,ik->i", J, known.covariance[np.ix_(columns, columns)], J)
+        loose = np.any(np.abs(J @ known.null[columns]) > 1e-6 * np.max(np.abs(J), initial=1e-300), axis=1)
+        return np.where(loose, np.inf, scale * np.sqrt(np.maximum(variance, 0)))
+
+    one = jax.tree.map(lambda leaf: leaf[row] if eqx.is_array(leaf) else leaf, batch)
+    own_params = lambda z: ravel_pytree({name: one.start(z)[2][name] for name in batch.own})
+    own, unravel_own = own_params(jnp.asarray(z))
+    own_J = jax.jacfwd(lambda z: own_params(z)[0])(jnp.asarray(z))
+    values, deviations = unravel_own(own), unravel_own(jnp.asarray(errors(np.hstack([np.zeros((own.size, p)), own_J]))))
+
+    unravel = ravel_pytree((e.q0, e.qdot0))[1]
+    half = part.ends.shape[1] // 2
+    start = unravel(jnp.asarray(part.ends[row, :half]))
+    if part.ends_jacobian is None:
+        start_errors = jax.tree.map(lambda x: jnp.full_like(x, jnp.nan), start)
+    else:
+        start_errors = unravel(jnp.asarray(errors(np.asarray(part.ends_jacobian[row, :half]))))
+    for which, value, error in zip(("q0", "qdot0"), start, start_errors, strict=True):
+        if any(is_within(name, which) for name in e.unknown):
+            values[which], deviations[which] = value, error
+    return values, deviations
+
+
+def with_estimates(e: Experiment, own: dict[str, Any]) -> Experiment:
+    """The experiment with its estimates put in."""
+    params = e.params | {name: value for name, value in own.items() if name in e.params}
+    return eqx.tree_at(lambda e: (e.q0, e.qdot0, e.params), e, (own.get("q0", e.q0), own.get("qdot0", e.qdot0), params))
+
+
+class Predicted(NamedTuple):
+    """One experiment: measured − predicted, the predictions, and their standard errors over σ̂."""
+
+    residuals: PyTree
+    predictions: PyTree
+    deviations: PyTree
+
+
+def predictions_of(minimum: Minimum, covariance: np.ndarray) -> list[Predicted]:
+    """For each experiment, its segments put together."""
+    found = []
+    joined = lambda parts: jax.tree.map(lambda *leaves: np.concatenate(leaves), *parts)
+    for e, segments in zip(minimum.experiments, minimum.segments_of_each(), strict=True):
+        seen, deviations = [], []
+        for k, row, n in segments:
+            own_samples = lambda tree, n=n: jax.tree.map(lambda x: x[:n], tree)
+            seen.append(own_samples(jax.tree.map(lambda x, row=row: np.asarray(x)[row], minimum.found.batches[k].channels)))
+            deviations.append(own_samples(_deviations(minimum, k, row, covariance)))
+        predictions = joined(seen)
+        found.append(Predicted(jax.tree.map(lambda z, p: np.asarray(z) - p, e.values, predictions), predictions, joined(deviations)))
+    return found
+
+
+def _deviations(minimum, k, row, covariance):
+    """√(J cov Jᵀ) of the predictions of one experiment; NaN where nothing was measured, for J is not known there."""
+    batch, part, loss = minimum.problem.batches[k], minimum.found.batches[k], minimum.problem.model.loss
+    values, sigma, seen = (jax.tree.map(lambda x: np.asarray(x)[row], tree) for tree in (batch.values, batch.sigma, part.channels))
+    if part.jacobian is None:
+        return jax.tree.map(lambda z: np.full(z.shape, np.nan), values)
+    flat = lambda tree: np.concatenate([np.ravel(leaf) for leaf in jax.tree.leaves(tree)])
+    columns = np.r_[0 : minimum.size, minimum.problem.own_columns(k, np.array([row]))[0]]
+    J = np.asarray(part.jacobian)[row] * flat(sigma)[:, None]
+    if loss is not None:
+        weighted = np.nan_to_num((flat(values) - flat(seen)) / flat(sigma))
+        J = J / np.asarray(loss.slope(weighted / minimum.problem.scale))[:, None]
+    deviation = np.sqrt(np.maximum(np.einsum("ij,jk,ik->i", J, covariance[np.ix_(columns, columns)], J), 0))
+    there = np.where(np.isfinite(flat(values)), deviation, np.nan)
+    leaves, structure = jax.tree.flatten(values)
+    parts = np.split(there, np.cumsum([leaf.size for leaf in leaves])[:-1])
+    return jax.tree.unflatten(structure, [part.reshape(leaf.shape) for part, leaf in zip(parts, leaves, strict=True)])

@@ -1,0 +1,114 @@
+"""The printed card of a fit: a table of the parameters, remarks, and a table of the channels."""
+
+import itertools
+from collections.abc import Iterator, Sequence
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+from jax.flatten_util import ravel_pytree
+
+from .._model.paths import entry_names, is_within
+from .autocorrelation import COLOURED
+from .channels import Channel
+from .rounding import plus_minus, rounded
+
+ROWS = 40  # of a table at most
+STRONGEST = 6  # correlations on the card
+MANY = 16  # numbers of one name; more are only counted
+
+
+def card(fit: Any) -> str:
+    """The card of a `Fit`, a line for each element."""
+    rows = [
+        _heading(fit),
+        *_parameter_rows(fit),
+        *_correlation_rows(fit),
+        *_inflation_rows(fit),
+        *(f"  ! {remark}" for remark in fit.remarks),
+        *channel_rows(fit.channels),
+        f"  residual sigma  {fit.sigma:.4g}{'  (1 where the stated noise level is right)' if fit.absolute else ''}",
+    ]
+    return "\n".join(rows)
+
+
+def estimates_by_name(fit: Any) -> Iterator[tuple[str, list[tuple[str, float, float]]]]:
+    """A name, and each of its numbers as (name, value, standard error): of the free parameters, then of each experiment's unknowns."""
+    theta = np.asarray(fit.problem.free.theta(jnp.asarray(fit.x[: len(fit.names)])))
+    triples = list(zip(fit.names, theta, np.sqrt(np.diag(fit.covariance)), strict=True))
+    yield from ((name, [triple for triple in triples if is_within(triple[0], name)]) for name in fit.estimates)
+    for k, unknowns in enumerate(fit.unknowns):
+        for which, tree in unknowns.items():
+            label = f"experiment {k}: {which}"
+            entries = [f"{label}{'.' if name[:1].isalpha() else ''}{name}" for name in entry_names(tree)]
+            values, errors = (np.asarray(ravel_pytree(x)[0]) for x in (tree, fit.unknown_errors[k][which]))
+            yield label, list(zip(entries, values, errors, strict=True))
+
+
+def _heading(fit):
+    count = len(fit.names)
+    outcome = f"converged after {fit.steps} steps" if fit.converged else f"not converged after {fit.steps} steps: {fit.reason}"
+    return f"Fit: {count} parameter{'s' if count != 1 else ''}, {fit.measurements} measurements, {outcome}"
+
+
+def _parameter_rows(fit):
+    """Estimates, errors and intervals; many numbers of one name in one row."""
+    groups = list(estimates_by_name(fit))
+    named = [(name, _estimate(fit, v, e)) for _, group in groups if len(group) <= MANY for name, v, e in group]
+    named += [(name, _counted(group)) for name, group in groups if len(group) > MANY]
+    width = max((len(name) for name, _ in named[:ROWS]), default=0)
+    rows = [f"  {name:<{width}}  {text}" for name, text in named[:ROWS]]
+    return rows + ([f"  … and {len(named) - ROWS} more"] if len(named) > ROWS else [])
+
+
+def _estimate(fit, value, error):
+    if not np.isfinite(error):
+        return "not determined by these measurements" if np.isinf(error) else f"{value:.6g}"
+    t = fit.quantile(0.95)
+    return f"{plus_minus(value, error):<24} 95 %: {rounded(value - t * error, error)} … {rounded(value + t * error, error)}"
+
+
+def _counted(group):
+    errors = np.array([error for _, _, error in group])
+    known = "" if np.all(np.isnan(errors)) else f", {np.count_nonzero(np.isfinite(errors))} of them determined individually"
+    return f"{len(group)} numbers{known}"
+
+
+def _correlation_rows(fit):
+    pairs = itertools.combinations(range(min(len(fit.names), ROWS)), 2)
+    strong = sorted((pair for pair in pairs if abs(fit.correlation[pair]) > 0.5), key=lambda pair: -abs(fit.correlation[pair]))
+    shown = [f"{fit.names[i]}, {fit.names[j]}: {fit.correlation[i, j]:+.2f}" for i, j in strong[:STRONGEST]]
+    more = [f"{len(strong) - STRONGEST} more above 0.5"] if len(strong) > STRONGEST else []
+    return [f"  correlation  {'; '.join([*shown, *more])}"] if strong else []
+
+
+def _inflation_rows(fit):
+    if not fit.correlated:
+        return []
+    factors = dict.fromkeys(f"{x:.2g}" for x in (np.min(fit.inflation, initial=np.inf), np.max(fit.inflation, initial=0)))
+    larger = f": {' to '.join(factors)} times those for white residuals" if fit.names else ""
+    return [f"  standard errors account for residuals correlated over {fit.correlated} samples{larger}"]
+
+
+def channel_rows(channels: Sequence[Channel]) -> list[str]:
+    """The table of channels."""
+    several = len({channel.experiment for channel in channels}) > 1
+    label = lambda c: f"{c.experiment}: {c.name}" if several else c.name
+    shown = channels[:ROWS]
+    width = max((len(label(c)) for c in shown), default=0)
+    rows = [
+        f"  {label(c):<{width}}  fit {_short(c.fit_percent, '6.2f')} %   R² {_short(c.r_squared, '.5f')}   rms {c.rms:.3g}   "
+        + _whiteness(c.whiteness)
+        for c in shown
+    ]
+    return rows + ([f"  … and {len(channels) - ROWS} more channels"] if len(channels) > ROWS else [])
+
+
+def _whiteness(p):
+    if np.isnan(p):
+        return ""
+    return "white" if p >= COLOURED else f"not white (p = {p:.1g})"
+
+
+def _short(x, digits):
+    return f"{x:{digits}}" if abs(x) < 1e4 else f"{x:.1e}"

@@ -1,0 +1,92 @@
+"""The minimum of a least-squares problem: what the statistics of a fit are computed from."""
+
+import dataclasses
+from collections.abc import Iterator, Sequence
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+from .._program.jit import compiled
+from .experiment import Experiment
+from .levenberg_marquardt import Outcome
+from .multiple_shooting import Segments
+from .problem import Linearisation, Problem
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Minimum:
+    """A problem linearised at its minimum x.
+
+    - `theta`, `slope`: the p parameters there, and dθ/dy. `found`: residuals and Jacobians.
+    - `weighted`: (measured − predicted) / sigma for each batch, (segments, samples · channels), NaN where nothing was measured.
+    """
+
+    problem: Problem
+    experiments: tuple[Experiment, ...]
+    segments: Segments
+    outcome: Outcome
+    x: np.ndarray
+    found: Linearisation
+    theta: np.ndarray
+    slope: np.ndarray
+    weighted: list[np.ndarray]
+
+    @classmethod
+    def of(cls, problem: Problem, experiments: Sequence[Experiment], outcome: Outcome, segments: Segments) -> "Minimum":
+        """At the best iterate of an outcome."""
+        best = outcome.best
+        theta, slope = map(np.asarray, _theta_and_slope(problem.free, jnp.asarray(best.y[: problem.free.size])))
+        weighted = list(weighted_residuals(problem, best.aux))
+        return cls(problem, tuple(experiments), segments, outcome, np.asarray(best.y), best.aux, theta, slope, weighted)
+
+    @property
+    def size(self) -> int:
+        """p, the number of free parameters."""
+        return self.problem.free.size
+
+    @property
+    def flat(self) -> np.ndarray:
+        """All entries of `weighted`."""
+        return np.concatenate([np.ravel(r) for r in self.weighted])
+
+    @property
+    def measured(self) -> np.ndarray:
+        """Those that were measured."""
+        flat = self.flat
+        return flat[np.isfinite(flat)]
+
+    @property
+    def absolute(self) -> bool:
+        """Whether sigma was given."""
+        return all(e.sigma is not None for e in self.experiments)
+
+    def segments_of_each(self) -> list[list[tuple[int, int, int]]]:
+        """For each experiment its segments: batch, row in the batch, and number of samples of its own."""
+        samples = self.segments.samples or [e.ts.size for e in self.experiments]
+        places = self.problem.places
+        of_each: list[list[tuple[int, int, int]]] = [[] for _ in self.experiments]
+        for j, (i, count) in enumerate(zip(self.segments.of, samples, strict=True)):
+            of_each[i].append((*places[j], count))
+        return of_each
+
+
+@compiled
+def _theta_and_slope(free, y):
+    return free.theta(y), free.slope(y)
+
+
+def weighted_residuals(problem: Problem, found: Linearisation) -> Iterator[np.ndarray]:
+    """(measured − predicted) / sigma for each batch, flat for each experiment; NaN where nothing was measured."""
+    for batch, part in zip(problem.batches, found.batches, strict=True):
+        count = len(batch.members)  # copies of the last one may follow
+        values, sigma = jax.tree.map(lambda x, count=count: np.asarray(x)[:count], (batch.values, batch.sigma))
+        r = jax.tree.map(lambda z, p, s: (z - p) / s, values, part.channels, sigma)
+        yield np.concatenate([np.reshape(leaf, (count, -1)) for leaf in jax.tree.leaves(r)], axis=1)
+
+
+def robust_scale(found: Linearisation, problem: Problem) -> Array:
+    """The standard deviation of normal noise whose residuals have this median, which outliers do not affect."""
+    r = np.concatenate([np.ravel(r)[np.isfinite(np.ravel(r))] for r in weighted_residuals(problem, found)])
+    return jnp.asarray(1.4826 * np.median(np.abs(r)), problem.scale.dtype)

@@ -1,0 +1,102 @@
+"""The covariance of all unknowns at the minimum, and how correlated residuals enlarge it."""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from .autocorrelation import autoregression, coloured_information, correlation_length
+from .identifiability import Determined, Undetermined, determined_by, undetermined
+from .minimum import Minimum
+from .problem import failure_of, linearise
+
+
+class Uncertainty(NamedTuple):
+    """What is determined, with the covariance over σ²; the Jacobian behind it, None where there are too many unknowns.
+
+    `inflation`, (p,): the factor by which correlated residuals enlarge each standard error; `correlated`: over how many samples they are.
+    """
+
+    known: Determined
+    jacobian: np.ndarray | None
+    inflation: np.ndarray
+    correlated: int
+
+
+def uncertainty_of(minimum: Minimum) -> Uncertainty:
+    """From the Jacobian at the minimum, without the weight of the gaps between segments."""
+    p, size = minimum.size, minimum.x.size
+    J = _jacobian(minimum)
+    if J is None:
+        known = Determined(np.full((size, size), np.nan), np.ones(size, bool), np.zeros((size, 0)))
+        return Uncertainty(known, None, np.ones(p), 0)
+    known = determined_by(J, np.asarray(minimum.found.gaps_jacobian))
+    covariance, correlated = _sandwich(minimum, J, known.covariance)
+    after, before = (np.diag(c)[:p] for c in (covariance, known.covariance))
+    inflation = np.sqrt(np.where(before > 0, after / np.where(before > 0, before, 1), 1))
+    return Uncertainty(known._replace(covariance=covariance), J, inflation, correlated)
+
+
+def _jacobian(minimum):
+    """Of priors and residuals; those of a robust loss as if it were quadratic."""
+    if minimum.found.jacobian is None:
+        return None
+    p, flat, loss = minimum.size, minimum.flat, minimum.problem.model.loss
+    J = np.asarray(minimum.found.jacobian)[: p + flat.size].copy()
+    if loss is not None:
+        J[p:] /= loss.slope(np.where(np.isfinite(flat), flat, 0) / minimum.problem.scale)[:, None]
+    return J
+
+
+def _sandwich(minimum, J, covariance):
+    """The covariance over σ² of all unknowns, with the sandwich where residuals are correlated; and over how many samples they are."""
+    p, loss = minimum.size, minimum.problem.model.loss
+    weighted = minimum.weighted
+    if loss is not None:
+        weighted = [np.asarray(loss.influence(r / minimum.problem.scale)) for r in weighted]
+    begins = p + np.cumsum([0, *(r.size for r in weighted)])
+
+    def of_experiment(segments, rows_of):
+        """Rows of its segments one after the other, (samples, channels, ...)."""
+        return np.concatenate([_by_time(minimum.problem.batches[k], rows_of(k, row), n) for k, row, n in segments])
+
+    def jacobian_of(k, row):
+        begin = begins[k] + row * weighted[k].shape[1]
+        return J[begin : begin + weighted[k].shape[1]].astype(float)
+
+    segments_of_each = minimum.segments_of_each()
+    series = [of_experiment(segments, lambda k, row: weighted[k][row].astype(float)) for segments in segments_of_each]
+    lengths = [correlation_length(autoregression(r[np.isfinite(r)]), len(r)) for rs in series for r in rs.T]
+    if not any(lengths):
+        return covariance, 0
+    power = np.nanmean(np.concatenate([r.ravel() for r in series]) ** 2)
+    middle = J[:p].T @ J[:p]
+    for segments, r in zip(segments_of_each, series, strict=True):
+        sizes = np.ones(r.shape[1]) if minimum.absolute else np.sqrt(np.nanmean(r**2, axis=0) / power)
+        middle = middle + coloured_information(of_experiment(segments, jacobian_of), r, sizes)
+    return covariance @ middle @ covariance, max(lengths)
+
+
+def _by_time(batch, flat, samples):
+    """Rows of one experiment, one channel after the other, as (samples, channels, ...)."""
+    shapes = [leaf.shape[1:] for leaf in jax.tree.leaves(batch.values)]
+    parts = np.split(flat, np.cumsum([int(np.prod(shape)) for shape in shapes])[:-1])
+    by_time = [part.reshape(shape[0], -1, *flat.shape[1:]) for part, shape in zip(parts, shapes, strict=True)]
+    return np.concatenate(by_time, axis=1)[:samples]
+
+
+def undetermined_parameters(minimum: Minimum, uncertainty: Uncertainty) -> Undetermined | None:
+    """Which parameters are not determined, if any; a second point tells products from sums."""
+    free, p, null = minimum.problem.free, minimum.size, uncertainty.known.null
+    if uncertainty.jacobian is None or not np.any(null[:p]):
+        return None
+    nulls, thetas = [minimum.slope[:, None] * null[:p]], [minimum.theta]
+    elsewhere = jnp.asarray(minimum.x).at[:p].add(0.1 * jnp.cos(jnp.arange(p)))
+    found = linearise(minimum.problem, elsewhere)
+    if failure_of(found) is None:
+        there = determined_by(np.asarray(found.jacobian)[: len(found.residuals) - len(found.gaps)], np.asarray(found.gaps_jacobian))
+        nulls.append(np.asarray(free.slope(elsewhere[:p]))[:, None] * there.null[:p])
+        thetas.append(np.asarray(free.theta(elsewhere[:p])))
+    idle = np.flatnonzero(~np.any(uncertainty.jacobian[:, :p], axis=0)).tolist()
+    return undetermined(minimum.theta, nulls, thetas, idle)

@@ -1,0 +1,134 @@
+"""S⁺ of S = G M⁻¹ Gᵀ, whose rank is judged: rows of G may repeat each other, and nearly so.
+
+Differentiated at constant rank. Source: Golub & Pereyra, SIAM J. Numer. Anal. 10 (1973) 413.
+"""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+# Exponents of eps (1.3e-5, 1.6e-10, 1.8e-12 and 1.3e-6 in double precision) and a factor, with which ranks are judged
+CLEAR, SEEN, NOISE, FOLLOWS, FARTHER = 0.3125, 0.625, 0.75, 0.375, 2
+
+
+@jax.custom_batching.custom_vmap
+def everywhere(condition: Bool[Array, ""]) -> Bool[Array, ""]:
+    """A condition; in a batch, whether it holds for all members, so that a `cond` on it stays one and not the work of both branches."""
+    return condition
+
+
+@everywhere.def_vmap
+def _for_all_members(axis_size, in_batched, conditions):
+    return everywhere(jnp.all(conditions)), False
+
+
+class Request(NamedTuple):
+    """Of a constrained solve, in the metric of M: the `rows` of G, what is asked of them, the `free` motion without them, and, where
+    that is given, how far x may `reach` in directions that are barely held.
+    """
+
+    rows: Float[Array, "m n"]
+    c: Float[Array, "m k"]
+    free: Float[Array, "n k"]
+    reach: Float[Array, ""] | None
+
+
+class Inverse(NamedTuple):
+    """S⁺, of an S with rows of length 1/D: by the Cholesky factor of D S D where S is `regular`, else as root rootᵀ; of one row, D."""
+
+    regular: Bool[Array, ""]
+    D: Float[Array, " m"]
+    factor: Float[Array, "m m"]
+    root: Float[Array, "m m"]
+
+
+def inverse_of(S: Float[Array, "m m"], c: Float[Array, "m k"], singular: Callable) -> tuple[Inverse, Bool[Array, ""]]:
+    """S⁺ on the directions that are held, and whether what c asks of the others follows from these; `singular(D)` says so where the rank
+    is in question.
+
+    All is judged with rows scaled to unit length in the metric of M, so that it does not depend on the units of the constraints. Where
+    S − m √eps 1 has a Cholesky factorisation, that of S serves: no eigenvalue is below √eps of the largest, which is at most m.
+    """
+    m, eps, size = S.shape[0], jnp.finfo(S.dtype).eps, jnp.diagonal(S)
+    if m < 2:
+        D = jnp.where(size > 0, 1 / jnp.where(size > 0, size, 1), 0)
+        return Inverse(jnp.array(True), D, S, S), jnp.all((size > 0)[:, None] | (c == 0))
+    there = size > (4 * eps) ** 2 * jnp.max(size)  # a row of nothing but rounding has no part in it
+    D = jnp.where(there, jax.lax.rsqrt(jnp.where(there, size, 1)), 0)
+    nearly_zero = jnp.abs(c) <= eps**FOLLOWS * jnp.max(jnp.abs(c), axis=0, keepdims=True)
+    follows = jnp.all(there[:, None] | nearly_zero)
+    one, nothing = jnp.eye(m, dtype=S.dtype), jnp.zeros_like(S)
+    scaled = S * jnp.outer(D, D) + jnp.diag(~there).astype(S.dtype)
+    regular = everywhere(jnp.all(jnp.diagonal(jnp.linalg.cholesky(scaled - m * eps**0.5 * one)) > 0))
+    root, others_follow = jax.lax.cond(regular, lambda: (nothing, jnp.array(True)), lambda: singular(D))
+    return Inverse(regular, D, jnp.linalg.cholesky(jnp.where(regular, scaled, one)), root), follows & others_follow
+
+
+def by_rows(asked: Request, D) -> tuple[Float[Array, "m m"], Bool[Array, ""]]:
+    """A root of S⁺ by the singular values of the rows themselves, of which S holds the squares: rounding hides those below √eps there.
+
+    Values above `CLEAR` of the largest count. Those down to `SEEN` count where what they ask for is no more than `FARTHER` times all the
+    rest, or `reach`. Others are left out: below `NOISE`, where dependent rows have them by rounding, for good; above it, unsatisfied.
+    """
+    eps = jnp.finfo(D.dtype).eps
+    U, values, _ = jnp.linalg.svd(D[:, None] * asked.rows)
+    values = jnp.zeros_like(D).at[: values.size].set(values)
+    wanted, rest = D[:, None] * asked.c, U.T @ (D[:, None] * (asked.c - asked.rows @ asked.free))
+    clear, seen = values > eps**CLEAR * values[0], values > eps**SEEN * values[0]
+    step = rest / jnp.where(seen, values, 1)[:, None]
+    length = lambda x: jnp.linalg.norm(x, axis=0, keepdims=True)
+    bound = FARTHER * (length(asked.free) + length(jnp.where(clear[:, None], step, 0))) if asked.reach is None else asked.reach
+    held = clear | (seen & jnp.all(jnp.abs(step) <= bound, axis=1))
+    contradicts = jnp.abs(rest) > eps**FOLLOWS * (length(wanted) + length(asked.free))
+    satisfied = ~jnp.any(~held & ((values > eps**NOISE * values[0]) | jnp.any(contradicts, axis=1)))
+    return _by_values(values**2, U, held, D), satisfied
+
+
+def _by_values(values, U, held, D):
+    """R with R Rᵀ = (D⁻¹ A D⁻¹)⁺, for A = U diag(values) Uᵀ with what is not held taken out."""
+    size = jnp.where(held, jax.lax.rsqrt(jnp.where(held, values, 1)), 0)
+    # Least norm in the units given: take out of range and domain what lies in the null space of S, spanned by V.
+    V = jnp.where(held[None, :], 0, D[:, None] * U)
+    gram = jnp.linalg.cholesky(V.T @ V + jnp.diag(held | (jnp.sum(V**2, axis=0) == 0)).astype(D.dtype))
+    out = jnp.eye(len(D), dtype=D.dtype) - V @ jax.scipy.linalg.cho_solve((gram, True), V.T)
+    return out @ (D[:, None] * U * size[None, :])
+
+
+@jax.custom_jvp
+def applied(S: Float[Array, "m m"], inverse: Inverse, R: Float[Array, "m k"]) -> Float[Array, "m k"]:
+    """S⁺R; differentiated at constant rank."""
+    regular, D, factor, root = inverse
+    if len(D) < 2:
+        return D[:, None] * R
+    by_factor = D[:, None] * jax.scipy.linalg.cho_solve((factor, True), D[:, None] * R)
+    # A forward pass over a reverse one differentiates this body, not its rule: nothing is changed, but the derivative by S.
+    fixed = jax.lax.stop_gradient(S)
+    P = lambda X: root @ (root.T @ X)  # by parts: the product has lost the smaller values
+    N, change, X = lambda X: X - fixed @ P(X), S - fixed, P(R)
+    by_root = X - P(change @ X) + N(change @ P(X)) + P(P(change @ N(R)))
+    return jnp.where(regular, by_factor, by_root)
+
+
+@applied.defjvp
+def _applied_jvp(primals, tangents):
+    # Golub & Pereyra 1973, eq. 4.12, for constant rank: P = S⁺ turns with its null space, that of N = 1 − S P.
+    (S, inverse, R), (dS, _, dR) = primals, tangents
+    P = lambda X: applied(S, inverse, X)
+    N = lambda X: X - S @ P(X)
+    X = P(R)
+    return X, P(dR - dS @ X) + N(dS @ P(X)) + P(P(dS @ N(R)))
+
+
+def pseudo_inverse(S: Float[Array, "m m"]) -> Float[Array, "m m"]:
+    """Moore–Penrose inverse of a symmetric positive semidefinite S."""
+
+    def singular(D):
+        D = jax.lax.stop_gradient(D)
+        values, U = jnp.linalg.eigh(jax.lax.stop_gradient(S) * jnp.outer(D, D))
+        return _by_values(values, U, values > jnp.finfo(D.dtype).eps ** (2 * CLEAR) * values[-1], D), jnp.array(True)
+
+    one = jnp.eye(len(S), dtype=S.dtype)
+    return applied(S, inverse_of(S, jnp.zeros_like(S), singular)[0], one)

@@ -1,0 +1,150 @@
+"""The system over flat vectors: what the mechanics works on."""
+
+from collections.abc import Callable
+from functools import partial
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.flatten_util import ravel_pytree
+from jaxtyping import Array, Float, PyTree
+
+from .injection import asks_for, call, described
+from .system import System, role
+
+
+class Flat(NamedTuple):
+    """A system with its parameters, over flat vectors q, v of length n and λ of length m: what the mechanics works on."""
+
+    lagrangian: Callable[..., Float[Array, ""]]  # L(t, q, v)
+    dissipations: dict[str, Callable[..., Float[Array, ""]]]  # D(t, q, v, λ)
+    forces: dict[str, Callable[..., Float[Array, " n"]]]  # Q(t, q, v, λ)
+    holonomic: Callable[..., Float[Array, " h"]]  # g(t, q)
+    nonholonomic: Callable[..., Float[Array, " k"]]  # a(t, q, v)
+    position: Callable[..., PyTree]  # x(t, q) of a position map
+    unravel: Callable[[Float[Array, " n"]], PyTree]
+    unravel_multipliers: Callable[[Float[Array, " m"]], dict[str, PyTree]]
+    needs_multipliers: bool
+    holonomic_names: tuple[str, ...]
+    terms: tuple[str, ...]
+    rows: int  # of G, those of the user's constraints
+    held: dict[str, np.ndarray] = {}  # noqa: RUF012 - rows of G beyond those, with which a dissipation term sticks
+
+
+def bind(system: System, like: PyTree, params: PyTree) -> Flat:
+    """The system over flat vectors, for coordinates structured `like` these, which need be shapes only."""
+    bound = _Bound(system, like, params)
+    return Flat(
+        lagrangian=bound.lagrangian,
+        dissipations={name: partial(bound.dissipation, (name, D)) for name, D in system.dissipation},
+        forces={name: partial(bound.force, (name, Q)) for name, Q in system.force},
+        holonomic=bound.holonomic,
+        nonholonomic=bound.nonholonomic,
+        position=bound.position,
+        unravel=bound.unravel,
+        unravel_multipliers=bound.unravel_multipliers,
+        needs_multipliers=any(asks_for(function, "multipliers") for _, function in (*system.dissipation, *system.force)),
+        holonomic_names=tuple(name for name, _ in system.holonomic),
+        terms=system.terms,
+        rows=bound.rows,
+    )
+
+
+class _Bound:
+    """The functions of a system with their parameters, over flat vectors."""
+
+    def __init__(self, system: System, like: PyTree, params: PyTree):
+        self.system, self.params = system, params
+        self.zeros = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), like)
+        zero, self.unravel = ravel_pytree(self.zeros)
+        t = jnp.zeros((), zero.dtype)
+        shapes = [jax.eval_shape(lambda term=term: self.value("holonomic", term, t, zero, None)) for term in system.holonomic]
+        shapes += [jax.eval_shape(lambda term=term: self.value("nonholonomic", term, t, zero, zero)) for term in system.nonholonomic]
+        residuals, self.unravel_residuals = ravel_pytree([jax.tree.map(lambda s: jnp.zeros(s.shape, zero.dtype), s) for s in shapes])
+        self.rows = residuals.size
+
+    def value(self, slot, term, t, q, v, **more):
+        """What one of the user's functions returns."""
+        name, function = term
+        state = {"t": t, "q": self.unravel(q)} | ({} if v is None else {"qdot": self.unravel(v)}) | more
+        return call(function, role(slot, name), self.params, **state)
+
+    def lagrangian(self, t, q, v):
+        terms = (jnp.asarray(self.value("lagrangian", term, t, q, v), q.dtype) for term in self.system.lagrangian)
+        return sum(terms, start=jnp.zeros((), q.dtype))
+
+    def dissipation(self, term, t, q, v, multipliers):
+        return jnp.asarray(self.value("dissipation", term, t, q, v, multipliers=self.unravel_multipliers(multipliers)), q.dtype)
+
+    def force(self, term, t, q, v, multipliers):
+        given = self.value("force", term, t, q, v, multipliers=self.unravel_multipliers(multipliers))
+        return flat_like(self.zeros, role("force", term[0]), given)
+
+    def holonomic(self, t, q):
+        return self._residuals("holonomic", t, q, None)
+
+    def nonholonomic(self, t, q, v):
+        return self._residuals("nonholonomic", t, q, v)
+
+    def _residuals(self, slot, t, q, v):
+        parts = [ravel_pytree(self.value(slot, term, t, q, v))[0].astype(q.dtype) for term in getattr(self.system, slot)]
+        return jnp.concatenate([jnp.zeros(0, q.dtype), *parts])
+
+    def position(self, at, t, q):
+        return jax.tree.map(lambda x: jnp.asarray(x, q.dtype), call(at, "a position map", self.params, t=t, q=self.unravel(q)))
+
+    def unravel_multipliers(self, multipliers):
+        return dict(zip(self.system.constraints, self.unravel_residuals(multipliers[: self.rows]), strict=True))
+
+
+def flat_like(like: PyTree, label: str, given: PyTree) -> Float[Array, " n"]:
+    """What a force returned, as a flat vector in the order of the coordinates `like`.
+
+    Entries of mappings may be left out, lists stand for arrays, and a plain 0 for zeros of any shape.
+    """
+    parts = jax.tree_util.tree_flatten_with_path(given)[0]
+    places = jax.tree_util.tree_flatten_with_path(like)[0]
+    for path, _ in parts:
+        if not any(path[: len(place)] == place for place, _ in places):
+            at = jax.tree_util.keystr(path) or "without a name"
+            raise ValueError(f"{label} must be shaped like q, but returned an entry {at} that is not in q. {SHAPED}")
+    return jnp.concatenate([_part(place, leaf, parts, label) for place, leaf in places])
+
+
+SHAPED = "Return one entry for each coordinate; where q is a mapping, coordinates without a force may be left out."
+
+
+def _part(place, coordinate, parts, label):
+    """The force on one array of coordinates, flat."""
+    label, shape = f"{label}{jax.tree_util.keystr(place)}", coordinate.shape
+    own = [(path[len(place) :], x) for path, x in parts if path[: len(place)] == place]
+    if not own:
+        known = max((_common(place, path) for path, _ in parts), default=0)
+        if not (known < len(place) and isinstance(place[known], jax.tree_util.DictKey)):
+            raise ValueError(f"{label} must be real and of shape {shape}, but nothing was returned. {SHAPED}")
+        return jnp.zeros(coordinate.size, coordinate.dtype)
+    flat = []
+    for path, x in own:
+        rest = shape[len(path) :]
+        in_list = len(path) <= len(shape) and all(isinstance(key, jax.tree_util.SequenceKey) for key in path)
+        is_zero = isinstance(x, np.ndarray) and x.shape == () and x == 0  # a plain one
+        if not in_list or (x.shape != rest and not is_zero):
+            of = f" of {len(own)} entries with" if path else ""
+            raise ValueError(f"{label} must be real and of shape {shape}, but is{of} {described(x)}. {SHAPED}")
+        flat.append(jnp.ravel(jnp.broadcast_to(jnp.asarray(x, coordinate.dtype), rest)))
+    if sum(x.size for x in flat) != coordinate.size:
+        raise ValueError(f"{label} must be real and of shape {shape}, but has {len(own)} entries. {SHAPED}")
+    return jnp.concatenate(flat)
+
+
+def _common(one: tuple, other: tuple) -> int:
+    """How many keys two paths have in common."""
+    return next((i for i, pair in enumerate(zip(one, other, strict=False)) if pair[0] != pair[1]), min(len(one), len(other)))
+
+
+def rows_by_name(flat: Flat) -> dict[str, np.ndarray]:
+    """Which rows of G, and entries of λ, belong to which constraint."""
+    with jax.ensure_compile_time_eval():
+        rows = jax.tree.map(np.asarray, flat.unravel_multipliers(jnp.arange(flat.rows, dtype=float)))
+    return {name: np.concatenate([np.ravel(leaf) for leaf in jax.tree.leaves(rows[name])]).astype(int) for name in rows}

@@ -1,0 +1,43 @@
+"""The failure of a motion, raised as an error that says when, why, and what to do."""
+
+import jax
+import numpy as np
+
+from .._mechanics.friction_elements import unread_friction
+from .._mechanics.singular_directions import explained
+from .._program.jit import is_concrete
+from .results import OF_THE_INPUT, OF_THE_STEPS, reason_of
+from .trajectory import Trajectory
+
+
+def raise_failure(trajectory: Trajectory, start: tuple | None = None) -> None:
+    """Raises the reason of a failed motion, outside of compiled code; under `jit` the reason stays in the result.
+
+    Given the `start` (q0, qdot0), it names the coordinates concerned.
+    """
+    if not is_concrete(trajectory.result) or np.all(trajectory.succeeded):
+        return
+    reason = reason_of(trajectory.result)
+    if reason in map(reason_of, OF_THE_INPUT):
+        if start is None:
+            raise ValueError(reason)
+        q0, qdot0 = start
+        raise ValueError(explained(reason, trajectory.provenance.system, q0, qdot0, trajectory.provenance.params, trajectory.ts[0]))
+    samples, coordinate = trajectory.ts.shape[-1], np.asarray(jax.tree.leaves(trajectory.q)[0])
+    reached = np.isfinite(coordinate.reshape(-1, samples, coordinate.size // trajectory.ts.size)[..., 0]).sum(1).min()
+    numerics = (
+        "Allow more `max_steps`, inspect what was computed with `throw=False`, or use a solver for stiff systems, "
+        f"`solver=diffrax.Kvaerno5()`.{_unread_friction(trajectory)}"
+    )
+    raise RuntimeError(
+        f"the motion must reach t = {np.ravel(trajectory.ts)[-1]:g}, but stopped at t = {np.min(trajectory.stats['reached']):g} "
+        f"after {reached} of {samples} samples: {reason} {numerics if reason in map(reason_of, OF_THE_STEPS) else ''}".rstrip()
+    )
+
+
+def _unread_friction(trajectory: Trajectory) -> str:
+    """Dry friction of the system that was not recognised as such; of a batch, in its first motion."""
+    for _ in trajectory.ts.shape[1:]:
+        trajectory = jax.tree.map(lambda x: x[0], trajectory)
+    flat, (q, v) = trajectory._flat(), trajectory._vectors()
+    return "".join(f" And {finding}." for finding in unread_friction(flat, trajectory.ts[0], q[0], v[0], trajectory.friction))

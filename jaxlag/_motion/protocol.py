@@ -1,0 +1,75 @@
+"""What the integration asks of equations of motion: the protocol that a single motion, its variations and a batch of motions share."""
+
+from typing import Any, NamedTuple, Protocol, runtime_checkable
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, PyTree
+
+from .._mechanics.projection import Projection
+from .._model.signal import least_spacing
+
+
+class Scales(NamedTuple):
+    """What counts as small in a motion: tolerances, its duration, the sample spacing of its inputs, the rounding of its times."""
+
+    rtol: Any
+    atol: Any
+    duration: Any
+    spacing: Any
+    rounding: Any
+
+    @classmethod
+    def of(cls, tolerances: tuple[Array, Array], ts: Array, params: PyTree) -> "Scales":
+        """The scales of a motion at the times `ts`."""
+        end = jnp.maximum(jnp.abs(ts[0]), jnp.abs(ts[-1]))
+        rtol, atol = tolerances
+        found = cls(rtol, atol, ts[-1] - ts[0], least_spacing(params, ts.dtype), jnp.finfo(ts.dtype).eps * end)
+        return jax.lax.stop_gradient(found)
+
+    @property
+    def slow(self) -> Array:
+        """Per velocity, the slip below which its direction is not worth the many steps that resolving it would take.
+
+        Where elements begin to slide together, a velocity may be off by this much.
+        """
+        return 1e2 * self.atol
+
+    def error(self, v: Array) -> Array:
+        """Per velocity, the error of the integration: slip below it counts as rest where another element changes its mode."""
+        return 10 * (self.rtol * jnp.abs(v) + self.atol)
+
+
+class Arguments(NamedTuple):
+    """What the right-hand side depends on besides t and y: diffrax's `args`."""
+
+    params: PyTree  # of the system; in a batch, those that all members share
+    scales: Scales | None = None  # None where no event is located
+    own: PyTree = None  # in a batch, the params of each member, members last
+    directions: Any = None  # of the variational equations: the derivatives of (params, own), directions last
+
+
+@runtime_checkable
+class FirstOrderSystem(Protocol):
+    """ẏ = f(t, y) on a manifold, as the integration sees it."""
+
+    @property
+    def rows(self) -> int:
+        """How many slip velocities stick and slip; 0 where the right-hand side is smooth."""
+
+    @property
+    def size(self) -> int:
+        """n, the number of coordinates. The first 2n entries of y are positions and velocities: their error sets the steps."""
+
+    @property
+    def projection(self) -> Projection | None:
+        """What puts y back on the manifold, if there is one."""
+
+    def rates(self, t: Any, y: Array, args: Arguments) -> Array:
+        """ẏ."""
+
+    def projected(self, t: Any, y: Array, args: Arguments) -> Array:
+        """y, put back on the manifold."""
+
+    def error_norm(self, error: Array) -> Array:
+        """The size of an error of y."""

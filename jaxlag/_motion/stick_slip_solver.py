@@ -1,0 +1,179 @@
+"""Steps that end a mode of dry friction where it ends."""
+
+import functools
+from typing import Any, NamedTuple
+
+import diffrax as dfx
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from .._program.jit import jitted
+from .first_order import EquationsOfMotion
+from .results import RESULTS, under_diffrax
+from .step_monitor import Seen, first_end, is_hidden
+from .tableaux import Tableau
+from .wrapped_solver import ProjectedSolver
+
+# Phases of a step: the whole step, watched for the end of a mode; where one was seen, Newton's steps for its time, each of them the
+# step up to there (the first makes the time right and its derivative, the others its higher derivatives), after the last of which the
+# mode changes; and the rest of the step, watched for a second end.
+WHOLE, NEWTON, CHANGE, REST = range(4)
+PHASES = np.array([WHOLE, NEWTON, NEWTON, CHANGE, REST])
+SIMULTANEOUS = 1e3  # modes that end within this many roundings of time end together
+BARELY = 1e-6  # of the motion, the step that ends where a bound turns negative
+
+
+class SplitInterpolation(dfx.AbstractLocalInterpolation):
+    """Dense output of a step with a change of mode in it, at `cut`."""
+
+    t0: Any
+    t1: Any
+    cut: Any
+    first: Any
+    second: Any
+
+    def evaluate(self, t0, t1=None, left=True):
+        if t1 is not None:
+            return self.evaluate(t1) - self.evaluate(t0)
+        before = (t0 < self.cut) | ((t0 == self.cut) & left)
+        return jnp.where(before, self.first.evaluate(t0), self.second.evaluate(t0))
+
+
+class Piece(NamedTuple):
+    """A step or a part of one: its end, error, dense output, the state of the solver, and whether it succeeded."""
+
+    y: Any
+    error: Any
+    dense: Any
+    state: Any
+    result: dfx.RESULTS
+
+
+class Cut(NamedTuple):
+    """Where a step is cut: the time, and Newton's next estimate of it; y there in the next mode, and whether that mode is consistent;
+    whether the pieces on both sides can be used.
+    """
+
+    time: Any
+    estimate: Any
+    y: Any
+    consistent: Any
+    usable: Any
+
+
+class Split(NamedTuple):
+    """A step that may be cut: the pieces before and after the cut, the cut, and what was seen along the whole step."""
+
+    first: Piece
+    second: Piece
+    cut: Cut
+    seen: Seen
+
+
+class StickSlipSolver(ProjectedSolver):
+    """A `ProjectedSolver` that ends a mode of friction where it ends, inside the step.
+
+    The end of the mode is bracketed on the dense output, narrowed down there, and made exact by Newton's steps on the step itself, so
+    that it is differentiated; their slope is not, for it decides how fast they converge and not to what. From there the step goes on
+    in the new mode. A step with a second end is rejected. All phases are turns of one loop, so that the equations are compiled once.
+    """
+
+    equations: EquationsOfMotion = eqx.field(static=True)
+
+    @property
+    def interpolation_cls(self):
+        def pieces(*, t0, t1, cut, first, second):
+            make = self.solver.interpolation_cls
+            return SplitInterpolation(t0, t1, cut, make(t0=t0, t1=cut, **first), make(t0=jnp.where(cut < t1, cut, t0), t1=t1, **second))
+
+        return pieces
+
+    def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
+        y0, starts = self.restarted(t0, y0, args, made_jump)
+        piece = lambda *given: Piece(*self.projected_step(terms, *given[:3], args, *given[3:]))
+        given = t0, t1, y0, solver_state, jnp.asarray(made_jump)
+        nothing = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), jax.eval_shape(piece, *given))
+        no, zeros = jnp.array(False), jnp.zeros(self.equations.elements, y0.dtype)
+        uncut = Split(nothing, nothing, Cut(t1, t1, y0, no, no), Seen(no, no, no, jnp.asarray(t1, y0.dtype), zeros))
+
+        run = functools.partial(self._run, piece, given, args)
+        needed = lambda split, phase: jax.lax.cond((phase == WHOLE) | split.seen.ended, run, lambda split, _: split, split, phase)
+        split, _ = jax.lax.scan(lambda split, phase: (needed(split, phase), None), uncut, PHASES)
+        return self._joined(split, t0, t1, y0, args, starts)
+
+    def _run(self, piece, given, args, split: Split, phase) -> Split:
+        """One phase of the step."""
+        t0, t1, y0, state, made_jump = given
+        watched, rest = (phase == WHOLE) | (phase == REST), phase == REST
+        start, end = jnp.where(rest, split.cut.time, t0), jnp.where(watched, t1, split.cut.estimate)
+        state = jax.tree.map(lambda new, old: jnp.where(rest, new, old), split.first.state, state)
+        done = piece(start, end, jnp.where(rest, split.cut.y, y0), state, rest | made_jump)
+        watch = lambda: self._watch(split, done, start, end, args, rest)
+        locate = lambda: self._locate(split, done, end, t0, t1, args, phase == CHANGE)
+        return jax.lax.cond(watched, watch, locate)
+
+    def _watch(self, split: Split, done: Piece, start, end, args, rest) -> Split:
+        """What is seen along a piece: of the whole step when its mode ends, of the rest whether all is fine."""
+        seen = self._seen(start, end, done.dense, args, ~rest)
+        fine = ~(seen.ended | seen.unsure | seen.negative)
+        return jax.lax.cond(
+            rest,
+            lambda: split._replace(second=done, cut=split.cut._replace(usable=split.cut.usable & fine)),
+            lambda: split._replace(first=done, second=done, seen=seen, cut=split.cut._replace(estimate=seen.time)),
+        )
+
+    def _locate(self, split: Split, done: Piece, end, t0, t1, args, last) -> Split:
+        """A Newton step for the time at which the mode ends, from the margins at the end of the piece; after the last, the next mode."""
+        value, slope = self.equations.margins(end, done.y, args)[: self.equations.elements], split.seen.slope
+        falling = slope < 0
+        until = jnp.where(falling, jnp.abs(value) / jnp.where(falling, -slope, 1), jnp.inf)
+        nearest = jax.lax.stop_gradient(jnp.argmin(until))
+        estimate = end - value[nearest] / jnp.where(falling[nearest], slope[nearest], -jnp.inf)
+        usable = jnp.any(falling) & (end >= t0) & (end < t1)
+        located = split._replace(first=done, cut=split.cut._replace(time=end, estimate=estimate, usable=usable))
+        simultaneous = falling & (value <= -slope * SIMULTANEOUS * args.scales.rounding)
+        ended = (jnp.arange(value.size) == nearest) | simultaneous
+        return jax.lax.cond(last, lambda: self._change(located, ended, args), lambda: located)
+
+    def _change(self, split: Split, ended, args) -> Split:
+        """With the state in the mode that follows when those of the elements `ended` end."""
+        y, consistent, at_rest = self.equations.changed(split.cut.time, split.first.y, args, ended)
+        return split._replace(cut=split.cut._replace(y=y, consistent=consistent, usable=split.cut.usable & at_rest))
+
+    def _joined(self, split: Split, t0, t1, y0, args, starts):
+        """What diffrax asks of a step, from its pieces."""
+        (first, second, cut, seen), ended = split, split.seen.ended
+        error = jnp.where(ended, jnp.maximum(jnp.abs(first.error), jnp.abs(second.error)), first.error)
+        # Where a bound has turned negative, steps shrink until the motion has come as far as it goes.
+        shrinking = seen.negative & (t1 - t0 > BARELY * args.scales.duration)
+        rates = lambda t, y: self.equations.rates(t, y, args)
+        refused = (ended & ~cut.usable) | seen.unsure | shrinking
+        error = jnp.where(refused, jnp.inf, error)
+        error = jnp.where(is_hidden(rates, _nodes(self.solver), t0, t1, y0, args.scales), jnp.inf, error)
+        consistent = (~ended | cut.consistent | ~cut.usable) & starts
+        result = dfx.RESULTS.where(consistent, dfx.RESULTS.successful, under_diffrax(RESULTS.no_friction))
+        result = dfx.RESULTS.where(seen.negative & ~shrinking, under_diffrax(RESULTS.negative_bound), result)
+        result = dfx.RESULTS.where(self.equations.exhausted(second.y), under_diffrax(RESULTS.chattering), result)
+        result = dfx.RESULTS.where(first.result == dfx.RESULTS.successful, result, first.result)
+        dense = {"cut": jnp.where(ended, cut.time, t1), "first": first.dense, "second": second.dense}
+        return second.y, error, dense, second.state, result
+
+    @jitted
+    def _seen(self, t0, t1, dense, args, exactly):
+        """What is seen of the margins along a piece, on its dense output."""
+        t0, t1, dense, args = jax.lax.stop_gradient((t0, t1, dense, args))
+        path = self.solver.interpolation_cls(t0=t0, t1=t1, **dense)
+        margins = lambda t, y: self.equations.margins(t, y, args)
+        return first_end(margins, path.evaluate, t0, t1, self.equations.elements, args.scales, exactly)
+
+
+def _nodes(solver) -> np.ndarray:
+    """The times, from 0 to 1, of the stages of a step that its error is estimated from."""
+    tableau = getattr(solver, "tableau", None)
+    if tableau is None:
+        return np.linspace(0, 1, 5)
+    estimates = tableau.errors if isinstance(tableau, Tableau) else [tableau.b_error]
+    times = tableau.c if isinstance(tableau, Tableau) else [0.0, *tableau.c]
+    return np.unique(np.clip([c for weights in estimates for c, weight in zip(times, weights, strict=False) if weight], 0, 1))

@@ -1,0 +1,223 @@
+"""The equations of motion and their derivation, printed, typeset, and written as programs."""
+
+import dataclasses
+import functools
+import itertools
+import math
+from collections.abc import Iterable, Iterator
+from typing import Any
+
+import jax
+import numpy as np
+from jaxtyping import PyTree
+
+from .._model.deprecation import warn_renamed
+from .._program.expressions import filled
+
+MOST_OPERATIONS = 150  # of a solution that is still shown
+
+Section = list[tuple[str, str]]  # left and right sides
+
+
+@dataclasses.dataclass(frozen=True, eq=False, repr=False)
+class Equations:
+    r"""The equations of motion of a system on paper, as `equations` returns them. `print` shows them, a notebook typesets them.
+
+    $$ M\ddot q = f + G^T\lambda, \qquad G\ddot q = -\gamma $$
+
+    Formulas are SymPy expressions in the symbols below; n coordinates remain, and m constraints. Any consistent set of units.
+
+    - `with_multipliers`: whether all multipliers were kept (Lagrange's equations of the first kind).
+    - `t`: the symbol of time; `q`, `qdot`, `qddot`: those of the n coordinates and their derivatives, as tuples.
+    - `params`: the symbols of the parameters, structured like `params`.
+    - `L`, `D`, `Q` (n), `g`, `a`: the Lagrangian, the sum of all dissipation functions, the applied forces, and the holonomic and the
+      nonholonomic constraints that remain, zero for each row.
+    - `M` (n, n), `f` (n), `G` (m, n), `gamma` (m): the matrices and vectors of the equations above.
+    - `motion`: the equations of motion, one `sympy.Eq` for each coordinate.
+    - `eliminated`: the coordinates that constraints express by the remaining ones, and their formulas.
+
+    ```python
+    import jaxlag as jl
+    from jaxlag.examples import pendulum
+    on_paper = jl.equations(pendulum.polar, {"r", "phi"}, {"m", "l", "g"})
+    print(on_paper)
+    on_paper.multipliers["rod"]  # −m l φ̇² − m g cos φ
+    ```
+    """
+
+    with_multipliers: bool
+    t: Any
+    q: tuple
+    qdot: tuple
+    qddot: tuple
+    params: PyTree
+    L: Any
+    D: Any
+    Q: Any
+    g: Any
+    a: Any
+    M: Any
+    f: Any
+    G: Any
+    gamma: Any
+    motion: tuple
+    eliminated: dict
+    _details: "Details"
+
+    @property
+    def style(self) -> str:
+        """The old name of `with_multipliers`: "first kind" or "second kind"."""
+        warn_renamed("Equations.style", "Equations.with_multipliers")
+        return "first kind" if self.with_multipliers else "second kind"
+
+    @property
+    def accelerations(self) -> PyTree:
+        """Formulas of q̈, structured like q; the symbol itself where its formula would be too long to read."""
+        details = self._details
+        formulas = iter([details.simplify(formula.xreplace(details.solution)) for formula in details.qddot])
+        return jax.tree.map(lambda symbols: arranged(symbols.shape, formulas), details.structure)
+
+    @property
+    def multipliers(self) -> dict[str, PyTree]:
+        """Formulas of λ by the constraint's name, structured like g or a; the symbol itself where its formula would be too long to read."""
+        details = self._details
+        formulas = [details.solution.get(symbol, symbol) for symbol in details.multipliers]
+        return jax.tree.map(lambda rows: arranged(rows.shape, (formulas[row] for row in rows.flat)), details.multiplier_rows)
+
+    def derivation(self) -> "Derivation":
+        """The steps on paper: for each coordinate ∂L/∂q̇, d/dt ∂L/∂q̇, ∂L/∂q, ∂D/∂q̇ and Q, then its equation of motion."""
+        return Derivation(self)
+
+    def __repr__(self) -> str:
+        from .unicode_printer import Unicode
+
+        return _lines(self._sections(Unicode(self._details.notation)))
+
+    def latex(self) -> str:
+        """LaTeX of what `print` shows: an `aligned` environment (amsmath)."""
+        from .latex_printer import Latex
+
+        return _aligned(self._sections(Latex(self._details.notation)))
+
+    def _repr_latex_(self) -> str:
+        return f"$${self.latex()}$$"
+
+    def to_python(self) -> str:
+        """The source of `acceleration(t, q, qdot, params)`, which returns q̈ and λ as arrays and needs NumPy only.
+
+        `q` and `qdot` (n) hold the coordinates in the order of `Equations.q`; `params` is structured as it was for `equations`.
+
+        **Raises:** `ValueError` where NumPy lacks a function, or where λ enters nonlinearly and has no formula.
+        """
+        from .codegen import to_python
+
+        return to_python(self._program())
+
+    def to_c(self) -> str:
+        """The source of `void acceleration(t, q, qdot, params, qddot, multipliers)` in C99; a comment lists the entries in order.
+
+        **Raises:** `ValueError` where C lacks a function, or where λ enters nonlinearly and has no formula.
+        """
+        from .codegen import to_c
+
+        return to_c(self._program())
+
+    def _program(self) -> Any:
+        from .codegen import Program
+
+        details = self._details
+        return Program(self.t, self.q, self.qdot, self.qddot, details.paths, details.multipliers, details.residuals, details.solution)
+
+    def _sections(self, printer: Any) -> Iterator[Section]:
+        """Eliminated coordinates; equations of motion and constraints; where there are multipliers, the solution for q̈ and λ."""
+        details = self._details
+        equal = lambda left, right: (printer.doprint(left), printer.doprint(right))
+        yield [equal(x, formula) for x, formula in self.eliminated.items()]
+        yield [*(equal(e.lhs, e.rhs) for e in self.motion), *((printer.doprint(residual), "0") for residual in (*self.g, *self.a))]
+        if details.multipliers:
+            solution = [(x, details.solution[x]) for x in (*self.qddot, *details.multipliers) if x in details.solution]
+            yield [equal(x, formula) for x, formula in solution if formula.count_ops() < MOST_OPERATIONS]
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Details:
+    """What `Equations` are made from."""
+
+    steps: Any  # `derivation.Steps`: SymPy is not imported here
+    free: tuple  # symbols of the accelerations that remain
+    qddot: tuple  # formulas of all accelerations in terms of these
+    multipliers: tuple  # symbols, of all constraints
+    residuals: tuple  # zero for the right q̈ and λ
+    structure: PyTree[np.ndarray]  # symbols like q
+    multiplier_rows: dict[str, PyTree[np.ndarray]]  # the indices of each constraint's multipliers
+    paths: list  # each parameter's symbol and how Python reaches it
+    simplify: Any  # `simplify.Simplifier`
+    notation: Any  # `notation.Notation`
+
+    @functools.cached_property
+    def solution(self) -> dict:
+        """Formulas of q̈ and λ, where they are short enough to read."""
+        from .linear_solve import solve_linear
+
+        return solve_linear(self.residuals, (*self.free, *self.multipliers), self.simplify)
+
+
+class Derivation:
+    """The steps from L, D and Q to the equations of motion. `print` shows them, a notebook typesets them.
+
+    ```python
+    import jaxlag as jl
+    spring = jl.System(lambda q, qdot, m, c: 0.5 * m * qdot**2 - 0.5 * c * q**2)
+    print(jl.equations(spring, "x", {"m", "c"}).derivation())
+    ```
+    """
+
+    def __init__(self, equations: Equations):
+        self._equations = equations
+
+    def __repr__(self) -> str:
+        from .unicode_printer import Unicode
+
+        return _lines(self._sections(Unicode(self._equations._details.notation)))
+
+    def latex(self) -> str:
+        """LaTeX of what `print` shows: an `aligned` environment (amsmath)."""
+        from .latex_printer import Latex
+
+        return _aligned(self._sections(Latex(self._equations._details.notation)))
+
+    def _repr_latex_(self) -> str:
+        return f"$${self.latex()}$$"
+
+    def _sections(self, printer: Any) -> Iterator[Section]:
+        e, text = self._equations, printer.doprint
+        steps, simplify = e._details.steps, e._details.simplify
+        readable = lambda given: min(given, simplify(given), key=lambda formula: formula.count_ops() * (1 if formula is given else 2))
+        yield [(text(x), text(formula)) for x, formula in e.eliminated.items()]
+        yield [(name, text(readable(energy))) for name, energy in (("L", e.L), ("D", e.D)) if name == "L" or energy != 0]
+        for i, (x, v) in enumerate(zip(e.q, e.qdot, strict=True)):
+            lines = [
+                (printer.partial("L", v), steps.momentum[i]),
+                (printer.time_derivative(printer.partial("L", v)), steps.momentum_rate[i]),
+                (printer.partial("L", x), steps.gradient[i]),
+                *([(printer.partial("D", v), steps.damping[i])] if e.D != 0 else []),
+                *([(printer.with_index("Q", x), e.Q[i])] if any(e.Q) else []),
+                *([(printer.reaction(x), steps.reaction[i])] if any(steps.reaction) else []),
+                (text(e.motion[i].lhs), e.motion[i].rhs),
+            ]
+            yield [(left, text(right)) for left, right in lines]
+
+
+def arranged(shape: tuple, formulas: Iterable) -> Any:
+    """The next formulas as an array of a shape, or a single one."""
+    array = filled(shape, itertools.islice(formulas, math.prod(shape)))
+    return array if shape else array[()]
+
+
+def _lines(sections: Iterable[Section]) -> str:
+    return "\n\n".join("\n".join(f"{left} = {right}" for left, right in section) for section in sections if section)
+
+
+def _aligned(sections: Iterable[Section]) -> str:
+    rows = [f"{left} &= {right}" for section in sections for left, right in section]
+    return "\\begin{aligned}\n" + " \\\\\n".join(rows) + "\n\\end{aligned}"

@@ -1,0 +1,78 @@
+"""The one walk over a jaxpr, for values of any kind, and what jaxprs call: bodies, branches, the turns of a loop.
+
+`walk` keeps the environment of variables, in which constants and inputs stand first. What the values are (arrays, expression nodes,
+intervals, sums of matrix products, numbers of quantities) and what an equation does with them is left to the caller.
+"""
+
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from typing import Any
+
+from jax.extend import core
+
+CALLS = ("jit", "pjit", "closed_call", "core_call", "remat", "remat2", "checkpoint")  # equations that call a program and do nothing else
+CALLS_WITH_DERIVATIVE_RULE = ("custom_jvp_call", "custom_vjp_call", "custom_vjp_call_jaxpr")
+
+
+def walk(
+    program: Any,
+    inputs: Iterable[Any],
+    evaluate: Callable[[Any, list[Any]], Iterable[Any]],
+    constant: Callable[[Any], Any] = lambda value: value,
+    literal: Callable[[Any], Any] = lambda atom: atom.val,
+    stop: int | None = None,
+) -> list[Any]:
+    """The outputs of a jaxpr, closed or not, over values of any kind.
+
+    **Arguments:** `evaluate(equation, operands)` gives the outputs of one equation; `constant(value)` and `literal(atom)` turn what the
+    program has of its own into values. With `stop`, the equations from that number on are left out, and there are no outputs.
+    """
+    jaxpr, constants = getattr(program, "jaxpr", program), map(constant, getattr(program, "consts", ()))
+    environment = dict(zip([*jaxpr.constvars, *jaxpr.invars], [*constants, *inputs], strict=True))
+    read = lambda atom: literal(atom) if isinstance(atom, core.Literal) else environment[atom]  # type: ignore[attr-defined]
+    for equation in jaxpr.eqns[:stop]:
+        environment.update(zip(equation.outvars, evaluate(equation, [read(atom) for atom in equation.invars]), strict=True))
+    return [read(atom) for atom in jaxpr.outvars] if stop is None else []
+
+
+def constants_as_inputs(closed: Any) -> Any:
+    """The jaxpr of a closed one, with its constants as inputs, which come first."""
+    return closed.jaxpr.replace(constvars=[], invars=[*closed.jaxpr.constvars, *closed.jaxpr.invars])
+
+
+def called_program(equation: Any) -> Any:
+    """The program that an equation calls, closed."""
+    p = equation.params
+    program = p["jaxprs"].solve if "jaxprs" in p else next(p[name] for name in ("jaxpr", "call_jaxpr", "fun_jaxpr") if name in p)
+    return program if hasattr(program, "consts") else core.ClosedJaxpr(program, ())
+
+
+def branch_index(index: Any, params: dict) -> int:
+    """The number of the branch that a `cond` takes."""
+    return min(max(int(index), 0), len(params["branches"]) - 1)
+
+
+def unrolled_scan(
+    params: dict, operands: Sequence[Any], turn: Callable[[list[Any]], Any], row: Callable[[Any, int], Any] = lambda x, k: x[k]
+) -> tuple[list[Any], list[tuple]]:
+    """The last carry of a `scan`, and the columns of its rows, in the order in which they are stacked: turn(inputs) once for each row."""
+    i, j = params["num_consts"], params["num_consts"] + params["num_carry"]
+    carry, rows = list(operands[i:j]), {}
+    for k in reversed(range(params["length"])) if params["reverse"] else range(params["length"]):
+        outputs = turn([*operands[:i], *carry, *(row(x, k) for x in operands[j:])])
+        carry, rows[k] = outputs[: j - i], outputs[j - i :]
+    return carry, list(zip(*(rows[k] for k in sorted(rows)), strict=True))
+
+
+def primitive_names(program: Any) -> Iterator[str]:
+    """The names of all primitives in a program, those of the programs it calls included."""
+    for equation in getattr(program, "jaxpr", program).eqns:
+        yield equation.primitive.name
+        for value in equation.params.values():
+            for part in value if isinstance(value, (tuple, list)) else [value]:
+                if hasattr(part, "eqns") or hasattr(part, "jaxpr"):
+                    yield from primitive_names(part)
+
+
+def count_equations(program: Any) -> int:
+    """The number of equations, those of the programs it calls included."""
+    return sum(1 for _ in primitive_names(program))
