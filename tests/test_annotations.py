@@ -28,7 +28,7 @@ def public_functions():
                     yield f"{prefix}{name}{member}", function
 
 
-@pytest.mark.parametrize("name, function", public_functions())
+@pytest.mark.parametrize("name, function", list(public_functions()))
 def test_it_is_annotated(name, function):
     signature = inspect.signature(function)
     parameters = [p for p in signature.parameters.values() if p.name not in ("self", "cls")]

@@ -106,7 +106,6 @@ def test_potential_is_the_integral_of_the_force(case, v):
         np.testing.assert_allclose(D, work, rtol=0, atol=1e-12 + error)
 
 
-@pytest.mark.fast
 @every_case
 @scalars_and_vectors
 def test_force_and_its_slope_are_those_of_the_closed_form(case, v):

@@ -52,7 +52,7 @@ class Projection:
     def feedback(self) -> None:
         """None: the accelerations remain unchanged."""
 
-    def project(self, flat: Flat, t, q, v):
+    def project(self, flat: Flat, t: Any, q: Float[Array, " n"], v: Float[Array, " n"]) -> tuple[Float[Array, " n"], Float[Array, " n"]]:
         """The state on the constraints that is nearest to this one, which is near already."""
         M = inertia(flat, t, q, v)[0]  # at the start serves throughout: corrections are small
         if flat.holonomic_names:

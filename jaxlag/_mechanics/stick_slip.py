@@ -233,11 +233,11 @@ class StickSlip:
     def __post_init__(self):
         count(self.max_transitions, "`max_transitions`", least=0, cure="The default is 10_000.")
 
-    def elements(self, flat: Flat, t, q, v) -> FrictionElements | None:
+    def elements(self, flat: Flat, t: Any, q: Float[Array, " n"], v: Float[Array, " n"]) -> FrictionElements | None:
         """What sticks and slips."""
         return find_elements(flat, t, q, v)
 
-    def smoothed(self, flat: Flat, t, q, v) -> Flat:
+    def smoothed(self, flat: Flat, t: Any, q: Float[Array, " n"], v: Float[Array, " n"]) -> Flat:
         """The system itself: without elements that stick there is nothing to smooth."""
         return flat
 
@@ -267,10 +267,10 @@ class Regularised:
         width = number(self.width, "`width`", positive=True, cure="Take some thousandths of the velocities that occur.")
         object.__setattr__(self, "width", float(width))
 
-    def elements(self, flat: Flat, t, q, v) -> None:
+    def elements(self, flat: Flat, t: Any, q: Float[Array, " n"], v: Float[Array, " n"]) -> None:
         """None: nothing sticks."""
 
-    def smoothed(self, flat: Flat, t, q, v) -> Flat:
+    def smoothed(self, flat: Flat, t: Any, q: Float[Array, " n"], v: Float[Array, " n"]) -> Flat:
         """The system with smooth friction."""
         elements = find_elements(flat, t, q, v)
         if elements is None:

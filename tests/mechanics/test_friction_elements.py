@@ -70,7 +70,6 @@ THREE_POINTS = {
 }
 
 
-@pytest.mark.fast
 @pytest.mark.parametrize("D", THREE_POINTS.values(), ids=THREE_POINTS)
 def test_three_sliding_points(D):
     """Each has a force of its own, −k s/‖s‖; written on arrays, they were taken for one point in six dimensions, or refused."""

@@ -9,8 +9,6 @@ from jax.flatten_util import ravel_pytree
 import jaxlag as jl
 from jaxlag.examples import pendulum, vehicle
 
-pytestmark = pytest.mark.fast
-
 
 def vehicle_by_hand(q, qdot, p):
     """The lecture's three equations of motion, solved for the accelerations."""
@@ -22,6 +20,7 @@ def vehicle_by_hand(q, qdot, p):
     }
 
 
+@pytest.mark.fast
 def test_vehicle_has_the_equations_of_the_lecture():
     rng = np.random.default_rng(1)
     draw = lambda size: {k: rng.normal(0, size, 1000) for k in ("x", "y", "phi")}
@@ -34,6 +33,7 @@ def test_vehicle_has_the_equations_of_the_lecture():
         np.testing.assert_allclose(found[name], expected[name], rtol=1e-12, atol=1e-12 * scale)
 
 
+@pytest.mark.fast
 def test_pendulum_has_the_equations_of_the_lecture():
     rng = np.random.default_rng(2)
     for _ in range(20):
@@ -55,6 +55,7 @@ def moving_charge(t, q, qdot, m, B):
     return 0.5 * m * (1 + t**2) * (vx**2 + vy**2) + 0.5 * B * (x * vy - y * vx) + jnp.cos(3 * t) * x * vx + 0.25 * m * qdot["s"] ** 2
 
 
+@pytest.mark.fast
 def test_every_term_of_the_force_against_a_derivation_by_hand():
     t, m, B = 0.7, 1.3, 2.1
     q, qdot = {"r": jnp.array([0.4, -0.8]), "s": jnp.array(0.1)}, {"r": jnp.array([1.5, 0.3]), "s": jnp.array(-2.0)}
@@ -74,6 +75,7 @@ def test_every_term_of_the_force_against_a_derivation_by_hand():
     np.testing.assert_allclose(found["s"], np.sin(t) / (0.5 * m), rtol=1e-13)
 
 
+@pytest.mark.fast
 def test_mass_matrix_momentum_and_energy():
     q, qdot = pendulum.polar_state(0.4, 1.7, 0.8)
     p = {"m": 1.5, "l": 0.8, "g": 9.81}
@@ -84,6 +86,7 @@ def test_mass_matrix_momentum_and_energy():
     np.testing.assert_allclose(jl.energy(pendulum.polar, q, qdot, p), by_hand, rtol=1e-14)
 
 
+@pytest.mark.fast
 def test_constraint_functions_of_moving_and_rolling_constraints():
     system = jl.System(
         lambda qdot: 0.5 * qdot @ qdot,
@@ -101,6 +104,7 @@ def test_constraint_functions_of_moving_and_rolling_constraints():
     np.testing.assert_allclose(velocity["edge"], 0.2 * 0.9 + 0.3 * 0.5 + 2, rtol=1e-14)
 
 
+@pytest.mark.fast
 def test_drive_force_of_a_prescribed_motion():
     """m ẍ = λ with x = sin(3t): the multiplier is the drive force −9 m sin(3t)."""
     system = jl.System(lambda qdot, m: 0.5 * m * qdot**2, holonomic={"drive": lambda t, q: q - jnp.sin(3 * t)})

@@ -74,7 +74,6 @@ def test_constraints():
     all_equal(each(lambda x: (rolling(x).qddot, rolling(x).multipliers["nonholonomic"][1]), NUMBERS), [0.0, 5.0, -3.0])
 
 
-@pytest.mark.fast
 def test_points_and_efforts():
     """δW = F · δx of a point (q₀, 3): the second component does none."""
     working = lambda point, effort: accelerated(ONES, REST, force=jl.virtual_work(point, effort)).qddot
