@@ -1,6 +1,6 @@
-"""Tests run in double precision, with strict ranks and every shape annotation checked.
+"""Tests run in double precision, without implicit broadcasting of ranks, and with every shape annotation checked.
 
-They are compiled as README advises for a CPU, in two thirds of the time; `program/test_jit` compares with the compiler's default.
+They are compiled with the flag that README recommends for a CPU, in two thirds of the time; `program/test_jit` compares with the default.
 """
 
 import os
@@ -10,7 +10,7 @@ import jaxlib
 import pytest
 from jaxtyping import install_import_hook
 
-if tuple(map(int, jaxlib.__version__.split(".")[:2])) <= (0, 10):  # a flag that XLA does not know ends the process
+if tuple(map(int, jaxlib.__version__.split(".")[:2])) <= (0, 10):  # an unknown flag would end the process
     os.environ["XLA_FLAGS"] = f"--xla_cpu_use_fusion_emitters=false {os.environ.get('XLA_FLAGS', '')}"
 
 jax.config.update("jax_enable_x64", True)
@@ -22,7 +22,7 @@ with install_import_hook("jaxlag", "beartype.beartype"):
 
 @pytest.fixture(autouse=True, scope="module")
 def fresh_caches():
-    """Lets go of what a file has compiled: each program holds memory maps, of which a process may have some 65 000 only."""
+    """Releases what a file has compiled: each program holds memory maps, of which a process may have only some 65 000."""
     yield
     jax.clear_caches()
 

@@ -24,8 +24,8 @@ class Determined(NamedTuple):
     null: np.ndarray
 
 
-def determined_by(J: np.ndarray, gaps_J: np.ndarray) -> Determined:
-    """(JᵀJ)⁻¹ among the changes that open no gap, without the directions that do not show."""
+def determined_by(J: np.ndarray, gaps_J: np.ndarray, hidden: int | None = None) -> Determined:
+    """(JᵀJ)⁻¹ among the changes that open no gap, without the directions that do not show; how many these are, unless `hidden` says so."""
     zero = max(ZERO, ZERO_ULPS * float(np.finfo(J.dtype).eps))
     J, gaps_J = J.astype(float), gaps_J.astype(float)
     size = np.linalg.norm(J, axis=0)
@@ -37,7 +37,7 @@ def determined_by(J: np.ndarray, gaps_J: np.ndarray) -> Determined:
     R = np.linalg.qr(np.asarray(J) * scale @ basis, mode="r")  # has the singular values of all the rows
     _, s, Vt = np.linalg.svd(R)
     s = np.concatenate([s, np.zeros(basis.shape[1] - s.size)])
-    weak = s <= zero * max(s[0], 1e-300)
+    weak = s <= zero * max(s[0], 1e-300) if hidden is None else np.arange(s.size) >= s.size - hidden
     directions = basis @ Vt.T
     inverse = directions[:, ~weak] / s[~weak] ** 2 @ directions[:, ~weak].T
     null = directions[:, weak]

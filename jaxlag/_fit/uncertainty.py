@@ -95,7 +95,8 @@ def undetermined_parameters(minimum: Minimum, uncertainty: Uncertainty) -> Undet
     elsewhere = jnp.asarray(minimum.x).at[:p].add(0.1 * jnp.cos(jnp.arange(p)))
     found = linearise(minimum.problem, elsewhere)
     if failure_of(found) is None:
-        there = determined_by(np.asarray(found.jacobian)[: len(found.residuals) - len(found.gaps)], np.asarray(found.gaps_jacobian))
+        J = np.asarray(found.jacobian)[: len(found.residuals) - len(found.gaps)]
+        there = determined_by(J, np.asarray(found.gaps_jacobian), hidden=null.shape[1])
         nulls.append(np.asarray(free.slope(elsewhere[:p]))[:, None] * there.null[:p])
         thetas.append(np.asarray(free.theta(elsewhere[:p])))
     idle = np.flatnonzero(~np.any(uncertainty.jacobian[:, :p], axis=0)).tolist()

@@ -11,7 +11,7 @@ import pytest
 from scipy import optimize, stats
 
 import jaxlag as jl
-from jaxlag._fit import levenberg_marquardt
+from jaxlag._fit import identifiability, levenberg_marquardt
 
 FREE = ("c", "b")
 
@@ -456,3 +456,14 @@ def test_an_unknown_start_is_found_within_its_bounds():
 def test_ratios_are_named_in_single_precision(single_precision):
     found = fit(osc.record(0), osc.START | {"m": 1.3}, free=("b", "c", "m"))
     assert found.remarks == ["only b/m and c/m are determined; their common factor is not"]
+
+
+def test_a_direction_that_is_known_to_be_hidden_is_found_beneath_the_error_of_integration():
+    """b, c and M act as b/M and c/M: an integration at its limit of stability leaves 5e-9 where the Jacobian is zero."""
+    rng = np.random.default_rng(1)
+    hidden = np.array([0.3, 0.4, 0.5])
+    J = rng.standard_normal((50, 3))
+    J -= np.outer(J @ hidden, hidden) / (hidden @ hidden) * (1 - 5e-9)
+    assert identifiability.determined_by(J, np.zeros((0, 3))).null.shape == (3, 0)
+    (direction,) = identifiability.determined_by(J, np.zeros((0, 3)), hidden=1).null.T
+    np.testing.assert_allclose(direction / direction[0], hidden / hidden[0], rtol=1e-6)
