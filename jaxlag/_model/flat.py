@@ -11,7 +11,7 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, PyTree
 
 from .injection import asks_for, call, described
-from .system import System, role
+from .system import CONSTRAINT_SLOTS, System, role
 
 
 class Flat(NamedTuple):
@@ -59,8 +59,11 @@ class _Bound:
         self.zeros = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), like)
         zero, self.unravel = ravel_pytree(self.zeros)
         t = jnp.zeros((), zero.dtype)
-        shapes = [jax.eval_shape(lambda term=term: self.value("holonomic", term, t, zero, None)) for term in system.holonomic]
-        shapes += [jax.eval_shape(lambda term=term: self.value("nonholonomic", term, t, zero, zero)) for term in system.nonholonomic]
+        shapes = [
+            jax.eval_shape(lambda slot=slot, term=term, v=zero if has_velocity else None: self.value(slot, term, t, zero, v))
+            for slot, has_velocity in CONSTRAINT_SLOTS.items()
+            for term in getattr(system, slot)
+        ]
         residuals, self.unravel_residuals = ravel_pytree([jax.tree.map(lambda s: jnp.zeros(s.shape, zero.dtype), s) for s in shapes])
         self.rows = residuals.size
 

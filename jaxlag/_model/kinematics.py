@@ -14,7 +14,7 @@ from .._program.jit import is_concrete
 from .flat import flat_like
 from .injection import asks_for, call, check_function
 from .numbers import numbers
-from .system import System, Terms, role
+from .system import CONSTRAINT_SLOTS, System, Terms, role
 
 
 def rate(coordinate: Callable) -> Callable:
@@ -115,8 +115,7 @@ def substitute(system: System, coordinates: Callable) -> System:
         pulled("lagrangian", _PulledBack),
         dissipation=pulled("dissipation", _PulledBack),
         force=pulled("force", _PulledForce),
-        holonomic=pulled("holonomic", _PulledPosition),
-        nonholonomic=pulled("nonholonomic", _PulledBack),
+        **{slot: pulled(slot, _PulledBack if has_velocity else _PulledPosition) for slot, has_velocity in CONSTRAINT_SLOTS.items()},
         one_sided=system.one_sided,
     )
 

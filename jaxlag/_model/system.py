@@ -10,6 +10,7 @@ from .pickling import picklable, unpickled
 Terms = tuple[tuple[str, Callable], ...]
 Slot = Any  # a function, a mapping from names to functions, or None: `_terms` checks it
 SLOTS = ("lagrangian", "dissipation", "force", "holonomic", "nonholonomic")
+CONSTRAINT_SLOTS = {"holonomic": False, "nonholonomic": True}  # in the order of the rows of G; whether velocities are given to it
 EXPLICIT_TIME = "time"  # the name, among the powers, of the energy that enters through explicit time in L
 
 
@@ -115,7 +116,7 @@ class System:
     @property
     def constraints(self) -> tuple[str, ...]:
         """Names of all constraints, in the order of the rows of G."""
-        return tuple(name for name, _ in (*self.holonomic, *self.nonholonomic))
+        return tuple(name for slot in CONSTRAINT_SLOTS for name, _ in getattr(self, slot))
 
     @property
     def terms(self) -> tuple[str, ...]:

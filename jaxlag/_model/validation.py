@@ -14,7 +14,7 @@ from .._program.jit import compiled, is_concrete
 from .flat import Flat, bind, flat_like
 from .injection import call, check_entries, described, missing
 from .numbers import number, numbers
-from .system import SLOTS, System, role
+from .system import CONSTRAINT_SLOTS, SLOTS, System, role
 from .user_errors import warn_of_recreated_functions
 
 
@@ -125,9 +125,9 @@ def check(system: System, t: Array, q: PyTree[Array], qdot: PyTree[Array], param
                     f"{role(slot, name)} must return a real scalar, but returned {described(out)}. "
                     "Did you forget to sum, e.g. `qdot @ qdot`?"
                 )
-    for slot in ("holonomic", "nonholonomic"):
+    for slot, has_velocity in CONSTRAINT_SLOTS.items():
         for name, function in getattr(system, slot):
-            velocity = {} if slot == "holonomic" else {"qdot": qdot}
+            velocity = {"qdot": qdot} if has_velocity else {}
             out = _shape_of(function, role(slot, name), params, t=t, q=q, **velocity)
             if not jax.tree.leaves(out):
                 raise ValueError(
@@ -162,7 +162,9 @@ def checked(system: System, t: Array, q: PyTree, qdot: PyTree, params: PyTree) -
 
 def _multipliers(system, t, q, qdot, params):
     slots = [
-        (role(s, n), f, {} if s == "holonomic" else {"qdot": qdot}) for s in ("holonomic", "nonholonomic") for n, f in getattr(system, s)
+        (role(s, n), f, {"qdot": qdot} if has_velocity else {})
+        for s, has_velocity in CONSTRAINT_SLOTS.items()
+        for n, f in getattr(system, s)
     ]
     shapes = [_shape_of(f, label, params, t=t, q=q, **velocity) for label, f, velocity in slots]
     return dict(zip(system.constraints, jax.tree.map(lambda s: jnp.zeros(s.shape, s.dtype), shapes), strict=True))
