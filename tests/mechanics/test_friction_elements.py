@@ -9,6 +9,7 @@ import jaxlag as jl
 from jaxlag import dissipation
 from jaxlag._mechanics.friction_elements import find_elements
 from jaxlag._model.flat import bind
+from jaxlag._motion.first_order import Formulation
 from jaxlag._motion.integrate import SolverOptions
 
 T = lambda qdot: 0.5 * jnp.sum(qdot**2)
@@ -267,7 +268,7 @@ def test_failures_name_friction_that_was_not_read():
     with pytest.raises(RuntimeError, match=r"`dissipation` depends on the sign or the root of a velocity.*write F \* jnp.abs\(v\)"):
         run(dissipation=lambda qdot, F: F * jnp.exp(jnp.sign(qdot)) * qdot)
     with pytest.raises(TypeError, match="`friction` must be an object that makes the choice, but is None"):
-        SolverOptions.of(None, jl.Projection(), None, 1000)
+        SolverOptions.of(None, Formulation(friction=None), 1000)  # under the hook of these tests `simulate` is refused before
 
 
 @pytest.mark.parametrize("off, end", [(False, np.cos(2 * 5.0)), (True, 0.05)])
