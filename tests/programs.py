@@ -59,7 +59,7 @@ BY_NUMPY = {
     **_elementwise(exp=np.exp, log=np.log, sqrt=np.sqrt, tanh=np.tanh, square=np.square, abs=np.abs, sign=np.sign, copy=np.array),
     **_elementwise(gt=np.greater, lt=np.less, ge=np.greater_equal, le=np.less_equal, eq=np.equal, ne=np.not_equal),
     **_elementwise(select_n=lambda which, no, yes: np.where(which, yes, no), convert_element_type=lambda x: x),
-    "reshape": lambda p, x: np.reshape(x, p["new_sizes"]),
+    "reshape": lambda p, x: np.reshape(x if p["dimensions"] is None else np.transpose(x, p["dimensions"]), p["new_sizes"]),
     "squeeze": lambda p, x: np.squeeze(x, tuple(p["dimensions"])),
     "transpose": lambda p, x: x.transpose(p["permutation"]),
     "broadcast_in_dim": _broadcast,
@@ -252,7 +252,17 @@ FORMS = {
 }
 
 
-NO_DERIVATIVE = ("not implemented", "rule", "differentiat", "Reverse-mode", "forward-mode", "complex", "float0", "NYI")
+NO_DERIVATIVE = (
+    "not implemented",
+    "rule",
+    "differentiat",
+    "Reverse-mode",
+    "forward-mode",
+    "complex",
+    "float0",
+    "NYI",
+    "gradient with respect to",
+)
 
 
 def jaxpr_of(function, *arguments):
