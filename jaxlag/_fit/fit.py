@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import PyTree
 
 from .._model.deprecation import renamed
+from .._model.numbers import count
 from .._model.system import System
 from .._motion.progress import Steps
 from .experiment import Experiment, measured
@@ -90,6 +91,8 @@ def fit(
     ```
     """
     segments = renamed(segments, "segments", pieces=numerics.pop("pieces", None))
+    segments = count(segments, "`segments`", cure="Use 1 for single shooting, some tens for a long or chaotic record.")
+    starts = count(starts, "`starts`", cure="Use 1 for a single start, some tens for a poor initial guess.")
     if (segments > 1) + (method is not None) + (starts > 1) > 1:
         raise ValueError("`segments`, `starts` and `method` must be used one at a time, but more than one was given. Omit the others.")
     problem, experiments = _checked_problem(system, experiments, params, free, bounds, priors, loss, method is None, numerics)

@@ -26,7 +26,7 @@ from .._program.polynomials import Modulus, moduli_in
 from .._program.substitution import evaluate_with_replacements, polynomial_values, source_equations
 from .._program.walker import constants_as_inputs
 
-LIMIT = 100_000  # entries of a program that is searched: a second or two
+MOST_NODES = 100_000  # of a program that is searched: a second or two
 
 
 class FrictionElements(NamedTuple):
@@ -75,7 +75,7 @@ class FrictionElements(NamedTuple):
 def find_elements(flat: Flat, t, q, v) -> FrictionElements | None:
     """The nonsmooth terms of D, or None where D is smooth. Of t, q and v only the shapes matter."""
     state = (t, q, v, jnp.zeros(flat.rows, v.dtype))
-    structure = Structure(LIMIT)
+    structure = Structure(MOST_NODES)
     terms = {name: _Term.read(structure, D, state) for name, D in flat.dissipations.items()}
     nonsmooth = {name: term.nonsmooth(role("dissipation", name)) for name, term in terms.items() if term.moduli}
     first: dict[Modulus, str] = {}  # each modulus, and the first term that has it
@@ -106,7 +106,7 @@ def unread_friction(flat: Flat, t, q, v, read: Container[str] | None = None) -> 
     """Dry friction that is not recognised as such, in words: forces that jump with a velocity; and for a motion that has failed, in which
     some terms were `read` as dry friction, what else in D may be nonsmooth.
     """
-    state, structure = (t, q, v, jnp.zeros(flat.rows, v.dtype)), Structure(LIMIT)
+    state, structure = (t, q, v, jnp.zeros(flat.rows, v.dtype)), Structure(MOST_NODES)
     findings = []
     for slot, terms in (("force", flat.forces), ("dissipation", flat.dissipations)):
         for name, function in terms.items():
@@ -148,7 +148,7 @@ class _Term(NamedTuple):
         closed = jax.make_jaxpr(D)(*state)
         jaxpr = constants_as_inputs(closed)
         try:
-            (result,) = _entries(structure, jaxpr, closed.consts, state)
+            (result,) = _outputs(structure, jaxpr, closed.consts, state)
         except TooLong:
             return cls(jaxpr, closed.consts, state, None, {}, {})
         moduli = Moduli(structure, objects(result).flat)
@@ -189,8 +189,8 @@ class _Term(NamedTuple):
 
         closed = jax.make_jaxpr(slopes)(self.consts, self.state, u)
         jaxpr = constants_as_inputs(closed)
-        structure = Structure(10 * LIMIT)
-        slope, slip = _entries(structure, jaxpr, [*closed.consts, *self.consts], (*self.state, u))
+        structure = Structure(10 * MOST_NODES)
+        slope, slip = _outputs(structure, jaxpr, [*closed.consts, *self.consts], (*self.state, u))
         constants = frozenset(x for c in self.consts if not is_numeric(c) for x in structure.unknown(c).flat)
         found, rows = [], iter(slip.flat)
         for x, du, modulus in zip(structure.unknown(u, len(self.state)), slope, moduli, strict=True):
@@ -245,7 +245,7 @@ class _Term(NamedTuple):
         return evaluate_with_replacements(self.jaxpr, inputs, wanted, self.branches, replaced, until)
 
 
-def _entries(structure: Structure, jaxpr: Jaxpr, consts: Sequence[Any], state: tuple) -> list[np.ndarray]:
+def _outputs(structure: Structure, jaxpr: Jaxpr, consts: Sequence[Any], state: tuple) -> list[np.ndarray]:
     """The outputs of a program at an unknown state, with what is known of what it closes over."""
     structure.reset()
     known = [structure.known(np.asarray(x)) if is_numeric(x) else structure.unknown(x) for x in consts]

@@ -1,5 +1,8 @@
 """What the integration asks of equations of motion: the protocol that a single motion, its variations and a batch of motions share."""
 
+import abc
+import dataclasses
+from collections.abc import Callable
 from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import jax
@@ -73,3 +76,37 @@ class FirstOrderSystem(Protocol):
 
     def error_norm(self, error: Array) -> Array:
         """The size of an error of y."""
+
+
+@dataclasses.dataclass(frozen=True)
+class AugmentedSystem(abc.ABC):
+    """A smooth `FirstOrderSystem` whose y has one more axis, its last: of variations, or of the members of a batch."""
+
+    equations: FirstOrderSystem
+    rows = 0
+
+    @property
+    def size(self) -> int:
+        """n, the number of coordinates."""
+        return self.equations.size
+
+    @property
+    def projection(self) -> Projection | None:
+        """What puts y back on the manifold, if there is one."""
+        return self.equations.projection
+
+    def rates(self, t: Any, y: Array, args: Arguments) -> Array:
+        """ẏ."""
+        return self.along_axis(self.equations.rates, t, y, args)
+
+    def projected(self, t: Any, y: Array, args: Arguments) -> Array:
+        """y, put back on the manifold."""
+        return self.along_axis(self.equations.projected, t, y, args)
+
+    @abc.abstractmethod
+    def error_norm(self, error: Array) -> Array:
+        """The size of an error of y."""
+
+    @abc.abstractmethod
+    def along_axis(self, function: Callable, t: Any, y: Array, args: Arguments) -> Array:
+        """A function (t, y, args) of the equations, for all that lies along the last axis."""

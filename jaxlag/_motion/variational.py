@@ -6,7 +6,6 @@ An explicit scheme gives of these what differentiating it would, for the same st
 Source: Hairer, Nørsett & Wanner, Solving Ordinary Differential Equations I, eqs. I.14.13 and I.14.14.
 """
 
-import dataclasses
 from collections.abc import Callable
 from typing import Any
 
@@ -15,8 +14,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from .._mechanics.projection import Projection
-from .protocol import Arguments, FirstOrderSystem
+from .protocol import Arguments, AugmentedSystem
 
 
 def jvp_along(function: Callable, x: Any, directions: Any) -> tuple[Any, Any, Any]:
@@ -44,32 +42,14 @@ def with_variations(y: Array, dy: Array) -> Array:
     return jnp.concatenate([y[..., None], dy], axis=-1)
 
 
-@dataclasses.dataclass(frozen=True)
-class VariationalEquations:
+class VariationalEquations(AugmentedSystem):
     """The `FirstOrderSystem` of a motion without stick and slip together with its variations, which are the last axis of y."""
-
-    equations: FirstOrderSystem
-    rows = 0
-
-    @property
-    def size(self) -> int:
-        return self.equations.size
-
-    @property
-    def projection(self) -> Projection | None:
-        return self.equations.projection
 
     def error_norm(self, error: Array) -> Array:
         """The error of the motion alone sets the steps."""
         return self.equations.error_norm(error[..., 0])
 
-    def rates(self, t: Any, y: Array, args: Arguments) -> Array:
-        return self._varied(self.equations.rates, t, y, args)
-
-    def projected(self, t: Any, y: Array, args: Arguments) -> Array:
-        return self._varied(self.equations.projected, t, y, args)
-
-    def _varied(self, function, t, y, args):
+    def along_axis(self, function: Callable, t: Any, y: Array, args: Arguments) -> Array:
         varying, constant = split_varying((args.params, args.own), args.directions)
         of_both = lambda both: (function(t, both[0], _arguments(eqx.combine(both[1], constant))), None)
         value, change, _ = jvp_along(of_both, (y[..., 0], varying), (y[..., 1:], args.directions))

@@ -56,6 +56,10 @@ def equations(
     ```
     """
     require_sympy("equations")
+    if not isinstance(multipliers, bool):
+        raise TypeError(
+            f"`multipliers` must be True or False, but is {multipliers!r}. Use True for Lagrange's equations of the first kind."
+        )
     from . import derivation, symbolic_system
     from .coordinate_elimination import eliminate_coordinates, reduce_system
     from .notation import Notation

@@ -148,3 +148,9 @@ def test_a_chaotic_record_in_segments():
         assert found.standard_errors[name] < 0.02 * value
     single = jl.fit(PENDULUM, e, START, free=tuple(START), max_steps=30, **LOOSE)
     assert single.sigma > 5  # nowhere near the noise
+
+
+@pytest.mark.parametrize("name", ["segments", "starts"])
+def test_there_is_at_least_one(name):
+    with pytest.raises(ValueError, match=f"`{name}` must be at least 1, but is 0"):
+        jl.fit(osc.SYSTEM, osc.record(0), osc.START, free=("c", "b"), **{name: 0})

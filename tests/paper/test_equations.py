@@ -2,6 +2,7 @@
 
 import ctypes
 import importlib
+import inspect
 import json
 import os
 import pathlib
@@ -651,3 +652,9 @@ def test_without_sympy_the_rest_works_and_the_extra_is_named():
 def test_importing_the_package_does_not_import_sympy():
     run = subprocess.run([sys.executable, "-c", "import sys, jaxlag; sys.exit('sympy' in sys.modules)"])
     assert run.returncode == 0
+
+
+def test_multipliers_is_a_switch():
+    equations = inspect.unwrap(jl.equations)  # without the hook of these tests, which refuses it before
+    with pytest.raises(TypeError, match="`multipliers` must be True or False, but is 'first kind'"):
+        equations(examples.vehicle.system, examples.vehicle.q0, examples.vehicle.params, multipliers="first kind")
