@@ -17,7 +17,7 @@ REFERENCE = {
     "At one state": "acceleration Acceleration mass_matrix momentum energy constraint_jacobian constraint_residual constraint_force powers "
     "Residual consistent_state examine Examination",
     "Motions": "simulate simulate_many Trajectory FrictionState RESULTS Instant Interpolated load Dop853 Dopri5 Projection Baumgarte "
-    "NoStabilisation StickSlip Regularised",
+    "NoStabilisation StickSlip Regularised keep_compiled",
     "Identification": "Experiment fit fit_each Fit Channel Interval Prediction regress Regression validate Validation compare Comparison "
     "information Information Huber learnt.ConvexDissipation learnt.PassiveDissipation learnt.Potential learnt.ConvexPotential",
     "On paper": "equations Equations to_sympy",

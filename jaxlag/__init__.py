@@ -27,6 +27,7 @@ from ._fit.regress import Regression as Regression, regress as regress
 from ._motion.simulate import simulate as simulate
 from ._motion.load import load as load
 from ._motion.simulate_many import simulate_many as simulate_many
+from ._program.compilation_cache import keep_compiled as keep_compiled
 from ._model.kinematics import rate as rate, substitute as substitute, virtual_work as virtual_work
 from ._mechanics.projection import (
     Baumgarte as Baumgarte,

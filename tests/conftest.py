@@ -4,10 +4,17 @@ They are compiled with the flag that README recommends for a CPU, in two thirds 
 """
 
 import os
+import pathlib
+import tempfile
+
+if "JAX_COMPILATION_CACHE_DIR" not in os.environ:  # what one worker has compiled serves all, and the programs that tests start
+    folder = tempfile.TemporaryDirectory(prefix="jaxlag-tests-")  # removed at the end of the run
+    os.environ |= {"JAX_COMPILATION_CACHE_DIR": folder.name, "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0"}
 
 import jax
 import jaxlib
 import pytest
+from jax.experimental.compilation_cache import compilation_cache as cache_of_jax
 from jaxtyping import install_import_hook
 
 if tuple(map(int, jaxlib.__version__.split(".")[:2])) <= (0, 10):  # an unknown flag would end the process
@@ -16,8 +23,17 @@ if tuple(map(int, jaxlib.__version__.split(".")[:2])) <= (0, 10):  # an unknown 
 jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_numpy_rank_promotion", "raise")
 
-with install_import_hook("jaxlag", "beartype.beartype"):
+ROOT = pathlib.Path(__file__).parents[1]
+FILES = [file.relative_to(ROOT).with_suffix("") for file in ROOT.glob("jaxlag/**/*.py") if "from jaxtyping import" in file.read_text()]
+
+# Files without annotations of shapes have nothing to check, and the checks of their calls took a sixth of the CPU time of the tests
+with install_import_hook([".".join(file.parts) for file in FILES], "beartype.beartype"):
     import jaxlag  # noqa: F401
+
+
+def pytest_collection_modifyitems(items):
+    """The files beside this one first: they hold the longest tests, for one of which a worker should not be left alone at the end."""
+    items.sort(key=lambda item: item.path.parent != ROOT / "tests")
 
 
 @pytest.fixture(autouse=True, scope="module")
@@ -32,3 +48,16 @@ def single_precision():
     jax.config.update("jax_enable_x64", False)
     yield
     jax.config.update("jax_enable_x64", True)
+
+
+@pytest.fixture
+def compilation_cache(tmp_path):
+    """A folder for `keep_compiled`, unless one is set already; the settings of JAX's cache are afterwards as they were."""
+    names = ["jax_compilation_cache_dir", "jax_persistent_cache_min_compile_time_secs", "jax_persistent_cache_min_entry_size_bytes"]
+    before = {name: getattr(jax.config, name) for name in names}
+    if before["jax_compilation_cache_dir"] is None:
+        jax.config.update("jax_compilation_cache_dir", str(tmp_path / "compiled"))
+    yield
+    for name, value in before.items():
+        jax.config.update(name, value)
+    cache_of_jax.reset_cache()

@@ -124,7 +124,7 @@ def check_statement(node, comment, names):
 
 
 @pytest.mark.parametrize("name", WITH_EXAMPLES)
-def test_an_example_runs_and_gives_what_it_states(name):
+def test_an_example_runs_and_gives_what_it_states(name, compilation_cache):
     for code in re.findall(r"```python\n(.*?)```", inspect.getdoc((PUBLIC | METHODS)[name]), re.S):
         names: dict = {}
         for node, comment in statements(textwrap.dedent(code)):

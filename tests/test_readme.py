@@ -8,7 +8,7 @@ import re
 README = (pathlib.Path(__file__).parents[1] / "README.md").read_text()
 
 
-def test_the_examples_print_what_they_say():
+def test_the_examples_print_what_they_say(compilation_cache):
     examples = re.findall(r"```python\n(.*?)```\n\n```text\n(.*?)```", README, re.S)
     assert len(examples) == README.count("```python")
     names: dict = {}

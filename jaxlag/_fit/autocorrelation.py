@@ -1,5 +1,7 @@
 """Autocorrelation of residuals: a test for it, its length in samples, and its effect on the covariance of the estimates."""
 
+import functools
+
 import numpy as np
 
 LAGS = 20
@@ -32,6 +34,12 @@ def autoregression(r: np.ndarray) -> np.ndarray:
 
     **Source:** Brockwell & Davis, Time Series: Theory and Methods, 2nd ed. (1991), sections 5.2 and 8.1.
     """
+    return _autoregression(np.asarray(r, float).tobytes())
+
+
+@functools.lru_cache(maxsize=64)  # the covariance and the table of channels ask for the same
+def _autoregression(samples):
+    r = np.frombuffer(samples)
     n = r.size
     if not whiteness(r) < COLOURED:
         return np.zeros(0)

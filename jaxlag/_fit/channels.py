@@ -45,7 +45,7 @@ class Channel(NamedTuple):
 
 def channels_of(number: int, values: PyTree, residuals: PyTree) -> list[Channel]:
     """Each scalar channel of an experiment, in flat order."""
-    flat = lambda tree: np.concatenate([np.reshape(leaf, (len(leaf), -1)) for leaf in jax.tree.leaves(tree)], axis=1).T
+    flat = lambda tree: np.concatenate([np.reshape(np.asarray(leaf), (len(leaf), -1)) for leaf in jax.tree.leaves(tree)], axis=1).T
     names = entry_names(jax.tree.map(lambda leaf: np.zeros(np.shape(leaf)[1:]), values))
     return [_channel(number, name or "z", z, r) for name, z, r in zip(names, flat(values), flat(residuals), strict=True)]
 

@@ -15,7 +15,7 @@ from .._model.injection import check_function
 from .._model.numbers import number, numbers
 from .._model.paths import entry_names, is_within
 from .._model.validation import is_vector, parameters, sample_times, state
-from .._program.jit import is_concrete
+from .._program.jit import is_concrete, numpy_for
 
 
 class Experiment(eqx.Module):
@@ -56,7 +56,7 @@ class Experiment(eqx.Module):
     ```
     """
 
-    ts: Float[Array, " T"]
+    ts: Float[Array | np.ndarray, " T"]
     values: PyTree
     q0: PyTree
     qdot0: PyTree
@@ -196,7 +196,8 @@ def _deviations(sigma, values):
     name = lambda path: f"`sigma{jax.tree_util.keystr(path)}`"
     sigma = jax.tree_util.tree_map_with_path(lambda path, s: numbers(s, name(path)), sigma, is_leaf=is_vector)
     values = sigma if values is None else values  # of an experiment that is only planned
-    for_each_sample = lambda s, v: jnp.broadcast_to(jnp.asarray(s, jnp.result_type(v, float)), jnp.shape(v))
+    xnp = numpy_for(sigma, values)
+    for_each_sample = lambda s, v: xnp.broadcast_to(xnp.asarray(s, jnp.result_type(v, float)), np.shape(v))
     try:
         sigma = jax.tree.map(lambda s, v: jax.tree.map(lambda v: for_each_sample(s, v), v), sigma, values)
     except ValueError as error:

@@ -18,13 +18,15 @@ from .._model.paths import is_within
 from .._model.system import System
 from .._model.validation import at_state
 from .._motion.simulate_many import of_each, padded
-from .._program.jit import is_concrete
+from .._program.jit import numpy_for
 from .experiment import Experiment, start_entries, with_own
 
 EXPERIMENTS_AXIS = PartitionSpec("experiments")
 
 
-class ExperimentBatch(eqx.Module):
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True, eq=False)
+class ExperimentBatch:
     """Experiments of one kind: each array has them as its first axis. Shorter records are padded with missing samples.
 
     `tangent_basis`: (experiments, 2n, k), directions in which the flat start (q0, qdot0) moves with the first k of an experiment's own
@@ -38,11 +40,11 @@ class ExperimentBatch(eqx.Module):
     qdot0: PyTree
     params: dict[str, Any]
     tangent_basis: Any
-    observe: Callable = eqx.field(static=True)
-    delay: Any = eqx.field(static=True)
-    own: tuple[str, ...] = eqx.field(static=True)  # entries of params that are unknown
-    members: tuple[int, ...] = eqx.field(static=True)  # indices of the experiments
-    mesh: Mesh | None = eqx.field(static=True, default=None)  # the devices they are distributed over
+    observe: Callable = dataclasses.field(metadata={"static": True})
+    delay: Any = dataclasses.field(metadata={"static": True})
+    own: tuple[str, ...] = dataclasses.field(metadata={"static": True})  # entries of params that are unknown
+    members: tuple[int, ...] = dataclasses.field(metadata={"static": True})  # indices of the experiments
+    mesh: Mesh | None = dataclasses.field(default=None, metadata={"static": True})  # the devices they are distributed over
 
     @property
     def unknowns(self) -> int:
@@ -67,7 +69,7 @@ def batches_of(system: System, params: PyTree, experiments: Sequence[Experiment]
     bases = [_tangent_basis(system, params, e) for e in experiments]
     for i, e in enumerate(experiments):
         rest = (e.q0, e.qdot0, e.params, bases[i])
-        shapes = [jnp.shape(x)[1:] for x in jax.tree.leaves(e.values)], [jnp.shape(x) for x in jax.tree.leaves(rest)]
+        shapes = [np.shape(x)[1:] for x in jax.tree.leaves(e.values)], [np.shape(x) for x in jax.tree.leaves(rest)]
         kind = e.observe, e.delay, _unknown_params(e), jax.tree.structure((e.values, rest)), str(shapes)
         kinds.setdefault(kind, []).append(i)
     return tuple(_batch([experiments[i] for i in members], [bases[i] for i in members], members) for members in kinds.values())
@@ -79,13 +81,13 @@ def _unknown_params(e):
 
 def _batch(experiments, bases, members):
     longest = max(e.ts.size for e in experiments)
-    xnp: Any = np if is_concrete(experiments, bases) else jnp  # NumPy is faster where nothing is traced
+    xnp = numpy_for(experiments, bases)
 
     def pad(x, e, padding=None):
         x = xnp.asarray(x)
         return xnp.concatenate([x, xnp.broadcast_to(x[-1] if padding is None else padding, (longest - e.ts.size, *x.shape[1:]))])
 
-    sigma = lambda e: e.sigma if e.sigma is not None else jax.tree.map(jnp.ones_like, e.values)
+    sigma = lambda e: e.sigma if e.sigma is not None else jax.tree.map(xnp.ones_like, e.values)
     padded = [
         (
             pad(e.ts, e),
@@ -98,8 +100,8 @@ def _batch(experiments, bases, members):
         )
         for e, basis in zip(experiments, bases, strict=True)
     ]
-    arrays, others = eqx.partition(padded, lambda x: isinstance(x, (np.ndarray, jax.Array)))
-    together = eqx.combine(jax.tree.map(lambda *leaves: jnp.asarray(xnp.stack(leaves)), *arrays), others[0])
+    arrays, others = eqx.partition(padded, eqx.is_array)
+    together = eqx.combine(jax.tree.map(lambda *leaves: xnp.stack(leaves), *arrays), others[0])
     first = experiments[0]
     return _distributed(ExperimentBatch(*together, first.observe, first.delay, _unknown_params(first), tuple(members)))
 
@@ -128,7 +130,7 @@ def _tangent_basis(system, params, e):
             _, s, Vt = np.linalg.svd(np.asarray(jacobian)[:, columns])
             rank = int(np.sum(s > 1e-9 * s[:1]))
             blocks[k] = blocks[k] @ Vt[rank:].T
-    return jnp.asarray(np.hstack(blocks), jax.tree.leaves(e.q0)[0].dtype)
+    return np.hstack(blocks).astype(jax.tree.leaves(e.q0)[0].dtype)
 
 
 def _constraint_jacobians(flat, t, q, v):

@@ -54,6 +54,8 @@ def _own_estimates(minimum, k, row, e, known, scale):
 
 def with_estimates(e: Experiment, own: dict[str, Any]) -> Experiment:
     """The experiment with its estimates put in."""
+    if not own:
+        return e
     params = e.params | {name: value for name, value in own.items() if name in e.params}
     return eqx.tree_at(lambda e: (e.q0, e.qdot0, e.params), e, (own.get("q0", e.q0), own.get("qdot0", e.qdot0), params))
 

@@ -13,7 +13,7 @@ from jaxtyping import PyTree
 from .._model.deprecation import renamed
 from .._model.numbers import count
 from .._model.system import System
-from .._motion.progress import Steps
+from .._motion.progress import Steps, compiling
 from .experiment import Experiment, measured
 from .levenberg_marquardt import Outcome, levenberg_marquardt
 from .minimise import minimise
@@ -68,7 +68,8 @@ def fit(
     - `segments`: number of segments that each record is cut into (multiple shooting), for long or chaotic records.
     - `max_steps`: step limit, by default 100, or 1000 with `method`. `tolerance`: the iteration ends when the next step would change no
       parameter by more than this part of its standard error.
-    - `progress`: shows step, cost and remaining time on standard error, in one line on a terminal, otherwise a line now and then.
+    - `progress`: shows step, cost and remaining time on standard error, in one line on a terminal, otherwise a line now and then; and
+      what is being compiled, where that takes more than two seconds.
     - `**numerics`: passed on to `simulate`: `solver`, `rtol`, `atol`, `stabilisation`, `friction`.
 
     Units are any consistent set. Where residuals are correlated in time, the standard errors account for it, as the card says (`Fit`).
@@ -99,21 +100,22 @@ def fit(
     steps = max_steps or (100 if method is None else 1000)
     line = Steps(steps) if progress else None
     of_segments = cut(problem, experiments, segments) if segments > 1 else Segments(problem, tuple(range(len(experiments))), ())
-    try:
-        outcome, problem = minimise(
-            of_segments.problem,
-            method=method,
-            starts=starts,
-            estimate_scale=loss is not None and not _absolute(experiments),
-            freedom=max(sum(map(_measurements, experiments)) - problem.size, 1),
-            max_steps=steps,
-            tolerance=tolerance,
-            progress=line,
-        )
-    finally:
-        if line:
-            line.end()
-    return report(problem, experiments, outcome, of_segments)
+    with compiling("the fit", progress):
+        try:
+            outcome, problem = minimise(
+                of_segments.problem,
+                method=method,
+                starts=starts,
+                estimate_scale=loss is not None and not _absolute(experiments),
+                freedom=max(sum(map(_measurements, experiments)) - problem.size, 1),
+                max_steps=steps,
+                tolerance=tolerance,
+                progress=line,
+            )
+        finally:
+            if line:
+                line.end()
+        return report(problem, experiments, outcome, of_segments)
 
 
 def fit_each(
@@ -166,10 +168,12 @@ def fit_each(
     own = jnp.full(batch.unknowns, jnp.inf)
     lower, upper = problem.free.bounds
     limits = jnp.concatenate([lower, -own]), jnp.concatenate([upper, own])
-    outcome = levenberg_marquardt(residuals, xs, bounds=limits, freedom=freedom, max_steps=max_steps, tolerance=tolerance, progress=line)
-    if line:
-        line.end()
-    return _report_each(problem, experiments, outcome)
+    stopping = {"freedom": freedom, "max_steps": max_steps, "tolerance": tolerance}
+    with compiling("the fits", progress):
+        outcome = levenberg_marquardt(residuals, xs, bounds=limits, progress=line, **stopping)
+        if line:
+            line.end()
+        return _report_each(problem, experiments, outcome)
 
 
 def _report_each(problem: Problem, experiments: Sequence[Experiment], outcome: Outcome) -> list[Fit]:

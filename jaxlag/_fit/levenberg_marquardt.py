@@ -78,10 +78,10 @@ def levenberg_marquardt(
     Methods for Non-Linear Least Squares Problems (2004), section 3.2; for the bounds Bertsekas, SIAM J. Control Optim. 20 (1982) 221.
     """
     initialise, update = SINGLE if y.ndim == 1 else BATCHED
-    box = [jnp.broadcast_to(jnp.asarray(bound, y.dtype), y.shape) for bound in bounds or (-jnp.inf, jnp.inf)]
+    box = [np.broadcast_to(np.asarray(bound, y.dtype), y.shape) for bound in bounds or (-np.inf, np.inf)]
     now, trial = initialise(y, linearise(y), box)
     costs = [now.cost]
-    step, limits = 0, (jnp.full(y.shape[:-1], tolerance, y.dtype), jnp.full(y.shape[:-1], freedom, y.dtype))
+    step, limits = 0, (np.full(y.shape[:-1], tolerance, y.dtype), np.full(y.shape[:-1], freedom, y.dtype))
     try:
         for step in range(1, max_steps + 1):
             now, trial = update(now, trial, linearise(trial.y), box, *limits)
@@ -94,7 +94,8 @@ def levenberg_marquardt(
     except KeyboardInterrupt:
         unfinished = INTERRUPTED
     status = np.asarray(now.status)
-    return Outcome(now._replace(status=np.where(status == RUNNING, unfinished, status)), step, np.array(costs))
+    status = np.where(status == RUNNING, unfinished, status)
+    return Outcome(now._replace(status=status), step, np.stack([np.asarray(cost) for cost in costs]))
 
 
 def _cost(r):

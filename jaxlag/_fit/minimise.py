@@ -24,7 +24,7 @@ def minimise(problem: Problem, *, method: Any, starts: int, estimate_scale: bool
     `limits`: `freedom`, `max_steps`, `tolerance` and `progress` of `levenberg_marquardt`.
     """
     original = problem
-    outcome, problem = _minimise(original, jnp.zeros(original.size), method, starts, limits)
+    outcome, problem = _minimise(original, np.zeros(original.size, original.free.start.dtype), method, starts, limits)
     for _ in range(SCALE_ROUNDS if estimate_scale else 0):
         if int(outcome.best.status) == INTERRUPTED:
             break

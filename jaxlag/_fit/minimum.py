@@ -37,7 +37,7 @@ class Minimum:
     def of(cls, problem: Problem, experiments: Sequence[Experiment], outcome: Outcome, segments: Segments) -> "Minimum":
         """At the best iterate of an outcome."""
         best = outcome.best
-        theta, slope = map(np.asarray, _theta_and_slope(problem.free, jnp.asarray(best.y[: problem.free.size])))
+        theta, slope = map(np.asarray, _theta_and_slope(problem.free, np.asarray(best.y)[: problem.free.size]))
         weighted = list(weighted_residuals(problem, best.aux))
         return cls(problem, tuple(experiments), segments, outcome, np.asarray(best.y), best.aux, theta, slope, weighted)
 

@@ -1,5 +1,6 @@
 """Free parameters: selected by name from a pytree, kept within bounds, with priors."""
 
+import dataclasses
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -7,12 +8,15 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, PyTree
+from jaxtyping import Array, PyTree
 
 from .._model.paths import entry_names, is_within, leaf_names
+from .._program.jit import numpy_for
 
 
-class Free(eqx.Module):
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True, eq=False)
+class Free:
     r"""The p free parameters θ as a function of scaled variables y, which are zero at the start θ₀.
 
     $$ \theta = \theta_0 + |\theta_0| y, \qquad a \le \theta \le b $$
@@ -21,15 +25,15 @@ class Free(eqx.Module):
     """
 
     params: PyTree  # all parameters, the free ones at their start
-    start: Float[Array, " p"]
-    scale: Float[Array, " p"]
-    lower: Float[Array, " p"]
-    upper: Float[Array, " p"]
-    prior_mean: Float[Array, " p"]
-    prior_deviation: Float[Array, " p"]  # infinite where there is no prior
-    names: tuple[str, ...] = eqx.field(static=True)  # as the user gave them
-    entries: tuple[str, ...] = eqx.field(static=True)  # one for each number
-    leaves: tuple[int, ...] = eqx.field(static=True)  # indices of the free arrays among the leaves of params
+    start: Any  # an array (p,), as all down to `prior_deviation`
+    scale: Any
+    lower: Any
+    upper: Any
+    prior_mean: Any
+    prior_deviation: Any  # infinite where there is no prior
+    names: tuple[str, ...] = dataclasses.field(metadata={"static": True})  # as the user gave them
+    entries: tuple[str, ...] = dataclasses.field(metadata={"static": True})  # one for each number
+    leaves: tuple[int, ...] = dataclasses.field(metadata={"static": True})  # indices of the free arrays among the leaves of params
 
     @classmethod
     def of(
@@ -52,29 +56,31 @@ class Free(eqx.Module):
             raise ValueError(f"`free` must name each parameter once, but names one twice: {', '.join(free)}. Remove one of the names.")
         entries = tuple(names[i] + entry for i in chosen for entry in entry_names(every[i]))
         flat = [np.ravel(every[i]) for i in chosen]
-        start = jnp.asarray(np.concatenate([np.zeros(0), *flat]) if not _traced(flat) else jnp.concatenate(flat))
+        xnp = numpy_for(flat)
+        start = xnp.concatenate([xnp.zeros(0), *flat])
+        start = start.astype(jax.dtypes.canonicalize_dtype(start.dtype))
         lower, upper = _pair_for_each_entry(bounds, "bounds", free, entries, (-np.inf, np.inf))
         mean, deviation = _pair_for_each_entry(priors, "priors", free, entries, (0.0, np.inf))
         _check(start, lower, upper, deviation, entries)
         for i, leaf in enumerate(every):
             if i not in chosen and eqx.is_inexact_array(leaf) and not _traced([leaf]) and np.any(np.isnan(leaf)):
                 raise ValueError(f"`params` must be known where they are not free, but {names[i]!r} is NaN. Give it a value, or free it.")
-        scale = jnp.where(start == 0, 1, jnp.abs(start)) if relative else jnp.ones_like(start)
-        as_start = lambda x: jnp.asarray(x, start.dtype)
-        return cls(params, start, scale, *map(as_start, (lower, upper, mean, deviation)), tuple(free), entries, tuple(chosen))
+        scale = xnp.where(start == 0, 1, xnp.abs(start)) if relative else xnp.ones_like(start)
+        lower, upper, mean, deviation = (np.asarray(x, start.dtype) for x in (lower, upper, mean, deviation))
+        return cls(params, start, scale, lower, upper, mean, deviation, tuple(free), entries, tuple(chosen))
 
     @property
     def size(self) -> int:
         """p, the number of free numbers."""
         return len(self.entries)
 
-    def theta(self, y: Array) -> Array:
+    def theta(self, y: Any) -> Array:
         """θ(y)."""
         theta = self.start + self.scale * y
         return theta + jax.lax.stop_gradient(jnp.clip(theta, self.lower, self.upper) - theta)  # exactly at a bound, and with its derivative
 
     @property
-    def bounds(self) -> tuple[Array, Array]:
+    def bounds(self) -> tuple[Any, Any]:
         """Lower and upper bounds of y."""
         return (self.lower - self.start) / self.scale, (self.upper - self.start) / self.scale
 
@@ -98,23 +104,23 @@ class Free(eqx.Module):
         default = jnp.where(jnp.isnan(a), jnp.where(jnp.isnan(b), 1.0, b - 1), jnp.where(jnp.isnan(b), a + 1, (a + b) / 2))
         return self.insert(jnp.where(jnp.isnan(self.start), default, self.start))
 
-    def slope(self, y: Array) -> Array:
+    def slope(self, y: Any) -> Array:
         """dθ/dy for each entry."""
         return jnp.broadcast_to(self.scale, y.shape)
 
-    def prior_residual(self, y: Array) -> Array:
+    def prior_residual(self, y: Any) -> Array:
         """(θ − mean) / standard deviation of the priors; zero where there is none."""
         return (self.theta(y) - self.prior_mean) / self.prior_deviation
 
-    def insert(self, theta: Array) -> PyTree:
+    def insert(self, theta: Any) -> PyTree:
         """All parameters, with the free ones replaced by θ."""
         leaves, structure = jax.tree.flatten(self.params)
-        sizes = np.cumsum([np.size(leaves[i]) for i in self.leaves])
-        for i, part in zip(self.leaves, jnp.split(theta, sizes[:-1]) if self.leaves else [], strict=True):
-            leaves[i] = part.reshape(jnp.shape(leaves[i])).astype(jnp.result_type(leaves[i]))
+        ends = np.cumsum([np.size(leaves[i]) for i in self.leaves])
+        for i, end in zip(self.leaves, ends, strict=True):
+            leaves[i] = theta[end - np.size(leaves[i]) : end].reshape(np.shape(leaves[i])).astype(leaves[i].dtype)
         return jax.tree.unflatten(structure, leaves)
 
-    def by_name(self, theta: Array) -> dict[str, PyTree]:
+    def by_name(self, theta: Any) -> dict[str, PyTree]:
         """The free parameters only, by name."""
         tree = self.insert(theta)
         return {name: _part(tree, name) for name in self.names}

@@ -12,14 +12,16 @@ from jaxtyping import Array, Float
 
 from .._motion.results import reason_of
 from .._motion.simulate_many import of_each
-from .._program.jit import compiled
+from .._program.jit import compiled, numpy_for
 from .experiment import Experiment
 from .experiment_batch import ExperimentBatch, batches_of, map_batch
 from .parameters import Free
 from .residuals import Linearised, Model, evaluate_batch, linearise_batch
 
 
-class Continuity(eqx.Module):
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True, eq=False)
+class Continuity:
     """Where one segment of a motion ends the next has to start: c = Wᵀ (end − start) = 0, enforced by an augmented Lagrangian.
 
     W is the tangent basis of the start of the next segment, over the typical size of the state.
@@ -28,10 +30,10 @@ class Continuity(eqx.Module):
     Optimization, section 17.3.
     """
 
-    weight: Array
-    dual: Array  # one for each entry of c
-    size: Array  # (2n,), typical size of the state
-    pairs: tuple[tuple[int, int], ...] = eqx.field(static=True)  # of segments that follow each other
+    weight: Any
+    dual: Any  # one for each entry of c
+    size: Any  # (2n,), typical size of the state
+    pairs: tuple[tuple[int, int], ...] = dataclasses.field(metadata={"static": True})  # of segments that follow each other
 
 
 class Linearisation(NamedTuple):
@@ -44,19 +46,21 @@ class Linearisation(NamedTuple):
     gaps_jacobian: Any
 
 
-class Problem(eqx.Module):
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True, eq=False)
+class Problem:
     """Residuals as a function of all unknowns x: y of the free parameters, then z of each experiment, in one flat vector."""
 
     model: Model
     free: Free
     batches: tuple[ExperimentBatch, ...]
-    scale: Array  # of the noise, in units of sigma, for robust losses
+    scale: Any  # of the noise, in units of sigma, for robust losses
     continuity: Continuity | None = None
 
     @classmethod
     def of(cls, model: Model, free: Free, experiments: Sequence[Experiment]) -> "Problem":
         """The problem of these experiments; its start is x = 0."""
-        return cls(model, free, batches_of(model.system, free.params, experiments), jnp.ones((), free.start.dtype))
+        return cls(model, free, batches_of(model.system, free.params, experiments), np.ones((), free.start.dtype))
 
     @property
     def size(self) -> int:
@@ -64,11 +68,11 @@ class Problem(eqx.Module):
         return self.free.size + sum(len(batch.members) * batch.unknowns for batch in self.batches)
 
     @property
-    def bounds(self) -> tuple[Array, Array]:
+    def bounds(self) -> tuple[Any, Any]:
         """Lower and upper bounds of all unknowns."""
         lower, upper = self.free.bounds
-        others = jnp.full(self.size - self.free.size, jnp.inf, lower.dtype)
-        return jnp.concatenate([lower, -others]), jnp.concatenate([upper, others])
+        xnp, others = numpy_for(lower, upper), np.full(self.size - self.free.size, np.inf, lower.dtype)
+        return xnp.concatenate([lower, -others]), xnp.concatenate([upper, others])
 
     @property
     def places(self) -> dict[int, tuple[int, int]]:
@@ -80,13 +84,13 @@ class Problem(eqx.Module):
         begin = self.free.size + sum(len(batch.members) * batch.unknowns for batch in self.batches[:k])
         return begin + rows[:, None] * self.batches[k].unknowns + np.arange(self.batches[k].unknowns)
 
-    def split(self, x: Float[Array, " x"]) -> tuple[Array, list[Array]]:
+    def split(self, x: Float[Array | np.ndarray, " x"]) -> tuple[Array, list[Array]]:
         """y, and for each batch z of its experiments."""
         sizes = [self.free.size, *(len(batch.members) * batch.unknowns for batch in self.batches)]
         y, *zs = jnp.split(x, np.cumsum(sizes)[:-1])
         return y, [z.reshape(len(batch.members), batch.unknowns) for batch, z in zip(self.batches, zs, strict=True)]
 
-    def linearise(self, x: Float[Array, " x"]) -> Linearisation:
+    def linearise(self, x: Float[Array | np.ndarray, " x"]) -> Linearisation:
         """All residuals and their Jacobian: those of the priors, of the experiments, of the gaps."""
         y, zs = self.split(x)
         parts = tuple(linearise_batch(self.model, self.free, batch, y, z, self.scale) for batch, z in zip(self.batches, zs, strict=True))
@@ -102,7 +106,7 @@ class Problem(eqx.Module):
         residuals, jacobians = zip(*((r.ravel(), J.reshape(-1, self.size)) for r, J in blocks), strict=True)
         return Linearisation(jnp.concatenate(residuals), jnp.concatenate(jacobians), parts, gaps, gaps_J)
 
-    def cost(self, x: Float[Array, " x"]) -> Array:
+    def cost(self, x: Float[Array | np.ndarray, " x"]) -> Array:
         """Half the sum of squares, without the Jacobian of the residuals: for reverse-mode differentiation."""
         y, zs = self.split(x)
         total = jnp.sum(self.free.prior_residual(y) ** 2)
@@ -137,7 +141,7 @@ class Problem(eqx.Module):
         return jnp.einsum("lij,lj->li", W, gap).ravel(), J.reshape(-1, self.size)
 
 
-def linearise(problem: Problem, x: Float[Array, " x"]) -> Linearisation:
+def linearise(problem: Problem, x: Float[Array | np.ndarray, " x"]) -> Linearisation:
     """`Problem.linearise`, compiled; results of several devices are gathered."""
     found = _linearise(problem, x)
     return found if all(batch.mesh is None for batch in problem.batches) else jax.tree.map(np.asarray, found)
@@ -149,7 +153,7 @@ def _linearise(problem, x):
 
 
 @compiled
-def without_jacobian(problem: Problem, x: Float[Array, " x"]) -> Linearisation:
+def without_jacobian(problem: Problem, x: Float[Array | np.ndarray, " x"]) -> Linearisation:
     """The residuals alone, where there are too many unknowns for a Jacobian."""
     y, zs = problem.split(x)
     parts = []

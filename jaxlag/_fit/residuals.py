@@ -1,8 +1,8 @@
 """Predicted measurements of an experiment, their residuals, and the Jacobians of these."""
 
+import dataclasses
 from typing import Any, NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
@@ -19,12 +19,14 @@ from .parameters import Free
 from .robust_loss import Huber
 
 
-class Model(eqx.Module):
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class Model:
     """How measurements are predicted. Models with equal fields are equal, so that they share one compiled program."""
 
-    system: System = eqx.field(static=True)
-    numerics: tuple[tuple[str, Any], ...] = eqx.field(static=True)
-    loss: Huber | None = eqx.field(static=True)
+    system: System = dataclasses.field(metadata={"static": True})
+    numerics: tuple[tuple[str, Any], ...] = dataclasses.field(metadata={"static": True})
+    loss: Huber | None = dataclasses.field(metadata={"static": True})
 
     def predicted(self, params: PyTree, e: ExperimentBatch, z: Any) -> tuple[PyTree, Trajectory]:
         """The predicted measurements of one experiment, and the motion behind them."""

@@ -7,7 +7,6 @@ from collections.abc import Sequence
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from .channels import channels_of
@@ -75,12 +74,12 @@ def _parameters(minimum: Minimum, uncertainty: Uncertainty, scale: float) -> Fie
     free, p, known = minimum.problem.free, minimum.size, uncertainty.known
     covariance = known.covariance[:p, :p] * np.outer(minimum.slope, minimum.slope) * scale**2
     covariance[np.diag_indices(p)] = np.where(known.determined[:p], np.diag(covariance), np.inf)
-    theta = jnp.asarray(minimum.theta)
+    theta = minimum.theta
     return {
         "names": free.entries,
         "params": free.insert(theta),
         "estimates": free.by_name(theta),
-        "standard_errors": free.by_name(jnp.asarray(np.sqrt(np.diag(covariance)))),
+        "standard_errors": free.by_name(np.sqrt(np.diag(covariance))),
         "covariance": covariance,
         "correlation": correlation_of(covariance),
         "x_covariance": known.covariance,

@@ -15,9 +15,10 @@ from .._model.numbers import count, number
 from .._model.system import System
 from .._model.validation import at_state, coordinates
 from .._program.jit import is_concrete
+from .._program.scalarise import scalarised
 from .._program.sparse_jacobian import jacobian
 from .lagrange import constraint_rows, inertia, position_residual, velocity_residual
-from .saddle_point import NO_INERTIA, Near, augmented, is_determined, saddle_point
+from .saddle_point import NO_INERTIA, augmented, is_determined, reach_of, saddle_point
 from .singular_directions import NOT_AFFINE, UNDEFINED, explained, not_affine_in
 
 
@@ -55,13 +56,21 @@ class Projection:
     def project(self, flat: Flat, t: Any, q: Float[Array, " n"], v: Float[Array, " n"]) -> tuple[Float[Array, " n"], Float[Array, " n"]]:
         """The state on the constraints that is nearest to this one, which is near already."""
         M = inertia(flat, t, q, v)[0]  # at the start serves throughout: corrections are small
+
+        @scalarised
+        def newton(t, q, M):
+            g, G = position_residual(flat, t, q)
+            return q + saddle_point(M, G, jnp.zeros_like(q), -g, reach_of(q)).x
+
+        @scalarised
+        def on_velocities(t, q, v, M):
+            psi, G, _ = constraint_rows(flat, t, q, v)
+            return _corrected(v, saddle_point(M, G, jnp.zeros_like(v), -psi, reach_of(v)).x)
+
         if flat.holonomic_names:
             metric = _metric_of_positions(flat, M, t, q, v)
-            for _ in range(self.iterations):
-                g, G = position_residual(flat, t, q)
-                q = q + saddle_point(metric, G, jnp.zeros_like(q), -g, Near(q)).x
-        psi, G, _ = constraint_rows(flat, t, q, v)
-        return q, _corrected(v, saddle_point(M, G, jnp.zeros_like(v), -psi, Near(v)).x)
+            q, _ = jax.lax.scan(lambda q, _: (newton(t, q, metric), None), q, length=self.iterations)
+        return q, on_velocities(t, q, v, M)
 
 
 def _corrected(v, dv):
@@ -132,6 +141,7 @@ class NoStabilisation:
 
 
 CONSISTENCY_ITERATIONS = 16  # a fixed number is one loop to compile; near the constraints four suffice
+STILL = 3  # iterations that move nothing, after which it ends: they make its derivatives right, k of them up to order 2ᵏ − 1
 
 
 class Consistent(NamedTuple):
@@ -163,31 +173,44 @@ def nearest_state(flat: Flat, t, q0, v0, free: Sequence[int] | None = None) -> C
         yes = jnp.array(True)
         return Consistent(q0, v0, yes, is_determined(M, jnp.zeros((0, moving.size), M.dtype)), yes, jnp.all(jnp.isfinite(M)))
 
-    def newton(carry, _):
-        q, multipliers = carry
+    @scalarised
+    def newton(t, q, multipliers, M, q0):
         g, G = position_residual(flat, t, q)
         bend = jax.hessian(lambda q: multipliers @ flat.holonomic(t, q))(q)[both]
         curved = jnp.where(is_determined(M - bend, G[:, moving]), M - bend, M)
-        near = Near(q[moving], _off(g, G, q) > tolerance)
-        step, multipliers, _ = saddle_point(lx.MatrixLinearOperator(curved), G[:, moving], M @ (q0 - q)[moving], -g, near)
-        return (q.at[moving].add(step), multipliers), None
+        reach = reach_of(q[moving], _off(g, G, q) > tolerance)
+        step, multipliers, _ = saddle_point(lx.MatrixLinearOperator(curved), G[:, moving], M @ (q0 - q)[moving], -g, reach)
+        return q.at[moving].add(step), multipliers
 
     q = q0
     if positions:
         if given.size > 2 * positions:  # velocity constraints may be all that holds a coordinate
             held = is_determined(M, position_residual(flat, t, q0)[1][:, moving])
             M = jnp.where(held, M, _metric_of_positions(flat, full, t, q0, v0).as_matrix()[both])
-        (q, _), _ = jax.lax.scan(newton, (q0, jnp.zeros(positions, q0.dtype)), length=CONSISTENCY_ITERATIONS)
+        start = q0, jnp.zeros(positions, q0.dtype)
 
-    psi, G, _ = constraint_rows(flat, t, q, v0)
-    M = inertia(flat, t, q, v0)[0].as_matrix()[both]
-    near = Near(v0[moving], _off(psi, G, v0) > tolerance)
-    nearest = saddle_point(lx.MatrixLinearOperator(M), G[:, moving], jnp.zeros_like(v0[moving]), -psi, near)
-    v = v0.at[moving].add(nearest.x)
-    off = jnp.maximum(_off(*position_residual(flat, t, q), q), _off(velocity_residual(flat, t, q, v), G, v))
+        def search(carry, _):
+            (q, multipliers), still = carry
+            found = jax.lax.cond(still < STILL, lambda: newton(t, q, multipliers, M, q0), lambda: (q, multipliers))
+            moved = jnp.max(jnp.abs(found[0] - q)) > 4 * jnp.finfo(q.dtype).eps * jnp.max(jnp.abs(q))
+            return (found, jnp.where(moved, 0, still + 1)), None
+
+        ((q, _), _), _ = jax.lax.scan(search, (start, jnp.array(0)), length=CONSISTENCY_ITERATIONS)
+
+    @scalarised
+    def velocities(t, q, v0):
+        psi, G, _ = constraint_rows(flat, t, q, v0)
+        M = inertia(flat, t, q, v0)[0].as_matrix()[both]
+        reach = reach_of(v0[moving], _off(psi, G, v0) > tolerance)
+        nearest = saddle_point(lx.MatrixLinearOperator(M), G[:, moving], jnp.zeros_like(v0[moving]), -psi, reach)
+        v = v0.at[moving].add(nearest.x)
+        off = jnp.maximum(_off(*position_residual(flat, t, q), q), _off(velocity_residual(flat, t, q, v), G, v))
+        return v, off, nearest.sound.determined, ~jnp.any(not_affine_in(flat, t, q0, v0))
+
+    v, off, determined, affine = velocities(t, q, v0)
     reached = (off < tolerance) & jnp.all(jnp.isfinite(q))
     defined = jnp.all(jnp.isfinite(given)) & jnp.all(jnp.isfinite(M))
-    return Consistent(q, v, reached, nearest.sound.determined, ~jnp.any(not_affine_in(flat, t, q0, v0)), defined)
+    return Consistent(q, v, reached, determined, affine, defined)
 
 
 def off_constraints(flat: Flat, t, q, v) -> Float[Array, ""]:

@@ -5,12 +5,12 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import lineax as lx
-import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from .._model.flat import Flat
+from .._program.scalarise import scalarised
 from .lagrange import applied_force, constraint_rows, inertia
-from .pseudo_inverse import Request, applied, by_rows, everywhere, inverse_of
+from .pseudo_inverse import Inverse, Request, applied, by_rows, everywhere, inverse_of
 
 
 class Sound(NamedTuple):
@@ -22,16 +22,12 @@ class Sound(NamedTuple):
     satisfied: Bool[Array, ""]
 
 
-class Near(NamedTuple):
-    """The state that a solve puts right: by rounding alone, or, where it is clearly `off`, as far as need be."""
-
-    state: Float[Array, " n"]
-    off: Bool[Array, ""] | None = None
-
-    def tolerance(self) -> Float[Array, " n"]:
-        """How far each of its numbers may go in a direction that is barely held."""
-        near = jnp.finfo(self.state.dtype).eps ** 0.5
-        return (1 + jnp.abs(jax.lax.stop_gradient(self.state))) * (near if self.off is None else jnp.where(self.off, 1 / near, near))
+def reach_of(state: Float[Array, " n"], off: Bool[Array, ""] | None = None) -> Float[Array, " n"]:
+    """How far each number of a state may go in a direction that is barely held, where a solve puts the state right: by rounding alone,
+    or, where it is clearly `off`, as far as need be.
+    """
+    near = jnp.finfo(state.dtype).eps ** 0.5
+    return (1 + jnp.abs(jax.lax.stop_gradient(state))) * (near if off is None else jnp.where(off, 1 / near, near))
 
 
 class SaddlePoint(NamedTuple):
@@ -42,7 +38,7 @@ class SaddlePoint(NamedTuple):
     sound: Sound
 
 
-def saddle_point(M: lx.AbstractLinearOperator, G: Float[Array, "m n"], f, c, near: Near | None = None) -> SaddlePoint:
+def saddle_point(M: lx.AbstractLinearOperator, G: Float[Array, "m n"], f, c, reach: Float[Array, " n"] | None = None) -> SaddlePoint:
     """The unique x and the λ of least norm with M x = f + Gᵀλ and G x = c.
 
     f and c are vectors, or as many columns each. M need be positive definite on the null space of G only, and rows of G may
@@ -50,71 +46,101 @@ def saddle_point(M: lx.AbstractLinearOperator, G: Float[Array, "m n"], f, c, nea
     (next to) nothing beside another.
 
     A direction that G barely holds is held where that takes x about as far as all else does, or, where x puts a state right, no farther
-    than `near` says. What is asked beyond that, the error of a state asks for, as of a mechanism that passes a singular position.
+    than its `reach`. What is asked beyond that, the error of a state asks for, as of a mechanism that passes a singular position.
     """
     if f.ndim == 1:
-        found = saddle_point(M, G, f[:, None], c[:, None], near)
+        found = saddle_point(M, G, f[:, None], c[:, None], reach)
         return found._replace(x=found.x[:, 0], multipliers=found.multipliers[:, 0])
     if not isinstance(M, lx.DiagonalLinearOperator):
-        return _saddle_point(M, G, f, c, near)
+        return _saddle_point(M, G, f, c, reach)
     heavy = M.diagonal > jnp.finfo(f.dtype).eps ** 0.25 * jnp.max(jnp.abs(M.diagonal))
-    divided = _saddle_point(lx.DiagonalLinearOperator(jnp.where(heavy, M.diagonal, 1)), G, f, c, near)
-    full = lambda: _saddle_point(lx.MatrixLinearOperator(M.as_matrix()), G, f, c, near)
+    divided = _saddle_point(lx.DiagonalLinearOperator(jnp.where(heavy, M.diagonal, 1)), G, f, c, reach)
+    full = lambda: _saddle_point(lx.MatrixLinearOperator(M.as_matrix()), G, f, c, reach)
     return jax.lax.cond(everywhere(jnp.all(heavy)), lambda: divided, full)
 
 
+def _saddle_point(M, G, f, c, reach) -> SaddlePoint:
+    factors = _factorised(*jax.lax.stop_gradient((M, G, f, c, reach)))
+    x, multipliers = _solution(M, G, f, c, factors)
+    return SaddlePoint(x, multipliers, Sound(factors.determined, factors.satisfied))
+
+
+class Factors(NamedTuple):
+    """What the solve takes as constant: weights W and Cholesky factor of M + GᵀWG, or none of both where M is diagonal, and positive
+    itself; S⁺ of S = G (M + GᵀWG)⁻¹ Gᵀ; whether M is positive there; whether rows that follow from others do so for this c too.
+    """
+
+    W: Float[Array, " m"] | None
+    cholesky: Float[Array, "n n"] | None
+    inverse: Inverse
+    determined: Bool[Array, ""]
+    satisfied: Bool[Array, ""]
+
+
+def _factorised(M, G, f, c, reach) -> Factors:
+    """On the constraint M + GᵀWG says the same as M, with GᵀWc added to f, and is positive definite: so one factorisation and the
+    pseudo-inverse of the small matrix S serve every case.
+
+    Source: Benzi, Golub & Liesen, Numerical solution of saddle point problems, Acta Numerica 2005, sections 5 and 6.
+    """
+    if isinstance(M, lx.DiagonalLinearOperator):
+        W, cholesky, determined = None, None, jnp.array(True)
+        by_root = lambda B: B / jnp.sqrt(M.diagonal)[:, None]
+    else:
+        A, W = augmented(M.as_matrix(), G)
+        cholesky = jnp.linalg.cholesky(jax.lax.optimization_barrier(A))  # the diagonal of A would be computed anew
+        determined = _is_positive(cholesky, A)
+        by_root = lambda B: jax.scipy.linalg.solve_triangular(cholesky, B, lower=True)
+
+    def request():
+        length = None if reach is None else jnp.sqrt(reach @ M.as_matrix() @ reach)
+        return Request(by_root(G.T).T, c, by_root(_load(G, W, f, c)), length)
+
+    S = G @ _by_inertia(M, G, W, cholesky)(G.T)
+    judged = scalarised(by_rows) if len(G) == 2 else by_rows
+    inverse, satisfied = inverse_of(S, c, lambda D: judged(request(), D))
+    return Factors(W, cholesky, inverse, determined, satisfied)
+
+
+def _load(G, W, f, c):
+    return f if W is None else f + G.T @ (W[:, None] * c)
+
+
+def _by_inertia(M, G, W, cholesky):
+    """B ↦ (M + GᵀWG)⁻¹ B."""
+    if cholesky is None:
+        return lambda B: B / M.diagonal[:, None]
+    A = M.as_matrix() + G.T @ (W[:, None] * G)
+    return lambda B: _solve(A, cholesky, B)
+
+
 @jax.custom_jvp
-def _saddle_point(M, G, f, c, near) -> SaddlePoint:
-    solve, _, determined, satisfied = _solver(M, G, f, c, near)
-    x, multipliers = solve(f, c)
-    return SaddlePoint(x, multipliers, Sound(determined, satisfied))
+def _solution(M, G, f, c, factors: Factors):
+    solve, _ = _solver(M, G, factors)
+    return solve(f, c)
 
 
-@_saddle_point.defjvp
-def _saddle_point_jvp(primals, tangents):
+@_solution.defjvp
+def _solution_jvp(primals, tangents):
     """One more solve:  M dx = df − dM x + dGᵀλ + Gᵀdλ,  G dx = dc − dG x.
 
     Through the formula, the derivative of the pseudo-inverse would cancel where a mechanism passes a singular position.
     """
-    (M, G, f, c, near), (dM, dG, df, dc, _) = primals, tangents
-    found = _saddle_point(M, G, f, c, near)
-    solve, rotated, *_ = _solver(M, G, f, c, near)
-    dx, d_multipliers = solve(df + dG.T @ found.multipliers - jax.vmap(dM.mv, 1, 1)(found.x), dc - dG @ found.x)
-    still = jax.tree.map(lambda flag: np.zeros(jnp.shape(flag), jax.dtypes.float0), found.sound)
-    return found, SaddlePoint(dx, d_multipliers + rotated(dG, found.multipliers), still)
+    (M, G, f, c, factors), (dM, dG, df, dc, _) = primals, tangents
+    x, multipliers = _solution(M, G, f, c, factors)
+    solve, rotated = _solver(M, G, factors)
+    dx, d_multipliers = solve(df + dG.T @ multipliers - jax.vmap(dM.mv, 1, 1)(x), dc - dG @ x)
+    return (x, multipliers), (dx, d_multipliers + rotated(dG, multipliers))
 
 
-def _solver(M, G, f, c, near):
-    """(f, c) ↦ (x, λ); (dG, λ) ↦ how λ turns with the null space of Gᵀ to stay of least norm; whether M is positive there; whether
-    rows that follow from others do so for this c too.
-
-    On the constraint M + GᵀWG says the same as M, with GᵀWc added to f, and is positive definite: so one factorisation and the
-    pseudo-inverse of the small matrix S = G (M + GᵀWG)⁻¹ Gᵀ serve every case. W = 0 where M is diagonal, and positive itself.
-    Source: Benzi, Golub & Liesen, Numerical solution of saddle point problems, Acta Numerica 2005, sections 5 and 6.
-    """
-    fixed = jax.lax.stop_gradient
-    if isinstance(M, lx.DiagonalLinearOperator):
-        W, by_inertia, determined = jnp.zeros_like(G[:, 0]), lambda B: B / M.diagonal[:, None], jnp.array(True)
-        by_root = lambda B: B / jnp.sqrt(fixed(M.diagonal))[:, None]
-    else:
-        A, W = augmented(M.as_matrix(), G)
-        A = jax.lax.optimization_barrier(A)  # its diagonal would be computed anew
-        factor = jnp.linalg.cholesky(fixed(A))
-        by_inertia, determined = lambda B: _solve(A, factor, B), _is_positive(factor, A)
-        by_root = lambda B: jax.scipy.linalg.solve_triangular(factor, B, lower=True)
+def _solver(M, G, factors: Factors):
+    """(f, c) ↦ (x, λ); and (dG, λ) ↦ how λ turns with the null space of Gᵀ to stay of least norm."""
+    by_inertia, inverse = _by_inertia(M, G, factors.W, factors.cholesky), factors.inverse
     mobility = by_inertia(G.T)
     S = G @ mobility
-    load = lambda f, c: f + G.T @ (W[:, None] * c)
-
-    def request():
-        tolerance = None if near is None else near.tolerance()
-        length = None if tolerance is None else jnp.sqrt(tolerance @ fixed(M.as_matrix()) @ tolerance)
-        return Request(by_root(fixed(G.T)).T, fixed(c), by_root(fixed(load(f, c))), length)
-
-    inverse, satisfied = inverse_of(S, fixed(c), lambda D: by_rows(request(), fixed(D)))
 
     def solve(f, c):
-        free = by_inertia(load(f, c))
+        free = by_inertia(_load(G, factors.W, f, c))
         multipliers = applied(S, inverse, c - G @ free)
         return free + mobility @ multipliers, multipliers
 
@@ -122,7 +148,7 @@ def _solver(M, G, f, c, near):
         change = dG @ (mobility @ applied(S, inverse, multipliers))
         return change - S @ applied(S, inverse, change)
 
-    return solve, rotated, determined, satisfied
+    return solve, rotated
 
 
 def is_determined(M: Float[Array, "n n"], G: Float[Array, "m n"]) -> Bool[Array, ""]:

@@ -73,9 +73,10 @@ class Signal(eqx.Module):
         *,
         kind: str | None = None,
     ):
-        self.ts, self.values, self.second_derivatives = numbers(ts, "`ts`"), numbers(values, "`values`"), None
+        ts, values = numbers(ts, "`ts`"), numbers(values, "`values`")
         self.interpolation = _interpolation(interpolation if kind is None else kind)
-        _check(self.ts, self.values)
+        _check(ts, values)
+        self.ts, self.values, self.second_derivatives = jnp.asarray(ts), jnp.asarray(values), None
 
     def __call__(self, t: ArrayLike) -> Float[Array, "..."]:
         """u(t); of several times, one row for each."""

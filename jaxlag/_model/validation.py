@@ -1,4 +1,4 @@
-"""User input: converted to arrays once and checked once, while a program is traced, at no cost at run time."""
+"""User input: its numbers are converted at each call, on the host; its functions are checked once, while a program is traced."""
 
 import functools
 from collections.abc import Callable, Mapping
@@ -8,14 +8,16 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, PyTree
+from jaxtyping import Array, Float, PyTree
 
 from .._program.jit import compiled, is_concrete
 from .flat import Flat, bind, flat_like
 from .injection import call, check_entries, described, missing
-from .numbers import number, numbers
+from .numbers import Label, in_dtype, number, numbers
 from .system import CONSTRAINT_SLOTS, SLOTS, System, role
 from .user_errors import warn_of_recreated_functions
+
+Arrays = PyTree[Array | np.ndarray]
 
 
 def is_vector(node: Any) -> bool:
@@ -23,68 +25,80 @@ def is_vector(node: Any) -> bool:
     return isinstance(node, list) and all(isinstance(entry, (float, int)) for entry in node)
 
 
-def coordinates(q: Any, name: str) -> PyTree[Array]:
+def coordinates(q: Any, name: str) -> Arrays:
     """`q` as a pytree of floating arrays; integers and half precision become Python floats, and a list of numbers becomes a vector."""
+    leaves, structure = _coordinates(q, name)
+    return jax.tree.unflatten(structure, leaves)
 
-    def floating(path, leaf):
-        where = f"`{name}{jax.tree_util.keystr(path)}`"
-        if not isinstance(leaf, (float, int, complex, np.generic, np.ndarray, jax.Array, list)):
-            raise TypeError(f"{where} must be a real number or array, but is a {type(leaf).__name__}. Pass numbers only.")
-        array = numbers(leaf, where)
-        return array if array.dtype.itemsize >= 4 else array.astype(float)
 
-    q = jax.tree_util.tree_map_with_path(floating, q, is_leaf=lambda node: node is None or is_vector(node))
-    if not jax.tree.leaves(q):
+def _coordinates(q, name):
+    """The same as leaves and structure."""
+    is_leaf = lambda node: node is None or is_vector(node)
+    given, structure = jax.tree.flatten(q, is_leaf=is_leaf)
+    if not given:
         raise TypeError(f"`{name}` must hold at least one coordinate, but it is empty. Pass a number, an array or a dict of them.")
-    return q
+    return [_coordinate(leaf, Label(name, q, i, is_leaf)) for i, leaf in enumerate(given)], structure
 
 
-def state(q: Any, qdot: Any, names: tuple[str, str] = ("q", "qdot")) -> tuple[PyTree[Array], PyTree[Array]]:
+def _coordinate(leaf, where):
+    if not isinstance(leaf, (float, int, complex, np.generic, np.ndarray, jax.Array, list)):
+        raise TypeError(f"{where} must be a real number or array, but is a {type(leaf).__name__}. Pass numbers only.")
+    array = numbers(leaf, where)
+    return array if array.dtype.itemsize >= 4 else array.astype(float)
+
+
+def state(q: Any, qdot: Any, names: tuple[str, str] = ("q", "qdot")) -> tuple[Arrays, Arrays]:
     """Position and velocity as arrays of one structure, of equal shapes and one dtype."""
-    q, qdot = coordinates(q, names[0]), coordinates(qdot, names[1])
-    have, need = jax.tree.structure(qdot), jax.tree.structure(q)
-    if have != need:  # type: ignore[operator]
+    (xs, need), (vs, have) = _coordinates(q, names[0]), _coordinates(qdot, names[1])
+    if have != need:
         raise TypeError(f"`{names[1]}` must be structured like `{names[0]}`, {need}, but is {have}. Give each coordinate its velocity.")
-    dtype = jnp.result_type(*jax.tree.leaves((q, qdot)))
-    for (path, x), v in zip(jax.tree_util.tree_flatten_with_path(q)[0], jax.tree.leaves(qdot), strict=True):
+    for i, (x, v) in enumerate(zip(xs, vs, strict=True)):
         if x.shape != v.shape:
-            at = jax.tree_util.keystr(path)
+            labels = (Label(name, jax.tree.unflatten(need, xs), i) for name in names)
             raise ValueError(
-                f"`{names[1]}{at}` must have the shape of `{names[0]}{at}`, {x.shape}, but has {v.shape}. "
-                "Give each coordinate its velocity."
+                "{1} must have the shape of {0}, {2}, but has {3}. Give each coordinate its velocity.".format(*labels, x.shape, v.shape)
             )
-    return jax.tree.map(lambda x: x.astype(dtype), (q, qdot))
+    dtypes = {x.dtype for x in (*xs, *vs)}
+    dtype = dtypes.pop() if len(dtypes) == 1 else jnp.result_type(*dtypes)
+    q, qdot = (jax.tree.unflatten(need, [in_dtype(x, dtype) for x in part]) for part in (xs, vs))
+    return q, qdot
 
 
-def parameters(params: PyTree, like: PyTree[Array], name: str = "params") -> PyTree:
-    """`params` with numbers and arrays as JAX arrays, Python numbers in the precision of the coordinates, and mappings as dicts."""
+def parameters(params: PyTree, like: Arrays, name: str = "params") -> PyTree:
+    """`params` with numbers as arrays, Python's in the precision of the coordinates, and mappings as dicts."""
     check_entries(params)
-    dtype = jax.tree.leaves(like)[0].dtype
-
-    def array(path, leaf):
-        label = f"`{name}{jax.tree_util.keystr(path)}`"
-        if isinstance(leaf, Mapping):  # one that JAX takes for a leaf
-            return jax.tree_util.tree_map_with_path(lambda rest, leaf: array((*path, *rest), leaf), dict(leaf))
-        if isinstance(leaf, (int, float)) and not isinstance(leaf, bool):
-            return jnp.asarray(leaf, dtype)
-        if isinstance(leaf, np.ma.MaskedArray) or (isinstance(leaf, (np.ndarray, np.generic)) and leaf.dtype.kind not in "biucfV"):
-            return str(leaf) if isinstance(leaf, np.str_) else numbers(leaf, label)
-        if isinstance(leaf, (np.ndarray, np.generic)):
-            return jnp.asarray(leaf if leaf.dtype.itemsize <= 8 or leaf.dtype.kind == "c" else leaf.astype(float))
-        _check_visible(leaf, label)
-        return leaf
-
-    return jax.tree_util.tree_map_with_path(array, params)
+    return _parameters(params, jax.tree.leaves(like)[0].dtype, name)
 
 
-def _check_visible(leaf: Any, label: str) -> None:
+def _parameters(params, dtype, name):
+    leaves, structure = jax.tree.flatten(params)
+    return jax.tree.unflatten(structure, [_parameter(leaf, dtype, Label(name, params, i)) for i, leaf in enumerate(leaves)])
+
+
+def _parameter(leaf, dtype, label):
+    if isinstance(leaf, (int, float)) and not isinstance(leaf, bool):
+        return np.asarray(leaf, dtype)
+    if isinstance(leaf, jax.Array):  # a weakly typed one, such as `jnp.asarray(1.0)`, counts as a number: nothing is compiled anew for it
+        return leaf.astype(dtype) if leaf.dtype.kind == "f" and jax.typeof(leaf).weak_type else leaf
+    if isinstance(leaf, Mapping):  # one that JAX takes for a leaf
+        return _parameters(dict(leaf), dtype, str(label).strip("`"))
+    if isinstance(leaf, np.ma.MaskedArray) or (isinstance(leaf, (np.ndarray, np.generic)) and leaf.dtype.kind not in "biucfV"):
+        return str(leaf) if isinstance(leaf, np.str_) else numbers(leaf, label)
+    if isinstance(leaf, (np.ndarray, np.generic)):
+        known = leaf.dtype.itemsize <= 8 or leaf.dtype.kind == "c"
+        return in_dtype(leaf, jax.dtypes.canonicalize_dtype(leaf.dtype if known else float))
+    _check_visible(leaf, label)
+    return leaf
+
+
+def _check_visible(leaf: Any, label: Any) -> None:
     """Refuses objects whose numbers JAX cannot see: a compiled program would keep the ones it was first given."""
     kind = type(leaf).__name__
     if isinstance(leaf, (set, frozenset)):
         raise TypeError(f"{label} must be numbers in some order, but is a {kind}, which has none. Write a list or a tuple.")
-    by_identity = type(leaf).__hash__ is object.__hash__ and not callable(leaf) and not isinstance(leaf, jax.Array)  # type: ignore[comparison-overlap]
+    by_identity = type(leaf).__hash__ is object.__hash__ and not callable(leaf)  # type: ignore[comparison-overlap]
     try:
-        hash(None if isinstance(leaf, jax.Array) else leaf)
+        hash(leaf)
     except TypeError:
         by_identity = True
     if by_identity:
@@ -94,7 +108,7 @@ def _check_visible(leaf: Any, label: str) -> None:
         )
 
 
-def sample_times(ts: Any, dtype: Any) -> Array:
+def sample_times(ts: Any, dtype: Any) -> Float[Array | np.ndarray, " T"]:
     """The sample times as a vector, at least two and increasing."""
     if isinstance(ts, Mapping):
         raise TypeError(f"`ts` must be a list of times, but is a {type(ts).__name__}. Pass `ts` before `params`.")
@@ -102,19 +116,23 @@ def sample_times(ts: Any, dtype: Any) -> Array:
     if ts.ndim != 1 or ts.size < 2:
         raise ValueError(f"`ts` must be a list of at least two times, but has shape {ts.shape}. Start it with the time of q0.")
     if is_concrete(ts):
-        if not np.all(np.isfinite(ts)):
-            raise ValueError("`ts` must be finite, but has a NaN or an infinity. Drop the rows without a time.")
-        steps = np.diff(np.asarray(ts))
-        if (steps <= 0).any():
-            i = int(np.argmax(steps <= 0))
-            raise ValueError(
-                f"`ts` must increase, but ts[{i}] = {ts[i]:g} is followed by ts[{i + 1}] = {ts[i + 1]:g}. "
-                "Sort the times and drop repeated ones."
-            )
+        _check_order(np.asarray(ts))
     return ts
 
 
-def check(system: System, t: Array, q: PyTree[Array], qdot: PyTree[Array], params: PyTree) -> None:
+def _check_order(ts):
+    increasing = ts[1:] > ts[:-1]
+    if increasing.all() and np.isfinite(ts[[0, -1]]).all():
+        return
+    if not np.isfinite(ts).all():
+        raise ValueError("`ts` must be finite, but has a NaN or an infinity. Drop the rows without a time.")
+    i = int(np.argmin(increasing))
+    raise ValueError(
+        f"`ts` must increase, but ts[{i}] = {ts[i]:g} is followed by ts[{i + 1}] = {ts[i + 1]:g}. Sort the times and drop repeated ones."
+    )
+
+
+def check(system: System, t: Array, q: Arrays, qdot: Arrays, params: PyTree) -> None:
     """Refuses functions that return the wrong kind of thing. Evaluates shapes only: it runs while a program is traced, never with it."""
     for slot in ("lagrangian", "dissipation"):
         for name, function in getattr(system, slot):

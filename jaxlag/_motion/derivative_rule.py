@@ -1,6 +1,7 @@
 """Derivatives of a whole motion: one rule that serves forward and reverse mode, to any order."""
 
 from collections.abc import Callable
+from typing import Any, Protocol, runtime_checkable
 
 import equinox as eqx
 import jax
@@ -8,54 +9,111 @@ import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
 
-from .variational import jvp_along, pushforward, split_varying
+from .._program.jit import compiled
+from .variational import derived, pushforward, split_varying
 
 # Up to this many perturbed numbers the Jacobian comes whole out of one vectorised forward pass; beyond it a tangent is
 # pushed forward, or a cotangent pulled back, alone. The two cross near 100 (tests/benchmarks/bench_gradient.py).
 FORWARD_LIMIT = 96
 
 
-def differentiable(solve: Callable, pull_back: Callable, drift: Callable, push: Callable | None = None) -> Callable:
-    """`solve(inputs, ts) -> (y, aux)` with a derivative rule that needs no setting and no choice of mode.
+@runtime_checkable
+class DifferentiableMap(Protocol):
+    """A map (inputs, ts) ↦ (y, aux), and what its derivative rule asks of it. `inputs` is a pytree; `aux` is not differentiated."""
+
+    def solve(self, inputs: Any, ts: Any) -> tuple[Any, Any]:
+        """y and aux, with forward-mode derivatives in `inputs`."""
+
+    def pull_back(self, inputs: Any, ts: Any) -> tuple[Any, Any]:
+        """The same with reverse-mode derivatives, for many inputs."""
+
+    def push(self, inputs: Any, directions: tuple, ts: Any) -> tuple[Any, Any]:
+        """y and its derivatives along directions, ((y, dy), aux), for directions of two orders (((y, dy), (y, dy)'), aux) and so on.
+
+        Directions are the last axis of the leaves of `inputs`, and None where these are constant.
+        """
+
+    def drift(self, inputs: Any, ts: Any, y: Any) -> Any:
+        """dy/dts, each sample to its own time."""
+
+
+def differentiable(of: DifferentiableMap) -> Callable:
+    """`of.solve` with a derivative rule that needs no setting and no choice of mode.
 
     The rule's tangent is J dx, with the Jacobian J from the same pass as the value: linear in dx, so that it can be
     transposed, and serves `grad` as well as `jvp`. Within the rule the function that returns value and Jacobian carries
     the same rule, built only when it is differentiated in its turn; so derivatives of every order follow.
-
-    - `solve`: has forward-mode derivatives in `inputs`, a pytree. `aux` is not differentiated.
-    - `pull_back`: the same function with reverse-mode derivatives, for many inputs.
-    - `drift(inputs, ts, y)`: dy/dts, each sample to its own time.
-    - `push(varying, constant, directions, ts)`: y, its derivatives along directions of what varies, and aux; by default what `solve` gives.
+    Each function is a program of its own where Python asks for it, so that it is compiled with the options of such programs.
     """
-    push = push or pushforward(solve)
 
     @eqx.filter_custom_jvp
-    def motion(inputs, ts):
-        return solve(inputs, ts)
+    def solution(inputs, ts):
+        return solved(of, inputs, ts)
 
-    @motion.def_jvp
+    @solution.def_jvp
     def rule(primals, tangents):
         (inputs, ts), (d_inputs, d_ts) = primals, tangents
         varying, constant = split_varying(inputs, d_inputs)
-        x, unravel = ravel_pytree(varying)
-        dx = ravel_pytree(d_inputs)[0]
-        of_x = lambda f: lambda x_and_still, *rest: f(eqx.combine(unravel(x_and_still[0]), x_and_still[1]), *rest)
-        at_x = of_x(solve), of_x(pull_back), of_x(drift)
+        size = sum(jnp.size(leaf) for leaf in jax.tree.leaves(varying))
         change = None
-        if x.size == 0:
-            y, aux = motion(inputs, ts)
-        elif x.size <= FORWARD_LIMIT:
-            (y, J), aux = differentiable(*_with_jacobian(push, pushforward(pull_back), at_x[2], unravel))((x, constant), ts)
+        if size == 0:
+            y, aux = solution(inputs, ts)
+        elif size <= FORWARD_LIMIT:
+            (y, J), aux = differentiable(WithJacobian(of))((varying, constant), ts)
+            dx = ravel_pytree(d_inputs)[0]
             change = jax.tree.map(lambda rows: rows @ dx, J)
         else:
-            y, aux = motion(inputs, ts)
-            change = _jacobian_product(at_x[0], at_x[1], (x, constant), ts, y, dx)
+            y, aux = solution(inputs, ts)
+            change = _jacobian_product(of, varying, constant, ts, y, ravel_pytree(d_inputs)[0])
         if d_ts is not None:
-            shift = jax.tree.map(lambda rate: jax.vmap(jnp.multiply)(rate, d_ts), drift(inputs, ts, y))
+            shift = jax.tree.map(lambda rate: jax.vmap(jnp.multiply)(rate, d_ts), drifted(of, inputs, ts, y))
             change = shift if change is None else jax.tree.map(jnp.add, change, shift)
         return (y, aux), (change, jax.tree.map(lambda _: None, aux))
 
-    return motion
+    return solution
+
+
+@compiled
+def solved(of: DifferentiableMap, inputs: Any, ts: Any) -> tuple[Any, Any]:
+    """y and aux."""
+    return of.solve(inputs, ts)
+
+
+@compiled
+def drifted(of: DifferentiableMap, inputs: Any, ts: Any, y: Any) -> Any:
+    """dy/dts."""
+    return of.drift(inputs, ts, y)
+
+
+class WithJacobian(eqx.Module):
+    """The map (varying, constant), ts ↦ ((y, J), aux), with J = ∂y/∂varying: itself a `DifferentiableMap`."""
+
+    of: Any
+
+    def solve(self, inputs, ts):
+        """y and J in one forward pass."""
+        return self.push(inputs, (), ts)
+
+    def pull_back(self, inputs, ts):
+        """The same with reverse mode. A Jacobian of more columns than FORWARD_LIMIT never comes here."""
+        return pushforward(self.of.pull_back)(eqx.combine(*inputs), (unit_directions(inputs[0]),), ts)
+
+    def push(self, inputs, directions, ts):
+        """The same and its derivatives: of the one map along directions of more orders, not of a map that is differentiated already."""
+        every = unit_directions(inputs[0]), *(eqx.combine(*of_order) for of_order in directions)
+        return self.of.push(eqx.combine(*inputs), every, ts)
+
+    def drift(self, inputs, ts, y_and_J):
+        """The rates of y, and their Jacobian."""
+        (varying, constant), (y, J) = inputs, y_and_J
+        of_both = lambda both: (self.of.drift(both[0], ts, both[1]), None)
+        return derived(of_both, (unit_directions(varying), J))((eqx.combine(varying, constant), y))[0]
+
+
+def unit_directions(varying: Any) -> Any:
+    """One direction for each number of what varies, as last axis of its leaves."""
+    x, unravel = ravel_pytree(varying)
+    return jax.vmap(unravel, out_axes=-1)(jnp.eye(x.size, dtype=x.dtype))
 
 
 def differentiable_batch(solve: Callable, drift: Callable, push: Callable) -> Callable:
@@ -90,7 +148,7 @@ def differentiable_batch(solve: Callable, drift: Callable, push: Callable) -> Ca
             y, aux = motions(inputs, ts)
         else:
             directions = jax.vmap(direction, out_axes=-1)(jnp.eye(count, dtype=ts.dtype))
-            y, J, aux = push(varying, constant, directions, ts)
+            (y, J), aux = push(inputs, directions, ts)
             dx = jnp.broadcast_to(ravel_pytree(d_inputs[0])[0][:, None], (x.size, members))
             change = jnp.einsum("...mp,pm->...m", J, jnp.concatenate([dx, joined(jax.tree.leaves(d_inputs[1]))]))
         if d_ts is not None:
@@ -101,40 +159,23 @@ def differentiable_batch(solve: Callable, drift: Callable, push: Callable) -> Ca
     return motions
 
 
-def _with_jacobian(push, push_back, drift, unravel):
-    """The three functions of `differentiable` for (y, ∂y/∂x) in place of y, where inputs = (x, constant)."""
-
-    def both(push):
-        def value_and_jacobian(inputs, ts):
-            x, constant = inputs
-            y, J, aux = push(unravel(x), constant, jax.vmap(unravel, out_axes=-1)(jnp.eye(x.size, dtype=x.dtype)), ts)
-            return (y, J), aux
-
-        return value_and_jacobian
-
-    def drift_of_both(inputs, ts, y_and_J):
-        (x, constant), (y, J) = inputs, y_and_J
-        of_both = lambda both: (drift((both[0], constant), ts, both[1]), None)
-        rate, change, _ = jvp_along(of_both, (x, y), (jnp.eye(x.size, dtype=x.dtype), J))
-        return rate, change
-
-    # A Jacobian of more columns than FORWARD_LIMIT never comes here, and solve has forward mode: it serves as both.
-    return both(push), both(push_back), drift_of_both
-
-
-def _jacobian_product(solve, pull_back, inputs, ts, y, dx):
+def _jacobian_product(of, varying, constant, ts, y, dx):
     """J dx by one forward pass, whose transpose is one reverse pass.
 
     JAX takes a transpose from the user in `custom_linear_solve` alone: here a symmetric one whose "solution" of (a, b) is
     (Jᵀb, Ja). Of the two products the one that is not asked for is dropped by the compiler.
     """
-    x, constant = inputs
+    x, unravel = ravel_pytree(varying)
+    constant = jax.tree.map(lambda leaf: jnp.asarray(leaf) if isinstance(leaf, np.ndarray) else leaf, constant)
+
+    def at_x(solve):
+        return lambda x: solve(eqx.combine(unravel(x), constant), ts)[0]
 
     def products(_, z):
         a, b = z
-        pushforward = jax.jvp(lambda x: solve((x, constant), ts)[0], (x,), (a,))[1]
-        pulled = jax.vjp(lambda x: pull_back((x, constant), ts)[0], x)[1](b)[0]
-        return pulled, pushforward
+        pushed = jax.jvp(at_x(of.solve), (x,), (a,))[1]
+        pulled = jax.vjp(at_x(of.pull_back), x)[1](b)[0]
+        return pulled, pushed
 
     def matrix(z):
         only_first = eqx.internal.nondifferentiable(x, msg=SECOND_ORDER)

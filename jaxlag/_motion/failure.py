@@ -5,8 +5,7 @@ import numpy as np
 
 from .._mechanics.friction_elements import unread_friction
 from .._mechanics.singular_directions import explained
-from .._program.jit import is_concrete
-from .results import OF_THE_INPUT, OF_THE_STEPS, reason_of
+from .results import OF_THE_INPUT, OF_THE_STEPS, has_failed, reason_of
 from .trajectory import Trajectory
 
 
@@ -15,7 +14,7 @@ def raise_failure(trajectory: Trajectory, start: tuple | None = None) -> None:
 
     Given the `start` (q0, qdot0), it names the coordinates concerned.
     """
-    if not is_concrete(trajectory.result) or np.all(trajectory.succeeded):
+    if not has_failed(trajectory.result):
         return
     reason = reason_of(trajectory.result)
     if reason in map(reason_of, OF_THE_INPUT):

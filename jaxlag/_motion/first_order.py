@@ -85,6 +85,11 @@ class Sample(NamedTuple):
     works: dict[str, Array] | None
     friction: dict[str, tuple[Array, Array]]
     counts: dict[str, Array]
+
+
+class Evidence(NamedTuple):
+    """What tells whether a sample keeps the guarantees of a motion."""
+
     sound: Sound
     violation: Violation
 
@@ -186,7 +191,7 @@ class EquationsOfMotion:
         """Whether there were more transitions than allowed."""
         return self.parts(y).transitions[0] > self.formulation.friction.max_transitions
 
-    def sample(self, t, y, params, tolerances) -> Sample:
+    def sample(self, t, y, params, tolerances) -> tuple[Sample, Evidence]:
         """One sample, from y on the constraints."""
         rtol, atol = tolerances
         q, v, works, sigma, held, transitions, time_stuck = self.parts(y)
@@ -205,7 +210,7 @@ class EquationsOfMotion:
             counts = {"transitions": transitions[0], "time_stuck": time_stuck}
         named = dict(zip(self.works, works, strict=True)) if self.works else None
         unraveled = flat.unravel(q), flat.unravel(v), flat.unravel(qddot), flat.unravel_multipliers(multipliers)
-        return Sample(*unraveled, named, friction_states, counts, sound, jax.lax.stop_gradient(violation))
+        return Sample(*unraveled, named, friction_states, counts), Evidence(sound, jax.lax.stop_gradient(violation))
 
 
 @jitted  # so that diffrax's many calls trace it once
@@ -254,7 +259,7 @@ def _projected(equations: EquationsOfMotion, t, y, args):
     _, mode, elements = equations.mode(t, q, v, sigma, args)
     assert equations.projection is not None  # asked where there is something to keep
     projection = equations.projection
-    on_q, on_v = scalarised(lambda t, q, v: projection.project(mode, t, q, v))(t, q, v)
+    on_q, on_v = projection.project(mode, t, q, v)
     if equations.works:
         lift = energy_exchange(mode, t, on_q, on_v)[0] - energy_exchange(mode, t, q, v)[0]
         works = works.at[equations.works.index(PROJECTION)].add(lift)

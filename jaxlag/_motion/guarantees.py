@@ -4,27 +4,32 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, PyTree
 
 from .._mechanics.projection import off_constraints
-from .first_order import EquationsOfMotion, Sample
+from .first_order import EquationsOfMotion, Evidence, Sample
 from .protocol import Arguments
 from .results import RESULTS
 
 
 def verified(
-    equations: EquationsOfMotion, ts: Float[Array, " T1"], ys: Float[Array, "T1 y"], samples: Sample, params, result: RESULTS, tolerances
+    equations: EquationsOfMotion,
+    ts: Float[Array, " T1"],
+    ys: Float[Array, "T1 y"],
+    samples: tuple[Sample, Evidence],
+    params: PyTree,
+    result: RESULTS,
+    tolerances: tuple[Array, Array],
 ) -> tuple[Sample, RESULTS, Float[Array, ""]]:
     """The samples that keep the guarantees, NaN from the first that does not; the reason that the motion ended; and the time it reached.
 
     The last sample is not one of the motion but the last state that the integration reached, and says why it got no farther.
     """
     reached = ts[-1]
-    result = RESULTS.where((result == RESULTS.dt_min_reached) & _locks(equations, ts, samples), RESULTS.beyond_reach, result)
-    ts, ys, *samples = jax.tree.map(lambda leaf: leaf[:-1], (ts, ys, *samples))
-    samples = Sample(*samples)
+    result = RESULTS.where((result == RESULTS.dt_min_reached) & _locks(equations, ts, samples[0]), RESULTS.beyond_reach, result)
+    ts, ys, (sample, evidence) = jax.tree.map(lambda leaf: leaf[:-1], (ts, ys, samples))
     there = jnp.all(jnp.isfinite(ys), axis=1)
-    for projected, reason in _guarantees(equations, ts, ys, samples, params, tolerances):
+    for projected, reason in _guarantees(equations, ts, ys, sample, evidence, params, tolerances):
         broken = there & ~projected
         first = jnp.argmax(broken)
         there = there & (jnp.cumsum(broken) == 0)
@@ -34,23 +39,25 @@ def verified(
     def masked(leaf):
         return jnp.where(there.reshape(-1, *[1] * (leaf.ndim - 1)), leaf, jnp.nan) if jnp.issubdtype(leaf.dtype, jnp.floating) else leaf
 
-    return jax.tree.map(masked, samples), result, reached
+    return jax.tree.map(masked, sample), result, reached
 
 
-def _guarantees(equations: EquationsOfMotion, ts, ys, samples: Sample, params, tolerances) -> list[tuple[Bool[Array, " T"], Any]]:
+def _guarantees(
+    equations: EquationsOfMotion, ts, ys, sample: Sample, evidence: Evidence, params, tolerances
+) -> list[tuple[Bool[Array, " T"], Any]]:
     """Which samples keep each guarantee, and the reason that a motion ended where one does not."""
-    numbers = jax.tree.leaves((samples.qddot, samples.multipliers))
+    numbers = jax.tree.leaves((sample.qddot, sample.multipliers))
     finite = jnp.all(jnp.stack([jnp.all(jnp.isfinite(leaf.reshape(len(ts), -1)), axis=1) for leaf in numbers]), axis=0)
     guarantees = [(finite, RESULTS.undefined)]
     if equations.rows:
-        excess, scale = samples.violation
+        excess, scale = evidence.violation
         within = excess <= LITTLE * scale + LITTLE**1.5 * jnp.max(jnp.where(jnp.isfinite(scale), scale, 0), axis=0, keepdims=True)
         guarantees.append((jnp.all(within, axis=1), RESULTS.missed))
     if equations.projection is not None:
         off = jax.vmap(lambda t, y: _off(equations, t, y, params))(*jax.lax.stop_gradient((ts, ys)))
-        guarantees += [(off <= _residual_bound(tolerances), RESULTS.contradictory), (samples.sound.satisfied, RESULTS.contradictory)]
+        guarantees += [(off <= _residual_bound(tolerances), RESULTS.contradictory), (evidence.sound.satisfied, RESULTS.contradictory)]
     elif equations.system.constraints:  # what drifts contradicts itself in time
-        guarantees.append((samples.sound.satisfied | (jnp.arange(len(ts)) > 0), RESULTS.contradictory))
+        guarantees.append((evidence.sound.satisfied | (jnp.arange(len(ts)) > 0), RESULTS.contradictory))
     return guarantees
 
 
@@ -66,12 +73,12 @@ def _residual_bound(tolerances):
     return jnp.maximum(rtol + atol, jnp.finfo(rtol.dtype).eps ** 0.5)
 
 
-def _locks(equations, ts, samples):
+def _locks(equations, ts, sample):
     """Whether constrained velocities grow without bounds within next to no time of the motion, as at the end of a mechanism's reach."""
     if not equations.system.constraints:
         return jnp.array(False)
     largest = lambda tree: jnp.max(jnp.stack([jnp.max(jnp.abs(leaf[-1])) for leaf in jax.tree.leaves(tree)]))
-    return largest(samples.qdot) < SUDDEN * (ts[-2] - ts[0]) * largest(samples.qddot)
+    return largest(sample.qdot) < SUDDEN * (ts[-2] - ts[0]) * largest(sample.qddot)
 
 
 SUDDEN = 1e-6

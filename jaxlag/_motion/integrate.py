@@ -1,13 +1,16 @@
 """Integration of the equations of motion by diffrax."""
 
+import dataclasses
 import functools
 import warnings
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import diffrax as dfx
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool
 
 from .._mechanics.projection import Baumgarte, NoStabilisation, Projection, nearest_state
@@ -20,26 +23,28 @@ from .jumps import after_jump
 from .progress import Bar
 from .protocol import Arguments, FirstOrderSystem
 from .results import RESULTS, from_diffrax
-from .runge_kutta import Dop853, is_explicit
+from .runge_kutta import Dop853, ExplicitRungeKutta, is_explicit
 from .step_size import GuardedController, ResumingController
 from .stick_slip_solver import StickSlipSolver
-from .variational import VariationalEquations, jvp_along, with_variations
+from .variational import VariationalEquations, derived, with_variations
 from .wrapped_solver import ProjectedSolver, SamplingAdjoint
 
 
-class SolverOptions(eqx.Module):
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class SolverOptions:
     """The choices of numerics, for which a program is compiled."""
 
     solver: dfx.AbstractSolver
-    formulation: Formulation = eqx.field(static=True)
-    max_steps: int = eqx.field(static=True)
+    formulation: Formulation = dataclasses.field(metadata={"static": True})
+    max_steps: int = dataclasses.field(metadata={"static": True})
     adjoint: dfx.AbstractAdjoint | None = None
-    progress: bool = eqx.field(static=True, default=False)
+    progress: bool = dataclasses.field(default=False, metadata={"static": True})
 
     @classmethod
     def of(cls, solver: Any, formulation: Formulation, max_steps: Any, adjoint: Any = None, progress: bool = False) -> "SolverOptions":
         """Checked, with the default solver where none is given."""
-        solver = Dop853() if solver is None else solver
+        solver = _default_solver() if solver is None else solver
         for name, given, kinds, cure in (
             ("solver", solver, (dfx.AbstractSolver,), "`jaxlag.Dop853()` or `diffrax.Kvaerno5()`"),
             (
@@ -57,9 +62,14 @@ class SolverOptions(eqx.Module):
         return cls(solver, formulation, max_steps, adjoint, progress)
 
 
-def tolerances_of(rtol, atol, dtype) -> tuple[Array, Array]:
+@functools.cache
+def _default_solver() -> dfx.AbstractSolver:
+    return Dop853()
+
+
+def tolerances_of(rtol, atol, dtype) -> tuple[Array | np.ndarray, Array | np.ndarray]:
     """The given tolerances, or the defaults for the precision."""
-    single = jnp.finfo(dtype).bits < 64
+    single = dtype.itemsize < 8
     if single:
         _warn_of_single_precision()
     defaults = (1e-4, 1e-6) if single else (1e-8, 1e-10)
@@ -129,7 +139,7 @@ def states_at(
     projected = alone(equations.projected) if equations.projection else None
     solution = dfx.diffeqsolve.__wrapped__(  # all is within a program already, and `equinox.filter_jit` would keep what it is given
         dfx.ODETerm(alone(equations.rates)),
-        _wrapped(options, equations, projected, restart),
+        _wrapped(options, equations, projected, restart, adjoint),
         t0,
         end,
         None,
@@ -148,29 +158,41 @@ def states_at(
     return ys, from_diffrax(solution.result), stats | {"last": jax.lax.stop_gradient((last_t[0], last_y[0]))}
 
 
-def _wrapped(options, equations, projected, restart):
+def _wrapped(options, equations, projected, restart, adjoint):
     """The chosen solver, with what the equations ask for at the ends of its steps."""
+    solver = options.solver
+    if isinstance(solver, ExplicitRungeKutta) and isinstance(adjoint, dfx.ForwardMode):
+        solver = dataclasses.replace(solver, reverse=False)
     if isinstance(equations, EquationsOfMotion) and equations.rows:
-        return StickSlipSolver(options.solver, projected, 2 * equations.size, restart, equations)
+        return StickSlipSolver(solver, projected, 2 * equations.size, restart, equations)
     if projected is not None or restart is not None or options.formulation.works:
-        return ProjectedSolver(options.solver, projected, 2 * equations.size, restart)
-    return options.solver
+        return ProjectedSolver(solver, projected, 2 * equations.size, restart)
+    return solver
 
 
-def states_and_variations(
-    equations: FirstOrderSystem, options: SolverOptions, initial, varying, directions, t0, dt0, ts, args: Arguments, tolerances
-):
-    """The same with derivatives along directions of what varies, by the variational equations; `initial(varying) -> (y0, aux)`.
-
-    δt0 is None where t0 is constant.
+class Variations(NamedTuple):
+    """The equations of a motion with its variations of some order; and how y at the start follows from the inputs, with what else of
+    the start is of interest.
     """
-    y0, dy0, aux = jvp_along(initial, varying, directions)
-    if dt0 is not None:  # a start that is later lies further back at t0
-        dy0 = dy0 - jnp.multiply.outer(equations.rates(t0, y0, args._replace(directions=None)), dt0)
-    both = VariationalEquations(equations), options, dfx.ForwardMode(), t0, with_variations(y0, dy0)
-    ys, result, stats = states_at(*both, ts, args, tolerances)
-    last_t, last_y = stats["last"]
-    return ys[..., 0], ys[..., 1:], result, stats | {"last": (last_t, last_y[..., 0])}, aux
+
+    equations: FirstOrderSystem
+    initial: Callable
+    directions: tuple = ()  # of (params, own), for each order
+
+    def along(self, directions: Any, of_params: Any, dt0: Array | None, arguments: Callable) -> "Variations":
+        """With variations along more directions of the inputs, of which `of_params` are those of (params, own), and dt0 that of t0.
+
+        `arguments(inputs)` are t0 and the `Arguments` of the motion alone.
+        """
+
+        def initial(inputs):
+            (y0, dy0), aux = derived(self.initial, directions)(inputs)
+            if dt0 is not None:  # a start that is later lies further back at t0
+                t0, args = arguments(inputs)
+                dy0 = dy0 - jnp.multiply.outer(self.equations.rates(t0, y0, args._replace(directions=self.directions)), dt0)
+            return with_variations(y0, dy0), aux
+
+        return Variations(VariationalEquations(self.equations), initial, (*self.directions, of_params))
 
 
 def is_variational(equations: FirstOrderSystem, options: SolverOptions, varying_params, params) -> bool:

@@ -1,9 +1,17 @@
 """Progress of a long computation: one line on standard error, rewritten in place where somebody watches, and few lines in a log."""
 
+import contextlib
 import sys
+import threading
 import time
+from collections.abc import Iterator
+
+import jax
 
 OFTEN, SELDOM = 0.2, 10.0  # seconds between two updates where somebody watches; before the first in a log
+LONG = 2.0  # seconds, after which a compilation is worth a word
+COMPILED = "/jax/core/compile/backend_compile_duration"  # the last stage of three, as `jax.monitoring` names them
+STAGES = ("/jax/core/compile/jaxpr_trace_duration", "/jax/core/compile/jaxpr_to_mlir_module_duration", COMPILED)
 WIDTH = 30  # of a bar
 
 
@@ -63,3 +71,77 @@ class Bar(Line):
         """At a fraction from 0 to 1."""
         left = self.elapsed * (1 - part) / part if 0 < part < 1 else None
         self.say(f"{'█' * round(WIDTH * part):░<{WIDTH}} {100 * part:3.0f} %", left)
+
+
+@contextlib.contextmanager
+def compiling(what: str, shown: bool = True) -> Iterator[None]:
+    """Says that `what` is being compiled wherever JAX, while the block runs, takes more than two seconds over a program."""
+    if not shown:
+        yield
+        return
+    compilation, over = Compilation(what), threading.Event()
+
+    def watch():
+        while not over.wait(OFTEN):
+            compilation.say_if_long()
+
+    watching = threading.Thread(target=watch, daemon=True)
+    jax.monitoring.register_scalar_listener(compilation.begins)
+    jax.monitoring.register_event_duration_secs_listener(compilation.ends)
+    watching.start()
+    try:
+        yield
+    finally:
+        over.set()
+        watching.join()
+        jax.monitoring.unregister_scalar_listener(compilation.begins)
+        jax.monitoring.unregister_event_duration_listener(compilation.ends)
+        compilation.vanish()
+
+
+class Compilation(Line):
+    """The seconds that a compilation has taken, gone when it is over; in a log, a line when one first takes long.
+
+    A program is traced, lowered and compiled, one after the other, and each of these stages may hold others.
+    """
+
+    def __init__(self, what: str) -> None:
+        super().__init__()
+        self.state = f"compiling {what}"
+        self.lock = threading.RLock()  # of the thread that compiles and the one that watches
+        self.depth, self.rested = 0, 0.0
+        self.began: float | None = None
+
+    def begins(self, event: str, value: float, **about: str | int) -> None:
+        """When JAX begins a stage."""
+        with self.lock:
+            if event in STAGES:
+                self.began = self.elapsed if self.began is None else self.began
+                self.depth += 1
+
+    def ends(self, event: str, duration_secs: float, **about: str | int) -> None:
+        """When a stage is over."""
+        with self.lock:
+            if event in STAGES:
+                self.depth, self.rested = self.depth - 1, self.elapsed
+            if event == COMPILED and self.depth == 0:
+                self.vanish()
+
+    def say_if_long(self) -> None:
+        """The line, if a program has been in compilation for long; what is traced and then not compiled is forgotten."""
+        with self.lock:
+            if self.depth == 0 and self.elapsed > self.rested + LONG:
+                self.vanish()
+            elif self.began is not None and self.elapsed > self.began + LONG:
+                if self.watched:
+                    self._write(f"{self.state}   {self.elapsed - self.began:.0f} s", "")
+                elif not self.longest:
+                    self._write(f"{self.state} ...", "\n")
+
+    def vanish(self) -> None:
+        """Leaves an empty line to whatever comes next, such as the progress bar."""
+        with self.lock:
+            self.began = None
+            if self.watched and self.longest:
+                print("\r" + " " * self.longest, end="\r", file=self.stream, flush=True)
+                self.longest = 0

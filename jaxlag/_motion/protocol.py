@@ -11,6 +11,7 @@ from jaxtyping import Array, PyTree
 
 from .._mechanics.projection import Projection
 from .._model.signal import least_spacing
+from .._program.jit import jitted
 
 
 class Scales(NamedTuple):
@@ -49,7 +50,7 @@ class Arguments(NamedTuple):
     params: PyTree  # of the system; in a batch, those that all members share
     scales: Scales | None = None  # None where no event is located
     own: PyTree = None  # in a batch, the params of each member, members last
-    directions: Any = None  # of the variational equations: the derivatives of (params, own), directions last
+    directions: tuple = ()  # of the variational equations, for each order: derivatives of (params, own), directions last
 
 
 @runtime_checkable
@@ -97,11 +98,11 @@ class AugmentedSystem(abc.ABC):
 
     def rates(self, t: Any, y: Array, args: Arguments) -> Array:
         """ẏ."""
-        return self.along_axis(self.equations.rates, t, y, args)
+        return _along_axis(self, "rates", t, y, args)
 
     def projected(self, t: Any, y: Array, args: Arguments) -> Array:
         """y, put back on the manifold."""
-        return self.along_axis(self.equations.projected, t, y, args)
+        return _along_axis(self, "projected", t, y, args)
 
     @abc.abstractmethod
     def error_norm(self, error: Array) -> Array:
@@ -110,3 +111,8 @@ class AugmentedSystem(abc.ABC):
     @abc.abstractmethod
     def along_axis(self, function: Callable, t: Any, y: Array, args: Arguments) -> Array:
         """A function (t, y, args) of the equations, for all that lies along the last axis."""
+
+
+@jitted  # so that diffrax's many calls trace it once
+def _along_axis(augmented: AugmentedSystem, name: str, t: Any, y: Array, args: Arguments) -> Array:
+    return augmented.along_axis(getattr(augmented.equations, name), t, y, args)

@@ -2,6 +2,7 @@
 
 import equinox as eqx
 import jax
+import numpy as np
 from jaxtyping import Array, PyTree
 
 from .._mechanics.stick_slip import Regularised, StickSlip
@@ -13,7 +14,7 @@ class Provenance(eqx.Module):
     of motions consist of arrays only.
     """
 
-    numbers: list[Array]
+    numbers: list[Array | np.ndarray]
     system: System = eqx.field(static=True)
     rest: tuple = eqx.field(static=True)
     friction: StickSlip | Regularised = eqx.field(static=True)

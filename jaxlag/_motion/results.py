@@ -4,6 +4,7 @@ from typing import Any
 
 import diffrax as dfx
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -65,6 +66,12 @@ OF_THE_INPUT = (
     RESULTS.negative_bound,
 )
 OF_THE_STEPS = (RESULTS.max_steps_reached, RESULTS.dt_min_reached)  # which other numerical settings may cure
+
+
+def has_failed(result: Any) -> bool:
+    """Whether a motion has failed, as far as that is known: under `jit` it is not. Asked on the host, at a tenth of the time of `!=`."""
+    code = result._value
+    return not isinstance(code, jax.core.Tracer) and bool(np.any(np.asarray(code) != np.asarray(RESULTS.successful._value)))  # type: ignore[attr-defined]
 
 
 def reason_of(result: Any) -> str:

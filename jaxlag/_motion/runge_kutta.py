@@ -3,6 +3,7 @@
 from typing import Any, ClassVar
 
 import diffrax as dfx
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -45,6 +46,7 @@ class ExplicitRungeKutta(dfx.AbstractAdaptiveSolver):
     """An explicit Runge–Kutta scheme; the derivative at the end of a step is that at the start of the next."""
 
     tableau: ClassVar[Tableau]
+    reverse: bool = eqx.field(static=True, default=True, kw_only=True)  # whether reverse mode may go through the loop over the stages
     term_structure: ClassVar = dfx.AbstractTerm
     interpolation_cls: ClassVar = Polynomial
 
@@ -59,8 +61,6 @@ class ExplicitRungeKutta(dfx.AbstractAdaptiveSolver):
 
     def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
         scheme, h = self.tableau, terms.contr(t0, t1)
-        if made_jump is not False:
-            solver_state = jax.lax.cond(made_jump, lambda: terms.vf(t0, y0, args), lambda: solver_state)
         changes = lambda weights, f: jax.tree.map(lambda f: terms.prod(weighted(weights, f), h), f)
 
         def stage(f, row):
@@ -71,9 +71,15 @@ class ExplicitRungeKutta(dfx.AbstractAdaptiveSolver):
 
         # One loop, so that the equations are compiled once. What is not there yet counts as nothing.
         size, dtype = len(scheme.c), jnp.result_type(*jax.tree.leaves(y0))
+        rows = np.arange(size), np.array(scheme.c, dtype), as_rows([[], *scheme.a], size, dtype)
+        if made_jump is not False and self.reverse:
+            solver_state = jax.lax.cond(made_jump, lambda: terms.vf(t0, y0, args), lambda: solver_state)
         first = jax.tree.map(lambda x: jnp.concatenate([x[None], jnp.zeros((size - 1, *x.shape), x.dtype)]), solver_state)
-        rows = np.arange(1, size), np.array(scheme.c[1:], dtype), as_rows(scheme.a, size, dtype)
-        f, _ = jax.lax.scan(stage, first, rows)
+        if made_jump is False or self.reverse:
+            f, _ = jax.lax.scan(stage, first, jax.tree.map(lambda x: x[1:], rows))
+        else:
+            at = lambda i: jax.tree.map(lambda x: jnp.asarray(x)[i], rows)
+            f = jax.lax.fori_loop(jnp.where(made_jump, 0, 1), size, lambda i, f: stage(f, at(i))[0], first)
 
         last = scheme.stages - 1
         ends, estimates = np.eye(size)[[0, last]], len(scheme.errors)

@@ -1,10 +1,8 @@
 """The motion of one system."""
 
-import functools
 from typing import Any
 
 import diffrax as dfx
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, PyTree
@@ -12,19 +10,17 @@ from jaxtyping import Array, PyTree
 from .._mechanics.projection import Baumgarte, NoStabilisation, Projection
 from .._mechanics.stick_slip import Regularised, StickSlip
 from .._model.deprecation import renamed
-from .._model.signal import with_second_derivatives
 from .._model.system import System
-from .._model.validation import checked, parameters, sample_times, state
-from .._program.jit import compiled
+from .._model.validation import parameters, sample_times, state
+from .._program.jit import compiled, is_concrete
 from .derivative_rule import differentiable
 from .failure import raise_failure
-from .first_order import EquationsOfMotion, Formulation
-from .guarantees import verified
-from .integrate import SolverOptions, initialised, is_variational, states_and_variations, states_at, tolerances_of, with_status
-from .protocol import Arguments, Scales
-from .provenance import Provenance
-from .trajectory import FrictionState, Trajectory
-from .variational import pushforward
+from .first_order import Formulation
+from .integrate import SolverOptions, tolerances_of
+from .padding import padded_signals, padded_times, without_padding
+from .progress import compiling
+from .solution_map import Inputs, SolutionMap, trajectory_of
+from .trajectory import Trajectory
 
 
 def simulate(
@@ -67,7 +63,7 @@ def simulate(
     - `max_steps`: step limit.
     - `adjoint`: a diffrax adjoint, used in place of the derivative rule of this package.
     - `works`: integrates the work of each term along with the motion, for `Trajectory.work()` and the energy balance.
-    - `progress`: shows a progress bar on standard error; in a log, a line now and then.
+    - `progress`: shows a progress bar on standard error; in a log, a line now and then. Says so where compilation takes long.
     - `throw`: whether a failure raises. If not, or under `jit`, `Trajectory.result` holds the reason, and samples not reached are NaN.
     - `audit`: deprecated name of `works`.
 
@@ -91,63 +87,23 @@ def simulate(
     dtype = jax.tree.leaves(q0)[0].dtype
     options = SolverOptions.of(solver, Formulation(stabilisation, friction, works), max_steps, adjoint, progress)
     ts, tolerances = sample_times(ts, dtype), tolerances_of(rtol, atol, dtype)
-    trajectory = _simulate(system, options, q0, qdot0, ts, parameters(params, q0), tolerances)
+    given, length = parameters(params, q0), ts.size
+    ts, params = padded_times(ts), padded_signals(given)
+    inputs, solution_map = Inputs(None, q0, qdot0, params, tolerances), SolutionMap(system, options)
+    with compiling("the motion", progress):
+        if adjoint is not None or is_concrete(inputs, ts):
+            trajectory = _trajectory(solution_map, inputs, ts)
+        else:
+            solution = differentiable(solution_map)(inputs._replace(t0=ts[0]), ts)
+            trajectory = trajectory_of(system, options, params, jnp.asarray(ts), *solution)
+    if ts.size > length or params is not given:
+        trajectory = without_padding(trajectory, length, given)
     if throw:
         raise_failure(trajectory, (q0, qdot0))
     return trajectory
 
 
 @compiled
-def _simulate(system, options, q0, qdot0, ts, params, tolerances):
-    flat, t0, q, v = checked(system, ts[0], q0, qdot0, params)
-    equations = EquationsOfMotion.of(system, q0, options.formulation, flat, t0, q, v)
-    solve = functools.partial(_motion, equations, options)
-    if options.adjoint is None:
-        drift = lambda inputs, ts, ys: jax.vmap(lambda t, y: equations.rates(t, y, Arguments(inputs[3])))(ts, ys)
-        forward, reverse = (functools.partial(solve, adjoint) for adjoint in (dfx.ForwardMode(), dfx.RecursiveCheckpointAdjoint()))
-        run = differentiable(forward, reverse, drift, functools.partial(_motion_and_variations, equations, options))
-    else:
-        run = functools.partial(solve, options.adjoint)
-    ys, (result, stats) = run((t0, q, v, params, tolerances), ts)
-    return trajectory_of(system, equations, ts, ys, params, result, stats, tolerances)
-
-
-def trajectory_of(system: System, equations: EquationsOfMotion, ts, ys, params, result, stats, tolerances) -> Trajectory:
-    """The trajectory with these states, and whether it keeps what a successful motion guarantees."""
-    last_t, last_y = stats.pop("last")
-    times, states = jnp.concatenate([ts, last_t[None]]), jnp.concatenate([ys, last_y[None]])
-    samples = jax.vmap(lambda t, y: equations.sample(t, y, params, tolerances))(times, states)
-    samples, result, reached = verified(equations, times, states, samples, params, result, tolerances)
-    q, qdot, qddot, multipliers, works, friction_states, counts, *_ = samples
-    friction_states = {name: FrictionState(*of_term) for name, of_term in friction_states.items()}
-    provenance = Provenance.of(system, params, equations.formulation.friction)
-    stats = stats | counts | {"reached": reached}
-    return Trajectory(ts, q, qdot, qddot, multipliers, result, stats, works, friction_states, provenance)
-
-
-def _motion(equations, options, adjoint, inputs, ts):
-    """y at the samples; and, not differentiated, the reason it ended and the counts."""
-    t0, q, v, params, tolerances = inputs
-    params = with_second_derivatives(params)
-    start, args = initialised(equations, t0, q, v, params), Arguments(params, Scales.of(tolerances, ts, params))
-    ys, result, stats = states_at(equations, options, adjoint, t0, start.y, ts, args, tolerances)
-    ys, result = with_status(ys, result, start.conditions, (inputs, ts))
-    return ys, (result, stats | {"start_moved": start.moved})
-
-
-def _motion_and_variations(equations, options, varying, constant, directions, ts):
-    """The same with derivatives along directions of what varies, by the variational equations where they hold."""
-    inputs = t0, *_, params, tolerances = eqx.combine(varying, constant)
-    if not is_variational(equations, options, varying[3], params):
-        return pushforward(functools.partial(_motion, equations, options, dfx.ForwardMode()))(varying, constant, directions, ts)
-
-    def initial(varying):
-        t0, q, v, params, _ = eqx.combine(varying, constant)
-        start = initialised(equations, t0, q, v, with_second_derivatives(params))
-        return start.y, start
-
-    args = Arguments(with_second_derivatives(params), directions=(directions[3], None))
-    along_all = varying, directions, t0, directions[0], ts, args
-    ys, change, result, stats, start = states_and_variations(equations, options, initial, *along_all, tolerances)
-    ys, result = with_status(ys, result, start.conditions, (inputs, ts))
-    return ys, jnp.where(jnp.isfinite(ys)[..., None], change, 0), (result, stats | {"start_moved": start.moved})
+def _trajectory(solution_map, inputs, ts):
+    """The motion and its `Trajectory` in one program: to build that in Python takes as long as some ten steps of a vehicle."""
+    return trajectory_of(solution_map.system, solution_map.options, inputs.params, ts, *solution_map.solve(inputs, ts))

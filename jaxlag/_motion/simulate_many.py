@@ -25,12 +25,13 @@ from .batch import BatchedEquations
 from .derivative_rule import differentiable_batch
 from .failure import raise_failure
 from .first_order import EquationsOfMotion, Formulation
-from .integrate import SolverOptions, initialised, is_variational, states_and_variations, states_at, tolerances_of, with_status
+from .integrate import SolverOptions, Variations, initialised, is_variational, states_at, tolerances_of, with_status
 from .protocol import Arguments
 from .results import RESULTS
-from .simulate import simulate, trajectory_of
+from .simulate import simulate
+from .solution_map import samples_at, trajectory_of
 from .trajectory import Trajectory
-from .variational import pushforward
+from .variational import pushforward, split_varying
 
 BATCH_SIZE = 64  # members that share their steps: as many as the cache holds the stages of
 
@@ -202,7 +203,7 @@ def _batch(system, equations, options, own, shared, ts, tolerances):
     def one(ys, last_y, result, moved, own):
         params = eqx.combine(own, shared)["params"]
         of_member = stats | {"start_moved": moved, "last": (last_t, last_y)}
-        return trajectory_of(system, equations, ts, ys, params, result, of_member, tolerances)
+        return trajectory_of(system, options, params, ts, *samples_at(equations, ts, ys, params, result, of_member, tolerances))
 
     return jax.vmap(one, in_axes=(-1, -1, 0, 0, 0))(ys, last_ys, result, moved, own)
 
@@ -216,18 +217,23 @@ def _motions(equations, options, inputs, ts):
     return _with_status(ys, result, stats, start)
 
 
-def _motions_and_variations(equations, options, varying, constant, directions, ts):
+def _motions_and_variations(equations, options, inputs, directions, ts):
     """The same with derivatives along directions of what varies, by the variational equations where they hold."""
-    (t0, tolerances, shared), own = eqx.combine(varying, constant)
-    if not is_variational(equations, options, varying[0][2]["params"], shared["params"]):
-        return pushforward(functools.partial(_motions, equations, options))(varying, constant, directions, ts)
-    initial = lambda varying: _initialised(equations, eqx.combine(varying, constant), ts)
-    of_params = directions[0][2]["params"], directions[1]["params"]
-    args = Arguments(with_second_derivatives(shared["params"]), own=own["params"], directions=of_params)
-    along_all = varying, directions, t0, directions[0][0], ts, args
-    ys, change, *rest = states_and_variations(BatchedEquations(equations), options, initial, *along_all, tolerances)
-    ys, aux = _with_status(ys, *rest)
-    return ys, jnp.where(jnp.isfinite(ys)[..., None], change, 0), aux
+    (t0, tolerances, shared), own = inputs
+    (dt0, _, d_shared), d_own = directions
+    varying = split_varying(inputs, directions)[0][0][2]["params"]
+    if not is_variational(equations, options, varying, shared["params"]):
+        return pushforward(functools.partial(_motions, equations, options))(inputs, (directions,), ts)
+    args = Arguments(with_second_derivatives(shared["params"]), own=own["params"])
+    variations = Variations(BatchedEquations(equations), lambda inputs: _initialised(equations, inputs, ts))
+    variations = variations.along(directions, (d_shared["params"], d_own["params"]), dt0, lambda _: (t0, args))
+    y0, start = variations.initial(inputs)
+    args = args._replace(directions=variations.directions)
+    ys, result, stats = states_at(variations.equations, options, dfx.ForwardMode(), t0, y0, ts, args, tolerances)
+    last_t, last_y = stats["last"]
+    ys, change = ys[..., 0], ys[..., 1:]
+    ys, aux = _with_status(ys, result, stats | {"last": (last_t, last_y[..., 0])}, start)
+    return (ys, jnp.where(jnp.isfinite(ys)[..., None], change, 0)), aux
 
 
 def _initialised(equations, inputs, ts):

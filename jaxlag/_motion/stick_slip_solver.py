@@ -12,6 +12,7 @@ import numpy as np
 from .._program.jit import jitted
 from .first_order import EquationsOfMotion
 from .results import RESULTS, under_diffrax
+from .runge_kutta import ExplicitRungeKutta
 from .step_monitor import Seen, first_end, is_hidden
 from .tableaux import Tableau
 from .wrapped_solver import ProjectedSolver
@@ -90,8 +91,17 @@ class StickSlipSolver(ProjectedSolver):
 
         return pieces
 
+    def init(self, terms, t0, t1, y0, args):
+        """The state of the solver, and whether it has yet to be made: the loop over the first step's stages does, which is there anyway."""
+        make = lambda: self.solver.init(terms, t0, t1, y0, args)
+        if not isinstance(self.solver, ExplicitRungeKutta):
+            return make(), jnp.array(False)
+        return jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), jax.eval_shape(make)), jnp.array(True)
+
     def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
         y0, starts = self.restarted(t0, y0, args, made_jump)
+        solver_state, is_new = solver_state
+        made_jump = made_jump | is_new
         piece = lambda *given: Piece(*self.projected_step(terms, *given[:3], args, *given[3:]))
         given = t0, t1, y0, solver_state, jnp.asarray(made_jump)
         nothing = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), jax.eval_shape(piece, *given))
@@ -101,7 +111,8 @@ class StickSlipSolver(ProjectedSolver):
         run = functools.partial(self._run, piece, given, args)
         needed = lambda split, phase: jax.lax.cond((phase == WHOLE) | split.seen.ended, run, lambda split, _: split, split, phase)
         split, _ = jax.lax.scan(lambda split, phase: (needed(split, phase), None), uncut, PHASES)
-        return self._joined(split, t0, t1, y0, args, starts)
+        y1, error, dense, solver_state, result = self._joined(split, t0, t1, y0, args, starts)
+        return y1, error, dense, (solver_state, jnp.array(False)), result
 
     def _run(self, piece, given, args, split: Split, phase) -> Split:
         """One phase of the step."""

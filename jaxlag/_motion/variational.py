@@ -23,11 +23,25 @@ def jvp_along(function: Callable, x: Any, directions: Any) -> tuple[Any, Any, An
     return jax.vmap(one, in_axes=-1, out_axes=(None, -1, None))(directions)
 
 
-def pushforward(solve: Callable) -> Callable:
-    """How `solve` itself differentiates forward: y, its derivatives along directions, which come last in their leaves, and aux."""
+def derived(function: Callable, directions: Any) -> Callable:
+    """x ↦ ((y, its derivatives along directions of what varies of x), aux); what is constant has None for its directions."""
 
-    def push(varying, constant, directions, ts):
-        return jvp_along(lambda varying: solve(eqx.combine(varying, constant), ts), varying, directions)
+    def both(x):
+        varying, constant = split_varying(x, directions)
+        y, dy, aux = jvp_along(lambda varying: function(eqx.combine(varying, constant)), varying, directions)
+        return (y, dy), aux
+
+    return both
+
+
+def pushforward(solve: Callable) -> Callable:
+    """How `solve` itself differentiates forward: y and aux with its derivatives along directions, those of each order in turn."""
+
+    def push(inputs, directions, ts):
+        function = lambda inputs: solve(inputs, ts)
+        for of_order in directions:
+            function = derived(function, of_order)
+        return function(inputs)
 
     return push
 
@@ -43,19 +57,19 @@ def with_variations(y: Array, dy: Array) -> Array:
 
 
 class VariationalEquations(AugmentedSystem):
-    """The `FirstOrderSystem` of a motion without stick and slip together with its variations, which are the last axis of y."""
+    """The `FirstOrderSystem` of a motion without stick and slip together with its variations, which are the last axis of y.
+
+    That of its variational equations in their turn has the second variations, and so on.
+    """
 
     def error_norm(self, error: Array) -> Array:
         """The error of the motion alone sets the steps."""
         return self.equations.error_norm(error[..., 0])
 
     def along_axis(self, function: Callable, t: Any, y: Array, args: Arguments) -> Array:
-        varying, constant = split_varying((args.params, args.own), args.directions)
-        of_both = lambda both: (function(t, both[0], _arguments(eqx.combine(both[1], constant))), None)
-        value, change, _ = jvp_along(of_both, (y[..., 0], varying), (y[..., 1:], args.directions))
+        *before, directions = args.directions
+        given = lambda numbers: Arguments(numbers[0], own=numbers[1], directions=tuple(before))
+        of_both = lambda both: (function(t, both[0], given(both[1])), None)
+        numbers = (args.params, args.own)
+        (value, change), _ = derived(of_both, (y[..., 1:], directions))((y[..., 0], numbers))
         return with_variations(value, change)
-
-
-def _arguments(numbers):
-    params, own = numbers
-    return Arguments(params, own=own)

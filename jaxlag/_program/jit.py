@@ -6,7 +6,7 @@ choice is the user's: the environment variable XLA_FLAGS="--xla_cpu_use_fusion_e
 """
 
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from typing import Any
 
 import jax
@@ -22,6 +22,30 @@ def jitted(function: Callable, **options: Any) -> Callable:
 
     `equinox.filter_jit` does that too, but keeps its arguments alive in a cache of JAX that `jax.clear_caches` does not clear.
     """
+    program = _program(function, **options)
+
+    @functools.wraps(function)
+    def call(*given, **named):
+        return program(*_split(given, named))
+
+    return call
+
+
+def compiled(function: Callable) -> Callable:
+    """`jitted`, with compiler options of its own where Python calls the program, not another program."""
+    within = _program(function)
+
+    @functools.wraps(function)
+    def call(*given, **named):
+        arrays, static = _split(given, named)
+        program = _program_with_options(function) if is_called_by_python(arrays) else within
+        return program(arrays, static)
+
+    return call
+
+
+def _program(function, **options):
+    """The compiled `function(arrays, static)`."""
 
     def on_leaves(arrays, static):
         leaves, structure = static
@@ -30,38 +54,31 @@ def jitted(function: Callable, **options: Any) -> Callable:
         return function(*given, **named)
 
     on_leaves.__name__ = getattr(function, "__name__", "on_leaves")  # the name of the program
-    program = jax.jit(on_leaves, static_argnums=1, **options)
-
-    @functools.wraps(function)
-    def call(*given, **named):
-        leaves, structure = jax.tree.flatten((given, named))
-        is_array = [isinstance(leaf, (jax.Array, np.ndarray)) for leaf in leaves]
-        arrays = [leaf if traced else None for leaf, traced in zip(leaves, is_array, strict=True)]
-        static = tuple(None if traced else leaf for leaf, traced in zip(leaves, is_array, strict=True))
-        return program(arrays, (static, structure))
-
-    return call
+    return jax.jit(on_leaves, static_argnums=1, **options)
 
 
-def compiled(function: Callable) -> Callable:
-    """`jitted`, with compiler options of its own where Python calls the program, not another program."""
-    within = jitted(function)
-
-    @functools.wraps(function)
-    def call(*given, **named):
-        return (_jitted_with_options(function) if _is_called_by_python(given, named) else within)(*given, **named)
-
-    return call
+def _split(given, named):
+    """The arrays among the leaves, and what is static: the other leaves and the structure. Each has None where the other has a leaf."""
+    leaves, structure = jax.tree.flatten((given, named))
+    is_array = [isinstance(leaf, (jax.Array, np.ndarray, np.number)) for leaf in leaves]
+    arrays = [leaf if traced else None for leaf, traced in zip(leaves, is_array, strict=True)]
+    static = tuple(None if traced else leaf for leaf, traced in zip(leaves, is_array, strict=True))
+    return arrays, (static, structure)
 
 
-def _is_called_by_python(*given) -> bool:
-    """Whether the call is not being traced: under `jit` even what is computed from numbers is traced."""
-    return jax.default_backend() == "cpu" and is_concrete(given, jnp.zeros(()))
+def is_called_by_python(arrays: Iterable[Any] = ()) -> bool:
+    """Whether the call is not being traced: under `jit` even what is computed from nothing is traced."""
+    return jax.default_backend() == "cpu" and not any(issubclass(kind, jax.core.Tracer) for kind in {type(_nothing()), *map(type, arrays)})
+
+
+@jax.jit
+def _nothing():
+    return 0
 
 
 @functools.cache
-def _jitted_with_options(function):
-    return jitted(function, compiler_options=_options())
+def _program_with_options(function):
+    return _program(function, compiler_options=_options())
 
 
 @functools.cache
@@ -72,6 +89,11 @@ def _options() -> dict[str, bool]:
     except jax.errors.JaxRuntimeError:
         return {}
     return OLD_EMITTERS
+
+
+def numpy_for(*trees: PyTree) -> Any:
+    """The module to compute these in: NumPy where the values are known, at a hundredth of the time that JAX takes for a small array."""
+    return np if is_concrete(*trees) else jnp
 
 
 def is_concrete(*trees: PyTree) -> bool:

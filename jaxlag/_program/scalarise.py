@@ -34,7 +34,7 @@ class _Jax(Algebra):
 JAX_ALGEBRA = _Jax()
 
 
-def scalarised(function: Callable, *, limit: int = 700) -> Callable:
+def scalarised(function: Callable, *, limit: int = 800) -> Callable:
     """`function` of pytrees of arrays as scalar code: the same values and derivatives, to rounding, in less time where it is small.
 
     What has no scalar form (a decomposition, a loop of unknown length) still works on arrays. A function of more than `limit` scalar
@@ -100,19 +100,29 @@ def _whole(equation, *arrays):
 
 
 def _custom_jvp_as_scalar_code(equation, *arrays):
-    """The body as scalar code, with its own derivative rule."""
+    """The body as scalar code, with its own derivative rule; what is not a real number has no derivative."""
     given, rebuild = _without_numbers(arrays)
-    if not all(jax.numpy.issubdtype(x.dtype, jax.numpy.inexact) for x in given):
-        return _whole(equation, *arrays)
-    on_scalars = lambda given: [x for array in _whole(equation, *rebuild(given)) for x in array.flat]
+    is_real = [jax.numpy.issubdtype(x.dtype, jax.numpy.inexact) for x in given]
+    on_scalars = lambda real, others: [x for array in _whole(equation, *rebuild(merged(real, others))) for x in array.flat]
+
+    def merged(real, others):
+        parts = {True: iter(real), False: iter(others)}
+        return [next(parts[kind]) for kind in is_real]
 
     @jax.custom_jvp
-    def body(given):
-        outputs = zip(evaluate(equation.params["call_jaxpr"], JAX_ALGEBRA, *rebuild(given)), equation.outvars, strict=True)
+    def body(real, others):
+        results = evaluate(equation.params["call_jaxpr"], JAX_ALGEBRA, *rebuild(merged(real, others)))
+        outputs = zip(results, equation.outvars, strict=True)
         return [jax.numpy.asarray(x, variable.aval.dtype) for array, variable in outputs for x in array.flat]
 
-    body.defjvp(lambda primals, tangents: _as_scalar_code(lambda *pair: jax.jvp(on_scalars, *pair))(primals, tangents))
-    return unflattened(body(given), [variable.aval.shape for variable in equation.outvars])
+    def rule(primals, tangents):
+        (real, others), (change, _) = primals, tangents
+        along = lambda real, change, others: jax.jvp(lambda real: on_scalars(real, others), (real,), (change,))
+        return _as_scalar_code(along)(real, change, others)
+
+    body.defjvp(rule)
+    parts = [[x for x, kind in zip(given, is_real, strict=True) if kind is which] for which in (True, False)]
+    return unflattened(body(*parts), [variable.aval.shape for variable in equation.outvars])
 
 
 def _linear_solve_as_scalar_code(equation, *arrays):

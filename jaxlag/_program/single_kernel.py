@@ -14,8 +14,8 @@ import jax.numpy as jnp
 
 from .walker import count_equations
 
-# Operations. Two links with one variation have 334, and take a seventh of the time; the vehicle has 206, and would take over twice as long.
-MIN_OPERATIONS = 320
+# Operations. Two links with one variation have 311, and take a seventh of the time; the vehicle has 206, and would take over twice as long.
+MIN_OPERATIONS = 300
 # The leading size of the result. From here on the stages of a step are too large for one kernel: 8 coordinates take 42 µs a step
 # against 4.5.
 MIN_ROWS = 16

@@ -1,14 +1,21 @@
-"""First use: seconds until the vehicle's first motion, gradient and fit in fresh processes, and then of each again.
+"""First use: what a person waits for in fresh processes, each beside the same by hand with JAX and diffrax in the same run.
 
-jaxlag as a user calls it, against hand-derived equations with diffrax and optimistix in their default settings (gradient
-in reverse mode; only the fit requires another adjoint). "import" is that of the libraries named.
+The vehicle: seconds until its first motion, gradient and fit, and then of each again; by hand with hand-derived equations, diffrax and
+optimistix in their default settings (gradient in reverse mode; only the fit requires another adjoint). The pendulum of README's first
+example, a point on a rod with the constraint |r| = l: its first motion, gradient and Hessian, its first motion with dry friction in the
+joint and the gradient of that; by hand from its equations with the multiplier eliminated. The whole of that example, without and with
+`keep_compiled`. "import" is that of the libraries named.
 Run: python tests/benchmarks/bench_first_use.py [processes]
 """
 
 import json
+import os
+import re
 import statistics
 import subprocess
 import sys
+import tempfile
+from pathlib import Path
 
 from timing import Row, record
 
@@ -63,29 +70,135 @@ solver = optx.LevenbergMarquardt(1e-6, 1e-6)
 best = jax.jit(lambda measured: optx.least_squares(residual, solver, jnp.ones(2), measured, options={"jac": "fwd"}).value)
 fit = lambda: best(run(3000.0))
 """
-CODES = {
+VEHICLE = {
     "jaxlag": TIMED.format(imports="import jaxlag as jl", actions=JAXLAG),
     "JAX + diffrax by hand": TIMED.format(imports="import jax, diffrax as dfx, optimistix as optx", actions=BY_HAND),
 }
 
+FIRST = """
+import json, resource, time
+{imports}
+import jax
+jax.config.update("jax_enable_x64", True)
+import jax.numpy as jnp
+ts = jnp.linspace(0, 10, 201)
+{actions}
+begin = time.perf_counter()
+jax.block_until_ready(action())
+print(json.dumps({{"seconds": time.perf_counter() - begin, "peak": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss}}))
+"""
+ROD = """
+lagrangian = lambda q, qdot, m, g: 0.5 * m * (qdot["x"] ** 2 + qdot["y"] ** 2) - m * g * q["y"]
+air = lambda qdot, b: 0.5 * b * (qdot["x"] ** 2 + qdot["y"] ** 2)
+rod = lambda q, l: jnp.hypot(q["x"], q["y"]) - l
+joint = lambda q, qdot, F, l: F * jnp.abs(q["x"] * qdot["y"] - q["y"] * qdot["x"]) / l
+start, params = ({"x": 1.5, "y": 0.0}, {"x": 0.0, "y": 0.0}), {"m": 2.0, "l": 1.5, "g": 9.81, "b": 0.1, "F": 2.0}
+smooth = jl.System(lagrangian, dissipation={"air": air}, holonomic={"rod": rod})
+dry = jl.System(lagrangian, dissipation={"joint": joint}, holonomic={"rod": rod})
+x = lambda system, **changed: jl.simulate(system, *start, ts, params | changed).q["x"]
+"""
+ROD_BY_HAND = """
+def field(t, s, p):
+    m, l, g, b = p
+    r, v = s[:2], s[2:]
+    length = jnp.sqrt(r @ r)
+    n, f = r / length, jnp.array([0.0, -m * g]) - b * v
+    return jnp.concatenate([v, (f - (m * (v @ v - (n @ v) ** 2) / length + n @ f) * n) / m])
+def x(l, b):
+    start = jnp.stack([l, 0.0 * l, 0.0 * l, 0.0 * l])
+    controller = dfx.PIDController(1e-8, 1e-10)
+    return dfx.diffeqsolve(dfx.ODETerm(field), dfx.Tsit5(), 0.0, 10.0, None, start, (2.0, l, 9.81, b), saveat=dfx.SaveAt(ts=ts),
+        stepsize_controller=controller, max_steps=100_000, **how).ys[:, 0]
+"""
+ACTIONS = {  # by jaxlag, and by hand; what both are asked to do
+    "rod: motion": ("lambda: x(smooth)", "lambda: jax.jit(x)(1.5, 0.1)"),
+    "rod: gradient": ("lambda: jax.grad(lambda l: x(smooth, l=l)[-1])(1.5)", "lambda: jax.jit(jax.grad(lambda l: x(l, 0.1)[-1]))(1.5)"),
+    "rod: Hessian": (
+        "lambda: jax.hessian(lambda p: x(smooth, l=p[0], b=p[1])[-1])(jnp.array([1.5, 0.1]))",
+        "lambda: jax.jit(jax.jacfwd(jax.jacfwd(lambda p: x(p[0], p[1])[-1])))(jnp.array([1.5, 0.1]))",
+    ),
+    "rod with friction: motion": ("lambda: x(dry)", None),
+    "rod with friction: gradient": ("lambda: jax.grad(lambda F: x(dry, F=F)[-1])(2.0)", None),
+}
 
-def fresh(code):
-    """The times that one new process reports."""
-    return json.loads(subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout)
+
+def codes_of(task):
+    """The programs that are compared at one task of the pendulum."""
+    ours, by_hand = ACTIONS[task]
+    codes = {"jaxlag": FIRST.format(imports="import jaxlag as jl", actions=f"{ROD}\naction = {ours}")}
+    if by_hand:
+        how = "how = dict(adjoint=dfx.ForwardMode())" if "Hessian" in task else "how = {}"
+        codes["JAX + diffrax by hand"] = FIRST.format(imports="import diffrax as dfx", actions=f"{how}\n{ROD_BY_HAND}\naction = {by_hand}")
+    return codes
 
 
-def main(processes=7):
-    runs = {name: [] for name in CODES}
+def readme():
+    """README's first example as one action."""
+    text = (Path(__file__).parents[2] / "README.md").read_text()
+    (example, *_) = re.findall(r"```python\n(.*?)```", text, re.S)
+    return FIRST.format(imports="import contextlib, io", actions=f"source = {example!r}\n{RUN_QUIETLY}")
+
+
+RUN_QUIETLY = """
+def action():
+    with contextlib.redirect_stdout(io.StringIO()):
+        exec(source, {})
+"""
+
+
+def fresh(code, cache):
+    """What one new process reports, with this folder for compiled programs."""
+    environment = {name: value for name, value in os.environ.items() if not name.startswith("JAX_")} | {"XDG_CACHE_HOME": cache}
+    run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, env=environment)
+    return json.loads(run.stdout.splitlines()[-1])
+
+
+def vehicle(processes):
+    """Tables of the vehicle."""
+    runs = {name: [] for name in VEHICLE}
     for _ in range(processes):
-        for name, code in CODES.items():
-            runs[name].append(fresh(code))
-    tables = {}
+        for name, code in VEHICLE.items():
+            with tempfile.TemporaryDirectory() as cache:
+                runs[name].append(fresh(code, cache))
     for task in runs["jaxlag"][0]:
-        rows = [Row(name, seconds=statistics.median(run[task] for run in of_name)) for name, of_name in runs.items()]
+        yield f"vehicle: {task}", table({name: [run[task] for run in of_name] for name, of_name in runs.items()})
+
+
+def pendulum(processes):
+    """Tables of the pendulum, with the peak memory of each process."""
+    for task in ACTIONS:
+        runs = {name: [] for name in codes_of(task)}
+        for _ in range(processes):
+            for name, code in codes_of(task).items():
+                with tempfile.TemporaryDirectory() as cache:
+                    runs[name].append(fresh(code, cache))
+        rows = table({name: [run["seconds"] for run in of_name] for name, of_name in runs.items()})
         for row in rows:
-            row.ratio = row.seconds / rows[0].seconds
-        tables[task] = rows
-    record("first use", tables.items())
+            row.note = f"{statistics.median(run['peak'] for run in runs[row.name]) / 1e6:.2f} GB"
+        yield task, rows
+
+
+def example(processes):
+    """Table of README's first example: in a first process, and in a second one with what the first has kept."""
+    taken = {"first process": [], "second process": []}
+    for _ in range(processes):
+        with tempfile.TemporaryDirectory() as cache:
+            for name in taken:
+                taken[name].append(fresh(readme(), cache)["seconds"])
+    yield "README's first example", table(taken)
+
+
+def table(taken):
+    """Medians and their ratios."""
+    rows = [Row(name, seconds=statistics.median(seconds)) for name, seconds in taken.items()]
+    for row in rows:
+        row.ratio = row.seconds / rows[0].seconds
+    return rows
+
+
+def main(processes=5):
+    for tables in (example, pendulum, vehicle):
+        record("first use", tables(processes))
 
 
 if __name__ == "__main__":

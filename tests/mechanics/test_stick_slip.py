@@ -175,9 +175,11 @@ def test_a_particle_leaves_a_rough_sphere():
     np.testing.assert_allclose(motion.multipliers["sphere"][on], (G * np.cos(th) - v2)[on], rtol=1e-7, atol=1e-7)
 
 
+belt = jl.System(oscillator_energy, dissipation={"belt": lambda qdot, v, vs: dissipation.stribeck(qdot - v, 1.0, 1.5, vs)})
+
+
 def belt_motion(vs, end=40.0, samples=4001):
     """A block held by a spring on a moving belt, with Stribeck friction."""
-    belt = jl.System(oscillator_energy, dissipation={"belt": lambda qdot, v, vs: dissipation.stribeck(qdot - v, 1.0, 1.5, vs)})
     return jl.simulate(belt, 0.0, 0.3, np.linspace(0, end, samples), {"c": 1.0, "v": 0.3, "vs": vs}, **SHARP)
 
 

@@ -1,0 +1,165 @@
+"""The solution map of a motion: from its inputs (start, params, tolerances) and sample times to its samples; and what differentiates it."""
+
+from typing import Any, NamedTuple
+
+import diffrax as dfx
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.flatten_util import ravel_pytree
+from jaxtyping import Array, PyTree
+
+from .._model.signal import with_second_derivatives
+from .._model.system import System
+from .._model.validation import checked
+from .first_order import EquationsOfMotion, Sample
+from .guarantees import verified
+from .integrate import SolverOptions, Variations, initialised, is_variational, states_at, with_status
+from .protocol import Arguments, Scales
+from .provenance import Provenance
+from .trajectory import FrictionState, Trajectory
+from .variational import derived, pushforward, split_varying
+
+
+class Inputs(NamedTuple):
+    """What a motion depends on besides its sample times; without `t0` it starts at the first of them."""
+
+    t0: Array | None
+    q0: PyTree
+    qdot0: PyTree
+    params: PyTree
+    tolerances: tuple[Array, Array]
+
+
+class Samples(NamedTuple):
+    """The states y at the sample times, and what a `Trajectory` shows of them; what is not a real number is None here."""
+
+    ys: Array
+    shown: Sample
+
+
+class Unchanging(NamedTuple):
+    """What is not differentiated: the reason that the motion ended, counts, and what is not a real number in its samples."""
+
+    result: Any
+    stats: dict[str, Array]
+    shown: Sample
+
+
+class SolutionMap(eqx.Module):
+    """The samples of one motion as a function of `Inputs` and sample times: a `DifferentiableMap`."""
+
+    system: System = eqx.field(static=True)
+    options: SolverOptions
+
+    def solve(self, inputs: Inputs, ts: Array) -> tuple[Samples, Unchanging]:
+        """The samples; unless the user has chosen an adjoint, with forward-mode derivatives."""
+        return self._solve(inputs, ts, self.options.adjoint or dfx.ForwardMode())
+
+    def pull_back(self, inputs: Inputs, ts: Array) -> tuple[Samples, Unchanging]:
+        """The samples, with reverse-mode derivatives."""
+        return self._solve(inputs, ts, dfx.RecursiveCheckpointAdjoint())
+
+    def _solve(self, inputs: Inputs, ts: Array, adjoint: dfx.AbstractAdjoint) -> tuple[Samples, Unchanging]:
+        equations, (t0, q, v) = self._equations(inputs, ts)
+        params, tolerances = inputs.params, inputs.tolerances
+        smooth = with_second_derivatives(params)
+        start, args = initialised(equations, t0, q, v, smooth), Arguments(smooth, Scales.of(tolerances, ts, smooth))
+        ys, result, stats = states_at(equations, self.options, adjoint, t0, start.y, ts, args, tolerances)
+        ys, result = with_status(ys, result, start.conditions, (inputs, ts))
+        return samples_at(equations, ts, ys, params, result, stats | {"start_moved": start.moved}, tolerances)
+
+    def push(self, inputs: Inputs, directions: tuple[Inputs, ...], ts: Array) -> tuple[Any, Unchanging]:
+        """The samples and their derivatives along directions, for each order; by the variational equations where they hold."""
+        equations, (t0, q, v) = self._equations(inputs, ts)
+        varying = [split_varying(inputs, of_order)[0].params for of_order in directions]
+        if not is_variational(equations, self.options, varying, inputs.params):
+            return pushforward(self.solve)(inputs, directions, ts)
+
+        def initial(inputs):
+            start = initialised(equations, _first_time(inputs, ts), *_vectors(inputs), with_second_derivatives(inputs.params))
+            return start.y, start
+
+        arguments = lambda inputs: (_first_time(inputs, ts), Arguments(with_second_derivatives(inputs.params)))
+        variations = Variations(equations, initial)
+        for of_order in directions:
+            variations = variations.along(of_order, (of_order.params, None), of_order.t0, arguments)
+        y0, start = variations.initial(inputs)
+        args = Arguments(with_second_derivatives(inputs.params), directions=variations.directions)
+        solution = states_at(variations.equations, self.options, dfx.ForwardMode(), t0, y0, ts, args, inputs.tolerances)
+        return self._samples_and_variations(equations, inputs, directions, ts, *solution, start)
+
+    def _samples_and_variations(self, equations, inputs, directions, ts, ys, result, stats, start):
+        motion = lambda ys: ys[(..., *[0] * len(directions))]  # without variations
+        last_t, last_y = stats["last"]
+        stats = stats | {"start_moved": start.moved, "last": (last_t, motion(last_y))}
+        states, result = with_status(motion(ys), result, start.conditions, (inputs, ts))
+        known = jnp.isfinite(states).reshape(*states.shape, *[1] * len(directions))
+
+        def samples(ys_and_params):
+            ys, params = ys_and_params
+            return samples_at(equations, ts, ys, params, result, stats, inputs.tolerances)
+
+        def with_more(function, directions):
+            """Of states with the variations of one order more."""
+
+            def of_variations(ys_and_params):
+                ys, params = ys_and_params
+                return derived(function, (ys[..., 1:], directions))((ys[..., 0], params))
+
+            return of_variations
+
+        function = samples
+        for of_order in directions:
+            function = with_more(function, of_order.params)
+        is_motion = np.zeros(ys.shape[states.ndim :], bool)
+        is_motion[(0,) * len(directions)] = True
+        return function((jnp.where(is_motion, states.reshape(known.shape), jnp.where(known, ys, 0)), inputs.params))
+
+    def drift(self, inputs: Inputs, ts: Array, samples: Samples) -> Samples:
+        """The change of each sample with its own time."""
+        equations, _ = self._equations(inputs, ts)
+
+        def at(t, y):
+            shown, _ = equations.sample(t, y, inputs.params, inputs.tolerances)
+            return Samples(y, eqx.filter(shown, eqx.is_inexact_array))
+
+        def of_one(t, y):
+            rate = equations.rates(t, y, Arguments(inputs.params))
+            found, change = jax.jvp(at, (t, y), (jnp.ones_like(t), rate))
+            return jax.tree.map(lambda x, dx: jnp.where(jnp.isfinite(x), dx, 0), found, change)
+
+        return jax.vmap(of_one)(ts, samples.ys)
+
+    def _equations(self, inputs: Inputs, ts: Array) -> tuple[EquationsOfMotion, tuple[Array, Array, Array]]:
+        flat, t0, q, v = checked(self.system, _first_time(inputs, ts), inputs.q0, inputs.qdot0, inputs.params)
+        return EquationsOfMotion.of(self.system, inputs.q0, self.options.formulation, flat, t0, q, v), (t0, q, v)
+
+
+def _first_time(inputs: Inputs, ts: Array) -> Array:
+    return ts[0] if inputs.t0 is None else inputs.t0
+
+
+def _vectors(inputs: Inputs) -> tuple[Array, Array]:
+    return ravel_pytree(inputs.q0)[0], ravel_pytree(inputs.qdot0)[0]
+
+
+def samples_at(equations: EquationsOfMotion, ts, ys, params, result, stats, tolerances) -> tuple[Samples, Unchanging]:
+    """The samples of a motion with these states, as far as they keep what a successful motion guarantees."""
+    last_t, last_y = stats["last"]
+    times, states = jnp.concatenate([ts, last_t[None]]), jnp.concatenate([ys, last_y[None]])
+    samples = jax.vmap(lambda t, y: equations.sample(t, y, params, tolerances))(times, states)
+    shown, result, reached = verified(equations, times, states, samples, params, result, tolerances)
+    counts = {name: count for name, count in stats.items() if name != "last"} | {"reached": jax.lax.stop_gradient(reached)}
+    changing, rest = eqx.partition(shown, eqx.is_inexact_array)
+    return Samples(ys, changing), Unchanging(result, counts, rest)
+
+
+def trajectory_of(system: System, options: SolverOptions, params: PyTree, ts, samples: Samples, unchanging: Unchanging) -> Trajectory:
+    """The trajectory of these samples."""
+    shown: Sample = eqx.combine(samples.shown, unchanging.shown)
+    friction = {name: FrictionState(*of_term) for name, of_term in shown.friction.items()}
+    provenance = Provenance.of(system, params, options.formulation.friction)
+    state = shown.q, shown.qdot, shown.qddot, shown.multipliers
+    return Trajectory(ts, *state, unchanging.result, unchanging.stats | shown.counts, shown.works, friction, provenance)

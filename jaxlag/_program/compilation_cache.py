@@ -1,0 +1,103 @@
+"""Compiled programs that outlast the process: JAX's persistent compilation cache, in a folder of the user's, of limited size."""
+
+import contextlib
+import errno
+import os
+import sys
+from pathlib import Path
+
+import jax
+from jax.experimental.compilation_cache import compilation_cache
+
+SMALLEST = {  # programs of any size: a fit has dozens of small ones, which take longer to compile than to read
+    "jax_persistent_cache_min_compile_time_secs": 0.0,
+    "jax_persistent_cache_min_entry_size_bytes": 0,
+}
+
+
+def keep_compiled(folder: str | os.PathLike | None = None, *, max_bytes: int = 2**30) -> Path:
+    r"""Keeps compiled programs on disk, so that the next process reads them where it would compile them.
+
+    Call it once, before the first motion. It sets JAX's persistent compilation cache, for all programs of the process. A motion, its
+    derivatives and a fit are read from it as long as the functions, the shapes and the versions of JAX and jaxlag are the same; only
+    `simulate(..., progress=True)` compiles anew, as its progress bar is called by the compiled program.
+
+    **Arguments:**
+
+    - `folder`: where to keep them. Default: the folder that is set already, by `JAX_COMPILATION_CACHE_DIR` or `jax.config`; else the
+      user's cache folder: `$XDG_CACHE_HOME/jaxlag` or `~/.cache/jaxlag` on Linux, `~/Library/Caches/jaxlag` on macOS and
+      `%LOCALAPPDATA%\jaxlag` on Windows. It is made if need be, for this user alone: whoever can write to it can run code in your
+      processes.
+    - `max_bytes`: if the folder is larger when this is called, the programs that were used longest ago are deleted. Not in a folder that
+      was set already, which is left to its owner.
+
+    The smallest compile time of a program that is kept is set to zero, unless `JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS` is set.
+
+    **Returns:** the folder.
+
+    **Raises:** `ValueError` where the folder cannot be made or written to.
+
+    **Source:** the guide of JAX, "Persistent compilation cache".
+
+    ```python
+    import jaxlag as jl
+    folder = jl.keep_compiled()  # e.g. /home/ada/.cache/jaxlag
+    ```
+    """
+    for setting, value in SMALLEST.items():
+        if setting.upper() not in os.environ:
+            jax.config.update(setting, value)
+    chosen = jax.config.values["jax_compilation_cache_dir"]
+    if folder is None and chosen:
+        return Path(chosen)
+    path = _user_cache() / "jaxlag" if folder is None else Path(folder).expanduser().absolute()
+    _make(path)
+    _shrink(path, max_bytes)
+    if chosen != str(path):
+        compilation_cache.reset_cache()  # JAX looks at the setting only once
+        compilation_cache.set_cache_dir(str(path))
+    return path
+
+
+def _user_cache() -> Path:
+    """The folder of the user's caches, by the conventions of the platform."""
+    if sys.platform == "win32":
+        return Path(os.environ.get("LOCALAPPDATA") or Path.home() / "AppData" / "Local")
+    if sys.platform == "darwin":
+        return Path.home() / "Library" / "Caches"
+    of_xdg = Path(os.environ.get("XDG_CACHE_HOME", ""))
+    return of_xdg if of_xdg.is_absolute() else Path.home() / ".cache"  # a relative one has to be ignored
+
+
+def _make(folder):
+    """A folder that can be written to, private to the user if it is new."""
+    try:
+        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+    except OSError as error:
+        raise _unusable(folder, error.strerror) from error
+    if not os.access(folder, os.W_OK | os.X_OK):
+        raise _unusable(folder, os.strerror(errno.EACCES))
+
+
+def _unusable(folder, reason):
+    return ValueError(f"`folder` must be a folder that can be written to, but {folder} cannot: {reason}. Give another one.")
+
+
+def _shrink(folder, max_bytes):
+    """Deletes the programs that were used longest ago until the others take no more than `max_bytes`.
+
+    JAX would do this itself, `jax_compilation_cache_max_size`, but with the package filelock, with a lock for every program that is read,
+    and not in a folder with programs from a time without that setting.
+    """
+    programs = []
+    for file in folder.glob("*-cache"):
+        with contextlib.suppress(OSError):  # deleted by another process meanwhile
+            found = file.stat()
+            programs.append((max(found.st_atime, found.st_mtime), found.st_size, file))
+    excess = sum(size for _, size, _ in programs) - max_bytes
+    for _, size, file in sorted(programs):
+        if excess <= 0:
+            break
+        with contextlib.suppress(OSError):  # another process has it open, on Windows
+            file.unlink(missing_ok=True)
+        excess -= size
