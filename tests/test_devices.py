@@ -16,7 +16,8 @@ import jaxlag as jl
 records = [osc.record(seed, osc.TIMES[: 60 - seed], unknown=("qdot0",)) for seed in range(11)]
 found = jl.fit(osc.SYSTEM, records, osc.START, free=("c", "b"))
 each = jl.fit_each(osc.SYSTEM, records, osc.START, free=("c", "b"))
-devices = len(found.problem.batches[0].ts.sharding.device_set)
+times = found.problem.batches[0].ts  # on the host where there is one device
+devices = len(times.sharding.device_set) if isinstance(times, jax.Array) else 1
 values = [found.estimates["c"], found.estimates["b"], found.standard_errors["c"], *(u["qdot0"] for u in found.unknowns)]
 print(devices, *map(repr, map(float, [*values, *(f.estimates["c"] for f in each)])))
 """

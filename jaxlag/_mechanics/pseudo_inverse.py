@@ -121,7 +121,7 @@ def applied(S: Float[Array, "m m"], inverse: Inverse, R: Float[Array, "m k"]) ->
     """S⁺R; differentiated at constant rank."""
     regular, D, factor, root = inverse
     if len(D) < 2:
-        return D[:, None] * R
+        return jnp.where(D[:, None] > 0, R / jnp.where(D[:, None] > 0, S, 1), 0)
     by_factor = D[:, None] * jax.scipy.linalg.cho_solve((factor, True), D[:, None] * R)
     # A forward pass over a reverse one differentiates this body, not its rule: nothing is changed, but the derivative by S.
     fixed = jax.lax.stop_gradient(S)

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
 
-from .._program.jit import compiled
+from .._program.jit import compiled, jitted
 from .variational import derived, pushforward, split_varying
 
 # Up to this many perturbed numbers the Jacobian comes whole out of one vectorised forward pass; beyond it a tangent is
@@ -61,7 +61,7 @@ def differentiable(of: DifferentiableMap) -> Callable:
         elif size <= FORWARD_LIMIT:
             (y, J), aux = differentiable(WithJacobian(of))((varying, constant), ts)
             dx = ravel_pytree(d_inputs)[0]
-            change = jax.tree.map(lambda rows: rows @ dx, J)
+            change = _product(J, dx)
         else:
             y, aux = solution(inputs, ts)
             change = _jacobian_product(of, varying, constant, ts, y, ravel_pytree(d_inputs)[0])
@@ -71,6 +71,11 @@ def differentiable(of: DifferentiableMap) -> Callable:
         return (y, aux), (change, jax.tree.map(lambda _: None, aux))
 
     return solution
+
+
+@jitted  # one program for all parts of y; its transpose is one, too
+def _product(J: Any, dx: Any) -> Any:
+    return jax.tree.map(lambda rows: rows @ dx, J)
 
 
 @compiled
@@ -166,7 +171,7 @@ def _jacobian_product(of, varying, constant, ts, y, dx):
     (Jᵀb, Ja). Of the two products the one that is not asked for is dropped by the compiler.
     """
     x, unravel = ravel_pytree(varying)
-    constant = jax.tree.map(lambda leaf: jnp.asarray(leaf) if isinstance(leaf, np.ndarray) else leaf, constant)
+    constant, ts = jax.tree.map(lambda leaf: jnp.asarray(leaf) if isinstance(leaf, np.ndarray) else leaf, (constant, ts))
 
     def at_x(solve):
         return lambda x: solve(eqx.combine(unravel(x), constant), ts)[0]

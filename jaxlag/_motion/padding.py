@@ -11,7 +11,7 @@ from jaxtyping import PyTree
 from .._model.signal import is_signal
 from .._program.jit import is_called_by_python, is_concrete, jitted
 from .provenance import Provenance
-from .trajectory import Trajectory
+from .trajectory import COUNTED, Trajectory
 
 EXACT = 16  # lengths up to here are left: they are those of examples
 
@@ -44,8 +44,20 @@ def _padded(rows: Any) -> np.ndarray:
     return np.concatenate([rows, np.repeat(rows[-1:], padded_size(len(rows)) - len(rows), axis=0)])
 
 
-@jitted  # one program: in Python its some thirty arrays would take longer than the motion of a vehicle
-def without_padding(trajectory: Trajectory, length: int, params: PyTree) -> Trajectory:
-    """The motion without the samples that were added, and with the params as they were given."""
-    provenance = Provenance.of(trajectory.provenance.system, params, trajectory.provenance.friction)
-    return dataclasses.replace(trajectory, provenance=provenance)[:length]
+def without_padding(t: Trajectory, length: int) -> Trajectory:
+    """The motion without the samples that were added."""
+    counts = {name: count for name, count in t.stats.items() if name in COUNTED}
+    parts = t.ts, t.q, t.qdot, t.qddot, t.multipliers, t.works, t.friction, counts
+    *state, works, friction, counts = _first(parts, length)
+    return Trajectory(*state, t.result, t.stats | counts, works, friction, t.provenance)
+
+
+@jitted
+def _first(arrays, length):
+    return jax.tree.map(lambda array: array[:length], arrays)
+
+
+def with_params(trajectory: Trajectory, params: PyTree) -> Trajectory:
+    """The motion with the params as they were given, where its own are padded."""
+    of = trajectory.provenance
+    return dataclasses.replace(trajectory, provenance=Provenance.of(of.system, params, of.friction))

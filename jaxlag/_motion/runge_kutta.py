@@ -124,7 +124,9 @@ class Dopri5(ExplicitRungeKutta):
 
     $$ y_1 = y_0 + h \sum_i b_i f_i, \qquad f_i = f\Bigl(t_0 + c_i h,\; y_0 + h \sum_{j<i} a_{ij} f_j\Bigr) $$
 
-    For `simulate(solver=...)`, and for any `diffrax.diffeqsolve`; the state is any pytree. No arguments.
+    For `simulate(solver=...)`, and for any `diffrax.diffeqsolve`; the state is any pytree.
+
+    **Arguments:** `reverse`: whether reverse mode may go through a step in which an input jumps. `simulate` chooses by itself.
 
     **Source:** Hairer, Nørsett & Wanner, Solving Ordinary Differential Equations I, table II.5.2 and section II.6.
 
@@ -143,7 +145,9 @@ class Dop853(ExplicitRungeKutta):
 
     $$ y_1 = y_0 + h \sum_i b_i f_i, \qquad f_i = f\Bigl(t_0 + c_i h,\; y_0 + h \sum_{j<i} a_{ij} f_j\Bigr) $$
 
-    For `simulate(solver=...)`, and for any `diffrax.diffeqsolve`; the state is any pytree. No arguments.
+    For `simulate(solver=...)`, and for any `diffrax.diffeqsolve`; the state is any pytree.
+
+    **Arguments:** `reverse`: whether reverse mode may go through a step in which an input jumps. `simulate` chooses by itself.
 
     **Source:** Hairer, Nørsett & Wanner, Solving Ordinary Differential Equations I, section II.10.
 

@@ -17,7 +17,7 @@ from .derivative_rule import differentiable
 from .failure import raise_failure
 from .first_order import Formulation
 from .integrate import SolverOptions, tolerances_of
-from .padding import padded_signals, padded_times, without_padding
+from .padding import padded_signals, padded_times, with_params, without_padding
 from .progress import compiling
 from .solution_map import Inputs, SolutionMap, trajectory_of
 from .trajectory import Trajectory
@@ -96,8 +96,10 @@ def simulate(
         else:
             solution = differentiable(solution_map)(inputs._replace(t0=ts[0]), ts)
             trajectory = trajectory_of(system, options, params, jnp.asarray(ts), *solution)
-    if ts.size > length or params is not given:
-        trajectory = without_padding(trajectory, length, given)
+    if ts.size > length:
+        trajectory = without_padding(trajectory, length)
+    if params is not given:
+        trajectory = with_params(trajectory, given)
     if throw:
         raise_failure(trajectory, (q0, qdot0))
     return trajectory

@@ -1,5 +1,6 @@
 """The solution map of a motion: from its inputs (start, params, tolerances) and sample times to its samples; and what differentiates it."""
 
+import dataclasses
 from typing import Any, NamedTuple
 
 import diffrax as dfx
@@ -47,10 +48,12 @@ class Unchanging(NamedTuple):
     shown: Sample
 
 
-class SolutionMap(eqx.Module):
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class SolutionMap:
     """The samples of one motion as a function of `Inputs` and sample times: a `DifferentiableMap`."""
 
-    system: System = eqx.field(static=True)
+    system: System = dataclasses.field(metadata={"static": True})
     options: SolverOptions
 
     def solve(self, inputs: Inputs, ts: Array) -> tuple[Samples, Unchanging]:

@@ -65,15 +65,12 @@ def _lu(interpreter, equation, A):
 
 @rule("custom_linear_solve")
 def _linear_solve(interpreter, equation, *operands):
-    """The solution written out; where the algebra differentiates, its derivative comes from the equation it solves."""
+    """The solution written out; where the algebra differentiates, in one piece, whose derivative comes from the equation it solves."""
     lengths, solve = equation.params["const_lengths"], equation.params["jaxprs"].solve
-    before, right, function = lengths.matvec + lengths.vecmat, operands[sum(lengths) :], interpreter.algebra.block(equation)
-    if function is not None:
-        held = lambda x: interpreter.new(x.dtype, "held", lax.stop_gradient, (x,)) if isinstance(x, Node) else x
-        right = [map_elements(held, x) for x in right]
-    x = interpreter.run(solve, [*operands[before : before + lengths.solve], *right])
+    before, function = lengths.matvec + lengths.vecmat, interpreter.algebra.block(equation)
+    x = interpreter.run(solve, [*operands[before : before + lengths.solve], *operands[sum(lengths) :]])
     if function is None:
         return x
     # An element that is a number is one whatever the operands are; its derivative is zero.
-    whole = interpreter.block(function, [*x, *operands], equation.outvars)
+    whole = interpreter.block(function, operands, equation.outvars)
     return [map_elements(lambda x, node: node if isinstance(x, Node) else x, *pair) for pair in zip(x, whole, strict=True)]

@@ -60,7 +60,7 @@ def _program(function, **options):
 def _split(given, named):
     """The arrays among the leaves, and what is static: the other leaves and the structure. Each has None where the other has a leaf."""
     leaves, structure = jax.tree.flatten((given, named))
-    is_array = [isinstance(leaf, (jax.Array, np.ndarray, np.number)) for leaf in leaves]
+    is_array = [isinstance(leaf, (np.ndarray, jax.Array, np.number)) for leaf in leaves]
     arrays = [leaf if traced else None for leaf, traced in zip(leaves, is_array, strict=True)]
     static = tuple(None if traced else leaf for leaf, traced in zip(leaves, is_array, strict=True))
     return arrays, (static, structure)
@@ -68,7 +68,11 @@ def _split(given, named):
 
 def is_called_by_python(arrays: Iterable[Any] = ()) -> bool:
     """Whether the call is not being traced: under `jit` even what is computed from nothing is traced."""
-    return jax.default_backend() == "cpu" and not any(issubclass(kind, jax.core.Tracer) for kind in {type(_nothing()), *map(type, arrays)})
+    return jax.default_backend() == "cpu" and not _has_tracers([_nothing(), *arrays])
+
+
+def _has_tracers(leaves):
+    return any(issubclass(kind, jax.core.Tracer) for kind in {*map(type, leaves)})
 
 
 @jax.jit
@@ -98,4 +102,4 @@ def numpy_for(*trees: PyTree) -> Any:
 
 def is_concrete(*trees: PyTree) -> bool:
     """Whether the values are known, so that Python may look at them; under `jit` and `vmap` they are not."""
-    return not any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(trees))
+    return not _has_tracers(jax.tree.leaves(trees))

@@ -126,31 +126,18 @@ def _custom_jvp_as_scalar_code(equation, *arrays):
 
 
 def _linear_solve_as_scalar_code(equation, *arrays):
-    """The solution x of A x = b as scalar code; its derivative solves A dx = db − dA x, as that of `custom_linear_solve` does."""
+    """The solution x of A x = b as scalar code within `custom_linear_solve`, whose derivatives of every order solve with A, too."""
     lengths, jaxprs, avals = equation.params["const_lengths"], equation.params["jaxprs"], [v.aval for v in equation.outvars]
-    (x, rebuild_x), (given, rebuild_given) = _without_numbers(arrays[: len(avals)]), _without_numbers(arrays[len(avals) :])
-    is_node = [not is_number(node) for array in arrays[: len(avals)] for node in array.flat]
     splits = np.cumsum([0, *lengths])
+    shapes = [aval.shape for aval in avals]
     as_vector = lambda arrays: _array(np.concatenate([objects(x).reshape(-1) for x in arrays]), avals[0].dtype)
 
-    def function(k, given):
+    def function(k):
         """A, its transpose or an inverse as a function of a vector, which comes last: JAX passes the linear map before it."""
-        jaxpr, consts = jaxprs[k], rebuild_given(given)[splits[k] : splits[k + 1]]
-        split = lambda vector: unflattened(_scalars(vector), [aval.shape for aval in avals])
+        jaxpr, consts = jaxprs[k], arrays[splits[k] : splits[k + 1]]
+        split = lambda vector: unflattened(_scalars(vector), shapes)
         return jaxpr and (lambda *arguments: as_vector(evaluate(jaxpr, JAX_ALGEBRA, *consts, *split(arguments[-1]))))
 
-    @jax.custom_jvp
-    def solution(x, given):
-        return x
-
-    @solution.defjvp
-    def differential(primals, tangents):
-        x, given = solution(*primals), primals[1]
-        vector = as_vector(rebuild_x(x))
-        defect = lambda given: as_vector(rebuild_given(given)[splits[-1] :]) - function(0, given)(vector)
-        _, right = jax.jvp(defect, (given,), (tangents[1],))
-        symmetric = jaxprs.vecmat is jaxprs.matvec
-        dx = lax.custom_linear_solve(function(0, given), right, function(2, given), function(3, given), symmetric=symmetric)
-        return x, [node for node, free in zip(_scalars(dx).flat, is_node, strict=True) if free]
-
-    return rebuild_x(solution(x, given))
+    symmetric = jaxprs.vecmat is jaxprs.matvec
+    x = lax.custom_linear_solve(function(0), as_vector(arrays[splits[-1] :]), function(2), function(3), symmetric=symmetric)
+    return unflattened(_scalars(x), shapes)

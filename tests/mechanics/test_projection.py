@@ -711,3 +711,15 @@ def test_gradients_with_respect_to_an_initial_value_a_mass_and_a_length(end, by_
     both = jax.jit(lambda x: (jax.jacfwd(end)(x), jax.jacrev(end)(x)))  # together: half the time of compilation
     for found in both(jnp.array(x)):
         np.testing.assert_allclose(found, expected, rtol=1e-6)
+
+
+@pytest.mark.parametrize("x", [(3.0, 4.0), (0.5, -0.2)], ids=["on the circle", "far from it"])
+def test_derivatives_of_a_consistent_state_of_every_order(x):
+    """The nearest point of the circle |q| = l is l x/|x|, whether the search for it begins there or not."""
+    circle = jl.System(lambda qdot: 0.5 * qdot @ qdot, holonomic=lambda q, l: q @ q - l**2)
+    x = jnp.array([*x, 5.0])
+    found = lambda x: jl.consistent_state(circle, x[:2], jnp.zeros(2), {"l": x[2]})[0]
+    exact = lambda x: x[2] * x[:2] / jnp.linalg.norm(x[:2])
+    for order in range(4):
+        np.testing.assert_allclose(found(x), exact(x), rtol=1e-9, atol=1e-9, err_msg=f"order {order}")
+        found, exact = jax.jacfwd(found), jax.jacfwd(exact)

@@ -13,7 +13,7 @@ from scipy.linalg import expm
 
 import jaxlag as jl
 from jaxlag import Cubic, Linear, Signal, ZeroOrderHold
-from jaxlag._motion import integrate, simulate
+from jaxlag._motion import integrate, solution_map
 
 RNG = np.random.default_rng(3)
 TS = np.cumsum(RNG.uniform(0.05, 0.4, 40)) - 0.3
@@ -326,8 +326,8 @@ def test_vmap_over_rides_equals_the_loop():
 
 
 def test_new_values_trace_nothing(monkeypatch):
-    traces, checked = [], simulate.checked
-    monkeypatch.setattr(simulate, "checked", lambda *args: traces.append(1) or checked(*args))
+    traces, checked = [], solution_map.checked
+    monkeypatch.setattr(solution_map, "checked", lambda *args: traces.append(1) or checked(*args))
     cart = jl.System(lambda qdot: 0.5 * qdot**2, force={"of its own": lambda t, u: u(t)})
     run = lambda times, values: jl.simulate(cart, 0.0, 0.0, [0.0, 2.0], {"u": Signal(times, values)}).q[-1]
     np.testing.assert_allclose([run([0, 1], [1, 2]), run(np.array([0.0, 0.5]), jnp.array([1.0, -1.0]))], [2.5, -0.25], rtol=1e-12)

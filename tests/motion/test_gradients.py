@@ -59,6 +59,21 @@ def test_variational_equations_give_what_the_integrator_would_differentiated(mon
     np.testing.assert_allclose(varied, jax.jacfwd(motion)(x), rtol=1e-10, atol=1e-10)
 
 
+def test_second_variations_give_what_the_integrator_would_differentiated_twice(monkeypatch):
+    """Of multipliers, accelerations and states, by the start, parameters and both; with the same steps, equal to rounding."""
+
+    def motion(x):
+        found = jl.simulate(pendulum.cartesian, *pendulum.cartesian_state(x[0], 0.5, x[1]), TS[:9], {"m": 1.0, "g": x[2], "l": x[1]})
+        return ravel_pytree((found.q, found.qddot, found.multipliers))[0]
+
+    x = jnp.array([0.6, 1.0, 9.81])
+    varied = jax.hessian(motion)(x)
+    np.testing.assert_allclose(varied, varied.swapaxes(1, 2), rtol=1e-9, atol=1e-8)
+    monkeypatch.setattr(solution_map, "is_variational", lambda *_: False)
+    jax.clear_caches()
+    np.testing.assert_allclose(varied, jax.hessian(motion)(x), rtol=1e-9, atol=1e-8)
+
+
 def test_vehicle_gradient_in_closed_form():
     """Heave without drag is a linear oscillator: y(t) = l − Mg/2c + A(t)(y₀ − l + Mg/2c), so dy(t)/dM₀ = 0 and dy(t)/dy₀ = A(t)."""
     p = vehicle.params

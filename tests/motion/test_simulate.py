@@ -10,7 +10,7 @@ import pytest
 from scipy.special import ellipj, ellipk
 
 import jaxlag as jl
-from jaxlag._motion import integrate, simulate
+from jaxlag._motion import integrate, solution_map
 from jaxlag._motion.results import RESULTS, from_diffrax, reason_of, under_diffrax
 from jaxlag.examples import pendulum, vehicle
 
@@ -204,8 +204,8 @@ def test_consistent_state_far_from_a_curved_constraint():
 
 def test_a_second_motion_traces_nothing(monkeypatch):
     traces = []
-    checked = simulate.checked
-    monkeypatch.setattr(simulate, "checked", lambda *args: traces.append(1) or checked(*args))
+    checked = solution_map.checked
+    monkeypatch.setattr(solution_map, "checked", lambda *args: traces.append(1) or checked(*args))
     energy = lambda q, qdot, c: 0.5 * qdot**2 - 0.5 * c * q**2  # a system no other test has compiled
     ts = np.linspace(0, 1, 7)
     run = lambda c, x, ts: jl.simulate(jl.System(energy), x, 0.0, ts, {"c": c})

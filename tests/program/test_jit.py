@@ -70,3 +70,19 @@ def test_the_options_reach_the_compiler_only_in_calls_from_python(monkeypatch):
     with pytest.raises(jax.errors.JaxRuntimeError, match="xla_cpu_no_such_option"):
         program(1.0)
     assert jax.jit(program)(1.0) == 2.0
+
+
+@pytest.mark.skipif(jax.default_backend() != "cpu", reason="the option is for CPUs")
+@pytest.mark.parametrize("derivative", [jax.grad, jax.jacfwd, jax.hessian, jax.vmap])
+def test_derivatives_from_python_have_the_options(derivative, monkeypatch):
+    """What stands within another program must not: JAX refuses it."""
+    asked, with_options = [], jit._program_with_options
+    monkeypatch.setattr(jit, "_program_with_options", lambda function: asked.append(function.__name__) or with_options(function))
+    oscillator = jl.System(lambda q, qdot, c: 0.5 * qdot**2 - 0.5 * c * q**2)
+    end = lambda c: jl.simulate(oscillator, 1.0, 0.0, TS, {"c": c}).q[-1]
+    c = jnp.array([4.0, 5.0]) if derivative is jax.vmap else 4.0
+    found = derivative(end)(c)
+    assert asked and set(asked) <= {"solved", "_trajectory"}
+    asked.clear()
+    np.testing.assert_allclose(found, jax.jit(derivative(end))(c), rtol=1e-9)
+    assert not asked

@@ -1,0 +1,63 @@
+"""Motions of many lengths share a few programs, and are what each would be by itself."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxlag as jl
+from jaxlag._motion.padding import padded_size
+
+CART = jl.System(lambda qdot: 0.5 * qdot**2, dissipation=lambda qdot, b: 0.5 * b * qdot**2, force=lambda t, u: u(t))
+
+
+def recording(length, interpolation):
+    ts = np.linspace(0.0, 2.0, length)
+    return ts, jl.Signal(ts[:-3], np.sin(3 * ts[:-3]), interpolation)  # the input ends before the motion does
+
+
+def motion(length, interpolation, b=0.3, **options):
+    ts, u = recording(length, interpolation)
+    return jl.simulate(CART, 0.0, 1.0, ts, {"b": b, "u": u}, **options)
+
+
+def test_sizes():
+    sizes = np.array([padded_size(n) for n in range(2, 5000)])
+    assert np.all(sizes >= np.arange(2, 5000)) and np.all(sizes[16:] <= 9 / 8 * np.arange(18, 5000)) and np.all(np.diff(sizes) >= 0)
+    assert len(set(sizes[400 - 2 : 801 - 2])) <= 10
+    np.testing.assert_array_equal(sizes[:15], np.arange(2, 17))
+
+
+@pytest.mark.parametrize("interpolation", [jl.ZeroOrderHold(), jl.Linear(), jl.Cubic()])
+def test_a_motion_is_that_without_padding(interpolation):
+    """Compared with the program that is compiled for its own length within `jit`, in all that a motion shows."""
+    padded = motion(37, interpolation, works=True)
+    plain = jax.jit(lambda b: motion(37, interpolation, b, works=True))(0.3)
+    assert len(padded) == 37 and padded.provenance.params["u"].ts.shape == (34,)
+    assert jax.tree.structure(padded) == jax.tree.structure(plain)
+    for found, expected in zip(jax.tree.leaves(padded), jax.tree.leaves(plain), strict=True):
+        np.testing.assert_allclose(found, expected, rtol=1e-12, atol=1e-12)
+    np.testing.assert_allclose(padded.at(1.234).q, plain.at(1.234).q, rtol=1e-12)
+    np.testing.assert_allclose(padded.balance(), 0, atol=1e-7)
+
+
+def test_its_derivatives_are_those_without_padding():
+    work = lambda b: jnp.sum(motion(37, jl.Linear(), b).qddot ** 2)
+    for derivative in (jax.grad, jax.jacfwd, jax.hessian):
+        np.testing.assert_allclose(derivative(work)(0.3), jax.jit(derivative(work))(0.3), rtol=1e-10)
+
+
+def test_many_lengths_compile_few_programs():
+    """The motions of a loop over recordings; what cuts them to length is compiled for each, in hundredths of a second."""
+    names = []
+
+    def listen(event, duration, **about):
+        names.extend([about.get("fun_name")] if event.endswith("backend_compile_duration") else [])
+
+    jax.monitoring.register_event_duration_secs_listener(listen)
+    try:
+        ends = [float(motion(length, jl.Linear()).q[-1]) for length in range(101, 129, 3)]
+    finally:
+        jax.monitoring.unregister_event_duration_listener(listen)
+    assert 1 <= sum("_trajectory" in str(name) for name in names) <= 4
+    np.testing.assert_allclose(ends, ends[0], rtol=1e-2)
