@@ -121,7 +121,8 @@ def applied(S: Float[Array, "m m"], inverse: Inverse, R: Float[Array, "m k"]) ->
     """S⁺R; differentiated at constant rank."""
     regular, D, factor, root = inverse
     if len(D) < 2:
-        return jnp.where(D[:, None] > 0, R / jnp.where(D[:, None] > 0, S, 1), 0)
+        size = jnp.diagonal(S)[:, None]
+        return jnp.where(D[:, None] > 0, R / jnp.where(D[:, None] > 0, size, 1), 0)
     by_factor = D[:, None] * jax.scipy.linalg.cho_solve((factor, True), D[:, None] * R)
     # A forward pass over a reverse one differentiates this body, not its rule: nothing is changed, but the derivative by S.
     fixed = jax.lax.stop_gradient(S)

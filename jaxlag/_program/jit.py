@@ -67,12 +67,20 @@ def _split(given, named):
 
 
 def is_called_by_python(arrays: Iterable[Any] = ()) -> bool:
-    """Whether the call is not being traced: under `jit` even what is computed from nothing is traced."""
-    return jax.default_backend() == "cpu" and not _has_tracers([_nothing(), *arrays])
+    """Whether the call is not being traced: under `jit` even what is computed from nothing is traced, under an eager `vmap` it is not."""
+    leaves = [_nothing(), *arrays]
+    return jax.default_backend() == "cpu" and (not _has_tracers(leaves) or all(map(_is_known, leaves)))
 
 
 def _has_tracers(leaves):
     return any(issubclass(kind, jax.core.Tracer) for kind in {*map(type, leaves)})
+
+
+def _is_known(leaf):
+    """Whether it is a value, or a batch of values."""
+    while isinstance(leaf, jax.core.Tracer) and hasattr(leaf, "batch_dim"):
+        leaf = leaf.val
+    return not isinstance(leaf, jax.core.Tracer)
 
 
 @jax.jit

@@ -51,7 +51,7 @@ def counts():
     return json.loads(subprocess.run([sys.executable, "-c", COUNTED], capture_output=True, text=True, check=True).stdout)
 
 
-@pytest.mark.parametrize("call, most", [("simulate", 700), ("acceleration", 450), ("fit", 6000), ("iteration", 350)])
+@pytest.mark.parametrize("call, most", [("simulate", 1000), ("acceleration", 450), ("fit", 6000), ("iteration", 350)])
 def test_python_does_little(counts, call, most):
     """One conversion by JAX is some 90 calls of functions: were each number converted by itself, `simulate` would make 4000."""
     assert 0 < counts[call] <= most

@@ -41,10 +41,11 @@ def test_a_motion_is_that_without_padding(interpolation):
     np.testing.assert_allclose(padded.balance(), 0, atol=1e-7)
 
 
-def test_its_derivatives_are_those_without_padding():
-    work = lambda b: jnp.sum(motion(37, jl.Linear(), b).qddot ** 2)
-    for derivative in (jax.grad, jax.jacfwd, jax.hessian):
-        np.testing.assert_allclose(derivative(work)(0.3), jax.jit(derivative(work))(0.3), rtol=1e-10)
+@pytest.mark.parametrize("derivative, tolerance", [(jax.grad, 1e-8), (jax.jacfwd, 1e-8), (jax.hessian, 1e-12)])
+def test_its_derivatives_are_those_without_padding(derivative, tolerance):
+    """The second at a tolerance for which the kinks of the input do not show."""
+    work = lambda b: jnp.sum(motion(37, jl.Linear(), b, rtol=tolerance).qddot ** 2)
+    np.testing.assert_allclose(derivative(work)(0.3), jax.jit(derivative(work))(0.3), rtol=1e-8)
 
 
 def test_many_lengths_compile_few_programs():
@@ -56,8 +57,9 @@ def test_many_lengths_compile_few_programs():
 
     jax.monitoring.register_event_duration_secs_listener(listen)
     try:
-        ends = [float(motion(length, jl.Linear()).q[-1]) for length in range(101, 129, 3)]
+        ends = [float(motion(length, jl.Linear()).q[-1]) for length in range(101, 129)]
     finally:
         jax.monitoring.unregister_event_duration_listener(listen)
-    assert 1 <= sum("_trajectory" in str(name) for name in names) <= 4
+    sizes = {(padded_size(length), padded_size(length - 3)) for length in range(101, 129)}  # of the samples, and of the input
+    assert 1 <= sum("_trajectory" in str(name) for name in names) <= len(sizes) <= 8
     np.testing.assert_allclose(ends, ends[0], rtol=1e-2)
