@@ -123,8 +123,10 @@ def applied(S: Float[Array, "m m"], inverse: Inverse, R: Float[Array, "m k"]) ->
     if len(D) < 2:
         size = jnp.diagonal(S)[:, None]
         return jnp.where(D[:, None] > 0, R / jnp.where(D[:, None] > 0, size, 1), 0)
-    by_factor = D[:, None] * jax.scipy.linalg.cho_solve((factor, True), D[:, None] * R)
-    # A forward pass over a reverse one differentiates this body, not its rule: nothing is changed, but the derivative by S.
+    solve = lambda _, R: D[:, None] * jax.scipy.linalg.cho_solve((factor, True), D[:, None] * R)
+    # A forward pass over a reverse one differentiates this body, not its rule: S⁺ is a solve with S that moves, or, where S is singular,
+    # has terms that change nothing but the derivative by S.
+    by_factor = jax.lax.custom_linear_solve(lambda X: S @ X, R, solve, symmetric=True)
     fixed = jax.lax.stop_gradient(S)
     P = lambda X: root @ (root.T @ X)  # by parts: the product has lost the smaller values
     N, change, X = lambda X: X - fixed @ P(X), S - fixed, P(R)

@@ -299,3 +299,30 @@ def test_constraints_that_contradict_each_other_have_no_acceleration(case, funct
         function(system, jnp.zeros(2), jnp.zeros(2))
     inside = jax.jit(lambda q: function(system, q, jnp.zeros(2)))(jnp.zeros(2))
     assert all(np.all(np.isnan(leaf)) for leaf in jax.tree.leaves(inside))
+
+
+SPHERE = {"sphere": lambda q: q @ q - 5.0}
+ROWS = {
+    "none": {},
+    "one row": SPHERE,
+    "two rows": SPHERE | {"saddle": lambda q: q[0] * q[1] - q[2]},
+    "redundant rows": SPHERE | {"again": lambda q: 2 * (q @ q) - 10.0},
+}
+
+
+@pytest.mark.parametrize("rows", ROWS)
+def test_second_derivatives_of_an_acceleration_in_every_mode(rows):
+    """Forward over reverse differentiates the linear maps of reverse mode, whose matrices move, too; by differences in forward mode."""
+
+    def lagrangian(q, qdot):
+        turning = 0.5 * qdot[2] ** 2 * (2 + jnp.sin(q[1]))
+        return 0.5 * qdot @ qdot * (1 + q[0] ** 2) + q[0] * qdot[0] * qdot[1] + turning - q[2] * q[0]
+
+    system = jl.System(lagrangian, holonomic=ROWS[rows])
+    x, h = jnp.array([1.0, 1.5, 0.8, 0.3, 0.7, -0.2]), 1e-4
+    found = lambda x: jl.acceleration(system, x[:3], x[3:]).qddot
+    slope = jax.jacfwd(found)
+    expected = jnp.stack([(slope(x + h * e) - slope(x - h * e)) / (2 * h) for e in jnp.eye(6)], axis=-1)
+    for outer in (jax.jacfwd, jax.jacrev):
+        for inner in (jax.jacfwd, jax.jacrev):
+            np.testing.assert_allclose(outer(inner(found))(x), expected, rtol=1e-6, atol=1e-7)
