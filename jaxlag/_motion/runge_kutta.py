@@ -128,6 +128,8 @@ class Dopri5(ExplicitRungeKutta):
 
     **Arguments:** `reverse`: whether reverse mode may go through a step in which an input jumps. `simulate` chooses by itself.
 
+    **Raises:** nothing; `simulate` reports a failure of the integration as the result of the motion.
+
     **Source:** Hairer, Nørsett & Wanner, Solving Ordinary Differential Equations I, table II.5.2 and section II.6.
 
     ```python
@@ -148,6 +150,8 @@ class Dop853(ExplicitRungeKutta):
     For `simulate(solver=...)`, and for any `diffrax.diffeqsolve`; the state is any pytree.
 
     **Arguments:** `reverse`: whether reverse mode may go through a step in which an input jumps. `simulate` chooses by itself.
+
+    **Raises:** nothing; `simulate` reports a failure of the integration as the result of the motion.
 
     **Source:** Hairer, Nørsett & Wanner, Solving Ordinary Differential Equations I, section II.10.
 
