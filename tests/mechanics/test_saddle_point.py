@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import jaxlag as jl
-from jaxlag._mechanics.pseudo_inverse import pseudo_inverse
+from jaxlag._mechanics.pseudo_inverse import _left_singular_vectors, pseudo_inverse
 from jaxlag._mechanics.saddle_point import saddle_point
 from jaxlag.examples import pendulum
 
@@ -326,3 +326,18 @@ def test_second_derivatives_of_an_acceleration_in_every_mode(rows):
     for outer in (jax.jacfwd, jax.jacrev):
         for inner in (jax.jacfwd, jax.jacrev):
             np.testing.assert_allclose(outer(inner(found))(x), expected, rtol=1e-6, atol=1e-7)
+
+
+def test_singular_values_of_two_rows():
+    """Against LAPACK: random rows, nearly dependent ones, equal ones, and one of zeros."""
+    rng, found = np.random.default_rng(0), jax.jit(_left_singular_vectors)
+    for kind in range(400):
+        rows = rng.normal(size=(2, 3))
+        if kind % 4:
+            rows[1] = rng.normal() * rows[0] * (kind % 4 < 3) + 10.0 ** -rng.integers(0, 17) * rng.normal(size=3) * (kind % 4 == 1)
+        U, values = map(np.asarray, found(rows))
+        a, b = U.T @ rows
+        largest = np.linalg.norm(rows, 2)
+        np.testing.assert_allclose(values, np.linalg.svd(rows, compute_uv=False), rtol=0, atol=4e-15 * largest)
+        np.testing.assert_allclose(U @ U.T, np.eye(2), rtol=0, atol=4e-15)
+        assert abs(a @ b) <= 4e-15 * largest**2
