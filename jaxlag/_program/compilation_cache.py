@@ -35,7 +35,8 @@ def keep_compiled(folder: str | os.PathLike | None = None, *, max_bytes: int = 2
 
     **Returns:** the folder.
 
-    **Raises:** `ValueError` where the folder cannot be made or written to.
+    **Raises:** `ValueError` where the folder cannot be made or written to; `TypeError` where `folder` is no path, or `max_bytes` no whole
+    number of 0 or more.
 
     **Source:** the guide of JAX, "Persistent compilation cache".
 
@@ -44,6 +45,10 @@ def keep_compiled(folder: str | os.PathLike | None = None, *, max_bytes: int = 2
     folder = jl.keep_compiled()  # e.g. /home/ada/.cache/jaxlag
     ```
     """
+    if not (folder is None or isinstance(folder, (str, os.PathLike))):
+        raise TypeError(f'`folder` must be a path, but is {folder!r}. Write e.g. "~/programs", or leave it out.')
+    if not (type(max_bytes) is int and max_bytes >= 0):
+        raise TypeError(f"`max_bytes` must be a whole number of bytes, 0 or more, but is {max_bytes!r}. The default is 2**30.")
     for setting, value in SMALLEST.items():
         if setting.upper() not in os.environ:
             jax.config.update(setting, value)

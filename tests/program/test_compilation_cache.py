@@ -136,3 +136,10 @@ def test_a_folder_that_cannot_be_written_to_is_refused(compilation_cache, tmp_pa
 
 def test_a_new_folder_is_private(compilation_cache, tmp_path):
     assert jl.keep_compiled(tmp_path / "new").stat().st_mode & 0o077 == 0
+
+
+@pytest.mark.parametrize("wrong", [{"folder": 3}, {"max_bytes": "1 GB"}, {"max_bytes": -1}])
+def test_arguments_of_the_wrong_kind(wrong):
+    (name,) = wrong
+    with pytest.raises(TypeError, match=f"`{name}` must be .*, but is"):
+        jl.keep_compiled(**wrong)
