@@ -113,7 +113,7 @@ def _custom_jvp_as_scalar_code(equation, *arrays):
     def body(real, others):
         results = evaluate(equation.params["call_jaxpr"], JAX_ALGEBRA, *rebuild(merged(real, others)))
         outputs = zip(results, equation.outvars, strict=True)
-        return [jax.numpy.asarray(x, variable.aval.dtype) for array, variable in outputs for x in array.flat]
+        return _depending_on([*real, *others], [jax.numpy.asarray(x, variable.aval.dtype) for array, variable in outputs for x in array.flat])
 
     def rule(primals, tangents):
         (real, others), (change, _) = primals, tangents
@@ -123,6 +123,17 @@ def _custom_jvp_as_scalar_code(equation, *arrays):
     body.defjvp(rule)
     parts = [[x for x, kind in zip(given, is_real, strict=True) if kind is which] for which in (True, False)]
     return unflattened(body(*parts), [variable.aval.shape for variable in equation.outvars])
+
+
+def _depending_on(variables, results):
+    """`results`, each of them a function of all variables for JAX; the compiler sees that it is not.
+
+    Under `vmap`, JAX wants a function and its derivative rule to depend on the same variables. Of what is simplified the rule may depend
+    on more.
+    """
+    select = lambda value, other: lax.select_n(np.False_, value, lax.convert_element_type(other, value.dtype))
+    nothing = functools.reduce(select, variables, jax.numpy.zeros(()))
+    return [select(x, nothing) for x in results]
 
 
 def _linear_solve_as_scalar_code(equation, *arrays):
