@@ -18,8 +18,8 @@ REFERENCE = {
     "Residual consistent_state examine Examination",
     "Motions": "simulate simulate_many Trajectory FrictionState RESULTS Instant Interpolated load Dop853 Dopri5 Projection Baumgarte "
     "NoStabilisation StickSlip Regularised keep_compiled",
-    "Identification": "Experiment fit fit_each Fit Channel Interval Prediction regress Regression validate Validation compare Comparison "
-    "information Information Huber learnt.ConvexDissipation learnt.PassiveDissipation learnt.Potential learnt.ConvexPotential",
+    "Identification": "Experiment fit fit_each Fit Channel Interval Prediction regress Regression Regress validate Validation compare "
+    "Comparison information Information Huber learnt.ConvexDissipation learnt.PassiveDissipation learnt.Potential learnt.ConvexPotential",
     "On paper": "equations Equations to_sympy",
     "Pictures": "plot.motion plot.phase plot.forces plot.energy plot.balance plot.friction plot.fit plot.parameters plot.convergence "
     "plot.equations animate",

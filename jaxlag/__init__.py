@@ -23,6 +23,7 @@ from ._fit.result import Fit as Fit, Interval as Interval, Prediction as Predict
 from ._fit.fit import fit as fit, fit_each as fit_each
 from ._fit.robust_loss import Huber as Huber
 from ._fit.channels import Channel as Channel
+from ._fit.lead_in import Regress as Regress
 from ._fit.regress import Regression as Regression, regress as regress
 from ._motion.simulate import simulate as simulate
 from ._motion.load import load as load

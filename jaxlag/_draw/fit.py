@@ -54,7 +54,7 @@ def fit(fit: Fit, *, number: int = 0, level: float = 0.95, units: Units = None, 
     experiment = fit.experiments[number]
     sigma = experiment.sigma
     if sigma is None:
-        sigma = jax.tree.map(lambda value: np.full(value.shape, fit.sigma), experiment.values)
+        sigma = jax.tree.map(lambda own, value: np.broadcast_to(own, value.shape), fit.sigmas[number], experiment.values)
     trees = (experiment.values, fit.predictions[number], fit.band(number, level)[1], fit.residuals[number], sigma)
     measured, fitted, upmost, residuals, sigma = (channels(tree, "z") for tree in trees)
     ts = np.asarray(experiment.ts)
@@ -155,7 +155,7 @@ def convergence(fit: Fit, *, ax: Any = None) -> Any:
     $$ \tfrac12\sum_i \left(\frac{r_i}{\sigma_i}\right)^2 $$
 
     The first is that of the initial guess. The cost can rise where the problem itself changes on the way: where the weight of the gaps
-    between segments (`segments=`) grows, and where the scale of a robust loss is estimated again.
+    between segments (`segments=`) grows, and where the sigmas of the channels are estimated again.
 
     **Arguments:**
 

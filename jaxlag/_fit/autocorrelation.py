@@ -74,6 +74,16 @@ def correlation_length(a: np.ndarray, count: int) -> int:
     return int(np.flatnonzero(np.abs(gamma) >= NEGLIGIBLE * gamma[0])[-1]) + 1
 
 
+def independent_samples(count: int, correlated: int) -> float:
+    """About how many independent samples tell as much about a variance as `count` samples that are `correlated` over so many.
+
+    With r_t = ρ r_{t−1} + e_t these are count (1 − ρ²)/(1 + ρ²), and the correlation falls to a tenth within 2.3 / (1 − ρ) samples.
+
+    **Source:** Bayley & Hammersley, J. R. Stat. Soc. Suppl. 8 (1946) 184.
+    """
+    return 2 * count / max(correlated, 2)
+
+
 def coloured_information(J: np.ndarray, r: np.ndarray, sizes: np.ndarray) -> np.ndarray:
     r"""$J^T R J$ for correlated residuals, the middle of the sandwich $(J^T J)^{-1} J^T R J (J^T J)^{-1}$; (x, x).
 

@@ -46,8 +46,12 @@ class Channel(NamedTuple):
 def channels_of(number: int, values: PyTree, residuals: PyTree) -> list[Channel]:
     """Each scalar channel of an experiment, in flat order."""
     flat = lambda tree: np.concatenate([np.reshape(np.asarray(leaf), (len(leaf), -1)) for leaf in jax.tree.leaves(tree)], axis=1).T
-    names = entry_names(jax.tree.map(lambda leaf: np.zeros(np.shape(leaf)[1:]), values))
-    return [_channel(number, name or "z", z, r) for name, z, r in zip(names, flat(values), flat(residuals), strict=True)]
+    return [_channel(number, *one) for one in zip(channel_names(values), flat(values), flat(residuals), strict=True)]
+
+
+def channel_names(values: PyTree) -> list[str]:
+    """The names of the scalar channels, in flat order."""
+    return [name or "z" for name in entry_names(jax.tree.map(lambda leaf: np.zeros(np.shape(leaf)[1:]), values))]
 
 
 def _channel(number, name, z, r):

@@ -116,6 +116,12 @@ def _distributed(batch):
     return jax.tree.map(lambda x: jax.device_put(padded(x, devices), sharding) if eqx.is_array(x) else x, batch)
 
 
+def with_sigma(batch: ExperimentBatch, sigma: PyTree) -> ExperimentBatch:
+    """The batch with another `sigma`, on the same devices."""
+    placed = sigma if batch.mesh is None else jax.device_put(sigma, NamedSharding(batch.mesh, EXPERIMENTS_AXIS))
+    return dataclasses.replace(batch, sigma=placed)
+
+
 def _tangent_basis(system, params, e):
     """Directions in which the start of an experiment may move: its unknown entries, within the constraints."""
     entries = start_entries(e)

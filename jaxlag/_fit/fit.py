@@ -2,9 +2,9 @@
 
 import dataclasses
 from collections.abc import Mapping, Sequence
+from functools import partial
 from typing import Any
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -15,11 +15,11 @@ from .._model.numbers import count
 from .._model.system import System
 from .._motion.progress import Steps, compiling
 from .experiment import Experiment, measured
-from .levenberg_marquardt import Outcome, levenberg_marquardt
-from .minimise import minimise
+from .lead_in import Regress, inside_bounds, led_in
+from .minimise import each_apart, minimise, minimise_each
 from .multiple_shooting import Segments, cut
 from .parameters import Free
-from .problem import Problem, linearise_each
+from .problem import Problem
 from .regress import regress
 from .residuals import Model
 from .result import Fit
@@ -39,6 +39,7 @@ def fit(
     method: Any = None,
     starts: int = 1,
     segments: int = 1,
+    start: Any = None,
     max_steps: int | None = None,
     tolerance: float = 1e-3,
     progress: bool = False,
@@ -55,7 +56,7 @@ def fit(
 
     - `experiments`: one `Experiment` or several, with T samples each; T may differ.
     - `params`: all parameters, a mapping or any pytree with named parts, of numbers and arrays of any shape. Those in `free` are starting
-      values; where one is NaN, `jaxlag.regress` finds it.
+      values; where one is NaN, `jaxlag.regress` finds it, and an estimate at its bound is moved inside.
     - `free`: names of the entries of `params` to be identified, or paths to parts of them, `"arm.length"`, `"joints[0]"`.
     - `bounds`: (lower, upper) by name, None where there is none: `{"b": (0, None)}` keeps b from being negative. Estimates and starting
       values may lie on a bound. If an estimate does, a remark says whether the measurements favour values beyond it.
@@ -66,13 +67,15 @@ def fit(
     - `starts`: number of starting values, tried in one batch: the given ones, and others at random, within two bounds or otherwise
       typically a factor of two away.
     - `segments`: number of segments that each record is cut into (multiple shooting), for long or chaotic records.
+    - `start`: `jaxlag.Regress()` leads the fit in from a poor start: by `regress`, and by segments where that is not enough.
     - `max_steps`: step limit, by default 100, or 1000 with `method`. `tolerance`: the iteration ends when the next step would change no
       parameter by more than this part of its standard error.
     - `progress`: shows step, cost and remaining time on standard error, in one line on a terminal, otherwise a line now and then; and
       what is being compiled, where that takes more than two seconds.
     - `**numerics`: passed on to `simulate`: `solver`, `rtol`, `atol`, `stabilisation`, `friction`.
 
-    Units are any consistent set. Where residuals are correlated in time, the standard errors account for it, as the card says (`Fit`).
+    Units are any consistent set. Where no sigma is given, that of each channel is estimated along with the parameters, by maximum
+    likelihood; experiments share it. Where residuals are correlated in time, the standard errors account for it, as the card says (`Fit`).
     Interrupted with Ctrl-C, it returns the best parameters so far. Experiments of one kind run as a batch, on all devices.
 
     **Returns:** a `Fit`.
@@ -94,8 +97,15 @@ def fit(
     segments = renamed(segments, "segments", pieces=numerics.pop("pieces", None))
     segments = count(segments, "`segments`", cure="Use 1 for single shooting, some tens for a long or chaotic record.")
     starts = count(starts, "`starts`", cure="Use 1 for a single start, some tens for a poor initial guess.")
-    if (segments > 1) + (method is not None) + (starts > 1) > 1:
-        raise ValueError("`segments`, `starts` and `method` must be used one at a time, but more than one was given. Omit the others.")
+    if (segments > 1) + (method is not None) + (starts > 1) + (start is not None) > 1:
+        raise ValueError(
+            "`segments`, `start`, `starts` and `method` must be used one at a time, but more than one was given. Omit the others."
+        )
+    common: dict[str, Any] = {"free": free, "bounds": bounds}
+    if start is not None:
+        fit_from = partial(fit, system, priors=priors, loss=loss, tolerance=tolerance, progress=progress, **common, **numerics)
+        return _led_in(fit_from, system, experiments, params, start, max_steps or 100, **common)
+    params, said = _without_nan(system, experiments, params, **common)
     problem, experiments = _checked_problem(system, experiments, params, free, bounds, priors, loss, method is None, numerics)
     steps = max_steps or (100 if method is None else 1000)
     line = Steps(steps) if progress else None
@@ -106,7 +116,7 @@ def fit(
                 of_segments.problem,
                 method=method,
                 starts=starts,
-                estimate_scale=loss is not None and not _absolute(experiments),
+                estimate_sigma=not _absolute(experiments),
                 freedom=max(sum(map(_measurements, experiments)) - problem.size, 1),
                 max_steps=steps,
                 tolerance=tolerance,
@@ -115,7 +125,29 @@ def fit(
         finally:
             if line:
                 line.end()
-        return report(problem, experiments, outcome, of_segments)
+        return dataclasses.replace(report(problem, experiments, outcome, of_segments), led_in=said)
+
+
+def _led_in(fit_from, system, experiments, params, start, max_steps, **common):
+    """The fit that `start` leads to."""
+    if not isinstance(start, Regress):
+        raise ValueError(f"`start` must be a `Regress` or None, but is a {type(start).__name__}. Write `start=jl.Regress()`.")
+    experiments, params = measured(experiments, params)
+    found = regress(system, experiments, params, width=start.width, **common)
+    params, said = inside_bounds(found, **common)
+    return led_in(fit_from, start, experiments, params, said, max_steps)
+
+
+def _without_nan(system, experiments, params, free, bounds):
+    """The parameters with those from `regress` that are free and NaN; and what was done."""
+    experiments, params = measured(experiments, params)
+    chosen = Free.of(params, free, bounds)
+    unknown = np.isnan(chosen.start)
+    if not np.any(unknown):
+        return params, ()
+    found = regress(system, experiments, params, free=free, bounds=bounds)
+    inside, said = inside_bounds(found, free, bounds)
+    return chosen.insert(jnp.where(unknown, Free.of(inside, free).start, chosen.start)), (said,)
 
 
 def fit_each(
@@ -153,53 +185,38 @@ def fit_each(
     [fit.estimates["c"] for fit in jl.fit_each(oscillator, records, {"c": 3.0}, free=("c",))]  # [4.0, 4.41]
     ```
     """
+    params, said = _without_nan(system, experiments, params, free, bounds)
     problem, experiments = _checked_problem(system, experiments, params, free, bounds, priors, None, True, numerics, apart=True)
     if len(problem.batches) > 1:
         raise ValueError("`experiments` must be of one kind, but differ in sensors, unknowns or shapes. Fit each kind by itself.")
     (batch,) = problem.batches
-    xs = jnp.zeros((len(experiments), problem.free.size + batch.unknowns))
-
-    def residuals(xs):
-        found = linearise_each(problem, xs)
-        return found.residuals, found.jacobian, found
-
     line = Steps(max_steps) if progress else None
-    freedom = max(min(map(_measurements, experiments)) - xs.shape[1], 1)
-    own = jnp.full(batch.unknowns, jnp.inf)
-    lower, upper = problem.free.bounds
-    limits = jnp.concatenate([lower, -own]), jnp.concatenate([upper, own])
-    stopping = {"freedom": freedom, "max_steps": max_steps, "tolerance": tolerance}
     with compiling("the fits", progress):
-        outcome = levenberg_marquardt(residuals, xs, bounds=limits, progress=line, **stopping)
-        if line:
-            line.end()
-        return _report_each(problem, experiments, outcome)
-
-
-def _report_each(problem: Problem, experiments: Sequence[Experiment], outcome: Outcome) -> list[Fit]:
-    best, batch = jax.tree.map(np.asarray, (outcome.best, problem.batches[0]))  # slices of NumPy arrays cost nothing
-    batch = dataclasses.replace(batch, members=(0,), mesh=None)
-    fits = []
-    for i, e in enumerate(experiments):
-        one = jax.tree.map(lambda leaf, i=i: leaf[i : i + 1] if eqx.is_array(leaf) else leaf, batch)
-        of_one = outcome._replace(best=jax.tree.map(lambda leaf, i=i: leaf[i], best), costs=outcome.costs[:, i])
-        fits.append(report(dataclasses.replace(problem, batches=(one,)), (e,), of_one, Segments(problem, (0,), ())))
-    return fits
+        try:
+            outcome, problem = minimise_each(
+                problem,
+                estimate_sigma=not _absolute(experiments),
+                freedom=max(min(map(_measurements, experiments)) - problem.free.size - batch.unknowns, 1),
+                max_steps=max_steps,
+                tolerance=tolerance,
+                progress=line,
+            )
+        finally:
+            if line:
+                line.end()
+        ends = each_apart(problem, outcome)
+        fits = [report(one, (e,), end, Segments(one, (0,), ())) for e, (one, end) in zip(experiments, ends, strict=True)]
+    return [dataclasses.replace(found, led_in=said) for found in fits]
 
 
 def _checked_problem(system, experiments, params, free, bounds, priors, loss, relative, numerics, apart=False):
-    """The problem after all checks of the arguments, and the experiments; starting values that are NaN come from `regress`."""
+    """The problem after all checks of the arguments, and the experiments."""
     experiments, params = measured(experiments, params)
     if len({e.sigma is None for e in experiments}) > 1:
         raise ValueError("`experiments` must all have a `sigma` or none, but only some have. Give each of them one.")
     chosen = Free.of(params, free, bounds, priors, relative)
     if priors and not _absolute(experiments):
         raise ValueError("`priors` must be weighed against known noise, but an experiment has no `sigma`. Give it.")
-    without_start = np.isnan(chosen.start)
-    if np.any(without_start):
-        found = regress(system, experiments, params, free=free, bounds=bounds)
-        start = jnp.where(without_start, Free.of(found.params, free, bounds).start, chosen.start)
-        chosen = Free.of(chosen.insert(start), free, bounds, priors, relative)
     for name in chosen.names:
         if all(name in e.params for e in experiments):
             raise ValueError(

@@ -10,6 +10,7 @@ from jax.flatten_util import ravel_pytree
 
 from .._model.paths import entry_names, is_within
 from .autocorrelation import COLOURED
+from .channel_sigma import sigmas_of
 from .channels import Channel
 from .rounding import plus_minus, rounded
 
@@ -22,12 +23,13 @@ def card(fit: Any) -> str:
     """The card of a `Fit`, a line for each element."""
     rows = [
         _heading(fit),
+        *([f"  led in by {', then '.join(fit.led_in)}"] if fit.led_in else []),
         *_parameter_rows(fit),
         *_correlation_rows(fit),
         *_inflation_rows(fit),
         *(f"  ! {remark}" for remark in fit.remarks),
         *channel_rows(fit.channels),
-        f"  residual sigma  {fit.sigma:.4g}{'  (1 where the stated noise level is right)' if fit.absolute else ''}",
+        f"  residual sigma  {_sigma(fit)}",
     ]
     return "\n".join(rows)
 
@@ -102,6 +104,17 @@ def channel_rows(channels: Sequence[Channel]) -> list[str]:
         for c in shown
     ]
     return rows + ([f"  … and {len(channels) - ROWS} more channels"] if len(channels) > ROWS else [])
+
+
+def _sigma(fit):
+    """In units of the given sigma, or of each channel by name."""
+    if fit.absolute:
+        return f"{fit.sigma:.4g}  (1 where the stated noise level is right)"
+    relative = sigmas_of(fit.problem)
+    if len(relative) == 1:
+        return f"{fit.sigma:.4g}"
+    shown = ", ".join(f"{name} {fit.sigma * sigma:.4g}" for name, sigma in list(relative.items())[:MANY])
+    return shown + (", …" if len(relative) > MANY else "")
 
 
 def _whiteness(p):

@@ -11,7 +11,7 @@ import optimistix as optx
 
 from .._program.jit import compiled
 
-RUNNING, CONVERGED, STALLED, STEP_LIMIT, INTERRUPTED, FAILED, UNRELATED, DISCONTINUOUS = range(8)
+RUNNING, CONVERGED, STALLED, STEP_LIMIT, INTERRUPTED, FAILED, UNRELATED, DISCONTINUOUS, KINKED = range(9)
 REASONS = (
     "still running",
     "converged",
@@ -21,12 +21,17 @@ REASONS = (
     "the motion at the start could not be computed",
     "no step lowers the cost any more, but the predictions are unrelated to the measurements",
     "the segments do not join, however heavily the gaps are weighted; use more segments, or start from other parameters",
+    "the cost has a kink here, as where dry friction comes to stick or begins to slip, and steps along it lower it by next to nothing; "
+    "the standard errors hold on one side of the kink; see whether `starts=` or a model that misses less finds a lower cost",
 )
 FIRST_DAMPING = 1e-2
 DAMPING_LIMITS = 1e-14, 1e14
 NEWTON_LIKE = 0.5  # damping below which a step is close to that of Gauss and Newton
 HOPELESS = 1e8  # damping from which on no step is expected to lower the cost
-FLAT = 1e-4  # cosine between the residuals and the columns of the Jacobian, below which the gradient counts as zero
+SHORT = 0.3  # standard errors; the cost of so short a step is as expected, unless there is a kink
+SLIGHT = 0.1  # standard errors; a cost that falls less than by such a step has not fallen
+PATIENCE = 5  # short damped steps without such a fall, after which the iteration ends
+FLAT = 1e-4  # cosine of residuals and columns of the Jacobian below which the gradient counts as zero, or that of a `SLIGHT` step
 
 
 class Iterate(NamedTuple):
@@ -39,6 +44,9 @@ class Iterate(NamedTuple):
     cost: Any  # ½|r|²
     damping: Any
     scale: Any  # largest norm that each column of the Jacobian has had
+    across: Any  # the Jacobian beyond a kink, where there is one; otherwise the same
+    mark: Any  # the cost when it last fell by what counts
+    slow: Any  # short damped steps since then
     status: Any
 
 
@@ -108,15 +116,27 @@ def _norms(J):
 
 def _initialise(y, linearised, bounds):
     r, J, aux = linearised
-    now = Iterate(y, r, J, aux, _cost(r), jnp.asarray(FIRST_DAMPING, y.dtype), _norms(J), jnp.asarray(RUNNING))
+    now = Iterate(y, r, J, aux, _cost(r), jnp.asarray(FIRST_DAMPING, y.dtype), _norms(J), J, _cost(r), jnp.asarray(0), jnp.asarray(RUNNING))
     return now, _propose(now, bounds)
+
+
+def _across_the_kink(now):
+    """The convex combination of the Jacobians on both sides of a kink with the smallest gradient: steps along the kink.
+
+    **Source:** Burke, Lewis & Overton, SIAM J. Optim. 15 (2005) 751 (gradient sampling), for two samples.
+    """
+    scale = jnp.where(now.scale > 0, now.scale, 1)
+    here, there = (now.residuals @ J / scale for J in (now.jacobian, now.across))
+    apart = jnp.sum((here - there) ** 2)
+    share = jnp.clip(here @ (here - there) / jnp.where(apart > 0, apart, 1), 0, 1)
+    return now.jacobian + share * (now.across - now.jacobian)
 
 
 def _propose(now, bounds):
     """The damped Gauss–Newton step, in columns scaled to norm one. Entries that would cross a bound stop there."""
     scale = jnp.where(now.scale > 0, now.scale, 1)
     lower, upper = ((bound - now.y) * scale for bound in bounds)
-    J, slope = now.jacobian / scale[None, :], now.residuals @ now.jacobian
+    J, slope = _across_the_kink(now) / scale[None, :], now.residuals @ now.jacobian
     active = ((lower >= 0) & (slope > 0)) | ((upper <= 0) & (slope < 0))
     descent = optx.DampedNewtonDescent()
 
@@ -149,7 +169,16 @@ def _update(now, trial, linearised, bounds, tolerance, freedom):
     damping = now.damping * jnp.where(better, jnp.where(as_expected, 0.1, 1.0), 10.0)
     damping = jnp.clip(damping, *DAMPING_LIMITS)
     status = _status(now, trial, taken, newton_like, tolerance, freedom)
-    chosen = Iterate(*take((trial.y, r, J, aux, after), now[:5]), damping, jnp.maximum(now.scale, _norms(jnp.where(taken, J, 0))), status)
+    per_error = 2 * before / jnp.maximum(freedom, 1)  # σ̂²: the |J Δy|² of a step by one standard error
+    short = (jnp.sum(trial.change**2) <= SHORT**2 * per_error) & jnp.isfinite(after)
+    across = jnp.where(taken, jnp.where(short & ~as_expected, now.jacobian, J), jnp.where(short, J, now.across))
+    fell = now.mark - jnp.where(taken, after, before) > SLIGHT**2 / 2 * per_error
+    slow = jnp.where(fell, 0, now.slow + (taken & ~newton_like))
+    status = jnp.where((status == RUNNING) & (slow >= PATIENCE), KINKED, status)
+    mark = jnp.where(fell, jnp.where(taken, after, before), now.mark)
+    chosen = take((trial.y, r, J, aux, after), now[:5])
+    scale = jnp.maximum(now.scale, _norms(jnp.where(taken, J, 0)))
+    chosen = Iterate(*chosen, damping, scale, across, mark, slow, status)
     now = jax.tree.map(lambda a, b: jnp.where(now.status != RUNNING, b, a), chosen, now)
     return now, _propose(now, bounds)
 
@@ -160,7 +189,7 @@ def _status(now, trial, taken, newton_like, tolerance, freedom):
     least = jnp.finfo(now.residuals.dtype).eps ** 0.625 * jnp.max(norms)  # below the rounding of what is integrated
     short = trial.free_change <= jnp.maximum(tolerance**2 * 2 * now.cost / jnp.maximum(freedom, 1), least**2)
     cosines = jnp.where((norms > 0) & ~trial.active, now.residuals @ now.jacobian / jnp.where(norms > 0, norms, 1), 0)
-    flat = jnp.linalg.norm(cosines) <= FLAT * jnp.sqrt(2 * now.cost)
+    flat = jnp.linalg.norm(cosines) <= jnp.maximum(FLAT, SLIGHT / jnp.sqrt(jnp.maximum(freedom, 1))) * jnp.sqrt(2 * now.cost)
     status = jnp.where((short & newton_like) | (now.cost == 0), CONVERGED, RUNNING)
     status = jnp.where(~taken & (now.damping >= HOPELESS), jnp.where(flat, CONVERGED, STALLED), status)
     status = jnp.where(jnp.isfinite(now.cost), status, FAILED)

@@ -3,36 +3,100 @@
 import dataclasses
 from typing import Any
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from .._motion.derivative_rule import FORWARD_LIMIT
 from .._program.jit import compiled
+from .channel_sigma import sigmas_of, weighted_by_residuals, weighted_by_spread
+from .experiment_batch import with_sigma
 from .levenberg_marquardt import INTERRUPTED, STEP_LIMIT, Iterate, Outcome, levenberg_marquardt
-from .minimum import robust_scale
 from .multiple_shooting import join
-from .problem import Problem, failure_of, linearise, linearise_starts, without_jacobian
+from .problem import Problem, failure_of, linearise, linearise_each, linearise_starts, without_jacobian
 
-SCALE_ROUNDS = 3  # of a robust loss with unknown sigma
+SIGMA_ROUNDS = 10  # at most, of estimating sigma and the unknowns in turn,
+ROBUST_ROUNDS = 3  # with a robust loss, whose sigma need not settle,
+OPTAX_ROUNDS = 1  # or with an optimiser of optax, which takes long
+SETTLED = 1e-4  # relative change of a sigma from one round to the next that counts as zero
 AT_THE_START = "the motion at the start must be computable"
 
 
-def minimise(problem: Problem, *, method: Any, starts: int, estimate_scale: bool, **limits: Any) -> tuple[Outcome, Problem]:
-    """The outcome, and the problem it belongs to: with the scale of the noise and the continuity of the last round.
+def minimise(problem: Problem, *, method: Any, starts: int, estimate_sigma: bool, **limits: Any) -> tuple[Outcome, Problem]:
+    """The outcome, and the problem it belongs to: with the sigmas of the channels and the continuity of the last round.
 
     `limits`: `freedom`, `max_steps`, `tolerance` and `progress` of `levenberg_marquardt`.
     """
-    original = problem
-    outcome, problem = _minimise(original, np.zeros(original.size, original.free.start.dtype), method, starts, limits)
-    for _ in range(SCALE_ROUNDS if estimate_scale else 0):
-        if int(outcome.best.status) == INTERRUPTED:
+    problem = weighted_by_spread(problem) if estimate_sigma else problem
+    apart = problem.continuity  # the weight of the gaps grows anew in each round
+    outcome, problem = _minimise(problem, np.zeros(problem.size, problem.free.start.dtype), method, starts, limits)
+    for _ in range(_rounds(problem, method) if estimate_sigma else 0):
+        if int(outcome.best.status) in (INTERRUPTED, STEP_LIMIT) and method is None:
             break
-        before = outcome
-        rescaled = dataclasses.replace(original, scale=robust_scale(before.best.aux, problem))
-        outcome, problem = _minimise(rescaled, before.best.y, method, 1, limits)
+        before, (reweighted, change) = outcome, weighted_by_residuals(problem, outcome.best.aux)
+        if change < SETTLED:
+            break
+        reweighted = dataclasses.replace(reweighted, continuity=apart)
+        outcome, problem = _minimise(reweighted, before.best.y, method, 1, limits)
         outcome = outcome._replace(steps=before.steps + outcome.steps, costs=np.append(before.costs, outcome.costs))
     return outcome, problem
+
+
+def _rounds(problem, method):
+    """How often the sigmas are estimated; never where there is one for all, of which the estimates do not depend."""
+    if problem.model.loss is None and len(sigmas_of(problem)) == 1:
+        return 0
+    return SIGMA_ROUNDS if method is None and problem.model.loss is None else ROBUST_ROUNDS if method is None else OPTAX_ROUNDS
+
+
+def minimise_each(problem: Problem, *, estimate_sigma: bool, **limits: Any) -> tuple[Outcome, Problem]:
+    """Each experiment of a problem with one batch by itself, with sigmas of its own; `limits` as for `minimise`."""
+    (batch,) = problem.batches
+    count = len(batch.members)
+    own = np.full(batch.unknowns, np.inf)
+    bounds = tuple(np.concatenate([bound, sign * own]) for bound, sign in zip(problem.free.bounds, (-1, 1), strict=True))
+
+    def minimised(problem, xs):
+        def residuals(xs):
+            found = linearise_each(problem, xs)
+            return found.residuals, found.jacobian, found
+
+        return levenberg_marquardt(residuals, xs, bounds=bounds, **limits)
+
+    if estimate_sigma:
+        problem = _each_weighted(problem, [weighted_by_spread(one) for one, _ in each_apart(problem)])
+    outcome = minimised(problem, jnp.zeros((count, problem.free.size + batch.unknowns)))
+    for _ in range(SIGMA_ROUNDS if estimate_sigma and len(sigmas_of(problem)) > 1 else 0):
+        apart = [(one, end.best) for one, end in each_apart(problem, outcome)]
+        found = [weighted_by_residuals(one, best.aux) if np.isfinite(best.cost) else (one, 0.0) for one, best in apart]
+        if max(change for _, change in found) < SETTLED or np.any(outcome.best.status == INTERRUPTED):
+            break
+        before, problem = outcome, _each_weighted(problem, [one for one, _ in found])
+        outcome = minimised(problem, before.best.y)
+        outcome = outcome._replace(steps=before.steps + outcome.steps, costs=np.concatenate([before.costs, outcome.costs]))
+    return outcome, problem
+
+
+def each_apart(problem: Problem, outcome: Outcome | None = None) -> list[tuple[Problem, Any]]:
+    """Each experiment of a problem with one batch as a problem by itself, with its part of the outcome."""
+    batch, best = jax.tree.map(np.asarray, (problem.batches[0], outcome and outcome.best))  # slices of NumPy arrays cost nothing
+    batch = dataclasses.replace(batch, members=(0,), mesh=None)
+    apart = []
+    for i in range(len(problem.batches[0].members)):
+        one = jax.tree.map(lambda leaf, i=i: leaf[i : i + 1] if eqx.is_array(leaf) else leaf, batch)
+        end = outcome and outcome._replace(best=jax.tree.map(lambda leaf, i=i: leaf[i], best), costs=outcome.costs[:, i])
+        apart.append((dataclasses.replace(problem, batches=(one,)), end))
+    return apart
+
+
+def _each_weighted(problem, apart):
+    """The problem with the sigmas of the problems that are its experiments."""
+    (batch,) = problem.batches
+    copies = len(batch.ts) - len(apart)  # of the last one
+    sigmas = [one.batches[0].sigma for one in [*apart, *apart[-1:] * copies]]
+    together = jax.tree.map(lambda *leaves: np.concatenate(leaves), *sigmas)
+    return dataclasses.replace(problem, batches=(with_sigma(batch, together),))
 
 
 def _minimise(problem, x, method, starts, limits):
@@ -99,7 +163,7 @@ def _by_optax(problem, method, x, limits):
         raise ValueError(f"{AT_THE_START}, but was not. Start from other parameters.")
     found = linearise(problem, best) if problem.size <= FORWARD_LIMIT else without_jacobian(problem, best)
     none = jnp.zeros(0)
-    iterate = Iterate(best, found.residuals, found.jacobian, found, lowest, none, none, np.asarray(ended))
+    iterate = Iterate(best, found.residuals, found.jacobian, found, lowest, *[none] * 5, np.asarray(ended))
     return Outcome(iterate, len(costs), np.array(costs))
 
 

@@ -4,9 +4,7 @@ import dataclasses
 from collections.abc import Iterator, Sequence
 
 import jax
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array
 
 from .._program.jit import compiled
 from .experiment import Experiment
@@ -84,9 +82,3 @@ def weighted_residuals(problem: Problem, found: Linearisation) -> Iterator[np.nd
         values, sigma = jax.tree.map(lambda x, count=count: np.asarray(x)[:count], (batch.values, batch.sigma))
         r = jax.tree.map(lambda z, p, s: (z - p) / s, values, part.channels, sigma)
         yield np.concatenate([np.reshape(leaf, (count, -1)) for leaf in jax.tree.leaves(r)], axis=1)
-
-
-def robust_scale(found: Linearisation, problem: Problem) -> Array:
-    """The standard deviation of normal noise whose residuals have this median, which outliers do not affect."""
-    r = np.concatenate([np.ravel(r)[np.isfinite(np.ravel(r))] for r in weighted_residuals(problem, found)])
-    return jnp.asarray(1.4826 * np.median(np.abs(r)), problem.scale.dtype)

@@ -58,8 +58,13 @@ def cut(problem: Problem, experiments: Sequence[Experiment], count: int) -> Segm
     return Segments(dataclasses.replace(of_segments, scale=problem.scale, continuity=continuity), tuple(of), tuple(samples))
 
 
+def whole(e: Experiment) -> bool:
+    """Whether a record cannot be cut."""
+    return bool(set(e.unknown) & set(e.params)) or e.delay is not None
+
+
 def _check(e, count):
-    if set(e.unknown) & set(e.params) or e.delay is not None:
+    if whole(e):
         raise ValueError(
             "`segments` must be 1 where an experiment has unknown parameters of its own or a delay, but is more. Free them in `params`."
         )

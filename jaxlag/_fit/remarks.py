@@ -6,12 +6,17 @@ import numpy as np
 
 from .channels import Channel
 from .identifiability import MANY, Undetermined
+from .parameter_stability import Halves
 from .parameters import Free
+from .rounding import plus_minus
 
 NO_ERRORS = "standard errors are not computed for so many parameters"
 UNEXPLAINED = 3.0  # residuals this many times the noise are not noise
+LARGER, CERTAIN = 1.2, 4.0  # residuals this many times the stated noise, by so many standard deviations, are larger than it
 UNRELATED_SIZE = 10.0  # residuals this many times the measurements belong to an unrelated motion
-WELL_PREDICTED = 0.99  # R² of a channel from which on the table alone reports correlated residuals
+WELL_PREDICTED = 0.99  # R² of a channel from which on the table alone reports correlated residuals,
+DRIFT = 1 / 6  # unless they are correlated over this part of the record;
+EXACT = 1 - 1e-8  # R² from which on residuals are those of the integration
 
 
 def on_undetermined(names: Sequence[str], found: Undetermined) -> list[str]:
@@ -67,20 +72,58 @@ def on_bounds(free: Free, theta: np.ndarray, gradient: np.ndarray) -> Iterator[s
                 yield f"{name} is at its bound {bound:g}; the measurements favour values beyond it"
 
 
-def on_misfit(relative_size: float, times_noise: float, channels: Sequence[Channel], explained: bool) -> Iterator[str]:
-    """Measurements that the model does not explain. `relative_size`: residuals over measurements; `explained`: whether another remark
-    already gives a reason for correlated residuals.
+def on_too_short(names: Sequence[str]) -> list[str]:
+    """Channels whose sigma cannot be estimated."""
+    if not names:
+        return []
+    have, own = ("has", "a sigma of its own") if len(names) == 1 else ("have", "sigmas of their own")
+    shown = _listed(names) if len(names) <= MANY else f"{names[0]}, … {names[-1]}"
+    return [f"{shown} {have} too few measurements for {own}: each channel is weighted by its spread; give `sigma`"]
+
+
+def on_misfit(
+    relative_size: float, times_noise: float, independent: float, halves: str, channels: Sequence[Channel], explained: bool
+) -> Iterator[str]:
+    """Measurements that the model does not explain.
+
+    `relative_size`: residuals over measurements; `times_noise`: residuals over the stated sigma, from so many `independent` samples;
+    `halves`: what differs between the halves of the records, if anything; `explained`: whether another remark already gives a reason.
     """
     if relative_size > UNRELATED_SIZE:
         yield f"the residuals are {relative_size:.2g} times as large as the measurements: check the units, and start from other parameters"
-    elif times_noise > UNEXPLAINED:
+        return
+    halves = "" if explained or all(c.r_squared >= EXACT for c in channels) else halves
+    if halves:
+        yield f"{halves}: the model misses something, and the errors above do not account for that"
+    if times_noise > UNEXPLAINED:
         yield (
             f"the model does not explain the measurements; the residuals are {times_noise:.2g} times the noise: try another start or "
             "`segments=`, or look for what the model lacks; the errors above mean little"
         )
-    elif not explained:
-        missed = [c for c in channels if c.correlated and c.r_squared < WELL_PREDICTED]
-        if missed:
-            names = ", ".join(dict.fromkeys(c.name for c in missed[:MANY])) + (", …" if len(missed) > MANY else "")
-            length = max(c.correlated for c in missed)
-            yield f"the model misses something, or the noise is not white: residuals of {names} are correlated over {length} samples"
+    elif times_noise > LARGER and times_noise**2 - 1 > CERTAIN * np.sqrt(2 / independent):
+        yield (
+            f"the residuals are {times_noise:.2g} times the noise that `sigma` states: it is larger, or the model misses something; "
+            "the errors above take `sigma` as it is"
+        )
+    elif not (explained or halves):
+        yield from _on_correlation([c for c in channels if c.correlated and not _well_predicted(c)])
+
+
+def _well_predicted(channel):
+    drifts = channel.correlated >= DRIFT * channel.samples and channel.r_squared < EXACT
+    return channel.r_squared >= WELL_PREDICTED and not drifts
+
+
+def _on_correlation(missed):
+    if missed:
+        names = ", ".join(dict.fromkeys(c.name for c in missed[:MANY])) + (", …" if len(missed) > MANY else "")
+        length = max(c.correlated for c in missed)
+        yield f"the model misses something, or the noise is not white: residuals of {names} are correlated over {length} samples"
+
+
+def on_halves(names: Sequence[str], found: Halves | None, records: int) -> str:
+    """What differs between the halves of the records."""
+    if found is None:
+        return ""
+    of, first, second = "record" if records == 1 else "records", plus_minus(*found.first), plus_minus(*found.second)
+    return f"{names[found.parameter]} would be {first} by the first half of the {of}, and {second} by the second"

@@ -5,20 +5,18 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.flatten_util import ravel_pytree
 from jaxtyping import Float, PyTree
 
 from .._motion.export import frame_of, jsonable, write_json
-from .._motion.trajectory import Trajectory
-from .._program.jit import compiled
+from .channel_sigma import sigmas_of
 from .channels import Channel
 from .experiment import Experiment
 from .fit_card import card, estimates_by_name
-from .problem import Problem, failure_of, linearise, with_zero_values
+from .prediction import Prediction, predicted
+from .problem import Problem
 from .profile_likelihood import profile_end
 
 
@@ -38,49 +36,25 @@ class Interval(NamedTuple):
     upper: float
 
 
-class Prediction(NamedTuple):
-    """What an experiment should show according to a fit, as `Fit.predict` returns it.
-
-    - `values`: structured like the experiment's `values`; leaves (T, ...) in the units of the channels.
-    - `standard_errors`: of `values`, from the uncertainty of the parameters; structured like them.
-    - `lower`, `upper`: the confidence band; structured like `values`.
-    - `motion`: the `Trajectory` behind them.
-
-    ```python
-    import jax.numpy as jnp
-    import jaxlag as jl
-    oscillator = jl.System(lambda q, qdot, c: 0.5 * qdot**2 - 0.5 * c * q**2)
-    ts = jnp.linspace(0.0, 3.0, 50)
-    fit = jl.fit(oscillator, jl.Experiment(ts, jnp.cos(2.0 * ts), 1.0, 0.0), {"c": 3.0}, free=("c",))
-    prediction = fit.predict(jl.Experiment(ts, None, 0.0, 2.0))
-    prediction.values.shape  # (50,)
-    ```
-    """
-
-    values: PyTree
-    standard_errors: PyTree
-    lower: PyTree
-    upper: PyTree
-    motion: Trajectory
-
-
 @dataclasses.dataclass(frozen=True, eq=False, repr=False)
 class Fit:
     r"""Identified parameters with their uncertainty; prints as a card for a report.
 
     $$ \mathrm{cov}\,\hat\theta = \hat\sigma^2 (J^T J)^{-1}, \qquad \hat\sigma^2 = \frac{\sum r_i^2}{N - p} $$
 
-    In the covariance, σ̂ is replaced by 1 where every experiment came with its sigma. Where residuals are correlated in time (the test is
-    `whiteness` of a channel), all errors, intervals and bands are those of the sandwich, with R the correlation according to an
-    autoregression of the residuals:
+    In the covariance, σ̂ is replaced by 1 where every experiment came with its sigma. Otherwise each channel has its own: r is what was
+    measured minus what is predicted, over the most likely sigma of the channel relative to σ̂, found together with θ̂; profile likelihoods
+    keep it. Where residuals are correlated in time (the test is `whiteness` of a channel), all errors, intervals and bands are those of
+    the sandwich, with R the correlation of each channel and experiment according to an autoregression of its residuals:
 
     $$ \mathrm{cov}\,\hat\theta = \hat\sigma^2 (J^T J)^{-1} J^T R J (J^T J)^{-1} $$
 
     Of the parameters, p numbers:
 
     - `params`: all parameters, the free ones at their estimate; `estimates`: the free ones only, by name.
-    - `standard_errors`: structured like `estimates`; infinite where the measurements do not determine a parameter. `remarks`: sentences
-      on what they determine instead, on bounds, and on a model that does not explain them.
+    - `standard_errors`: structured like `estimates`; infinite where the measurements do not determine a parameter.
+      `white_standard_errors`: what they would be if residuals were white. `remarks`: sentences on what the measurements determine
+      instead, on bounds, and on a model that does not explain them.
     - `names`: of the p numbers; in this order `covariance` (p, p), `correlation` (p, p), and `inflation` (p,), by which factor correlated
       residuals enlarge the standard errors. `correlated`: over how many samples they are correlated, 0 where they are white.
 
@@ -94,9 +68,12 @@ class Fit:
 
     Of the noise and the iteration:
 
-    - `sigma`: σ̂, in units of the given sigma; in units of the measurements where none was given. `absolute`: whether sigma was given.
+    - `sigma`: σ̂, in units of the given sigma; where none was given, in units of the measurements, the geometric mean of those of the
+      channels. `sigmas`: for each experiment, one for each channel, estimated or given; structured like a row of its values. `absolute`:
+      whether sigma was given.
     - `cost`: ½ Σ r² at the estimates; `measurements`: N; `unknown_count`: determined unknowns, the p parameters and those of experiments.
     - `converged`; `reason`: why the iteration ended; `steps`: how many it took; `costs`: the cost at the start and after each step.
+    - `led_in`: by which steps the start was found, where it was not `params` (`Regress`).
     - `problem`, `x`, `x_covariance`: the least-squares problem, all its unknowns at the minimum, and their covariance over σ̂².
 
     Quantities have the units of the parameters and measurements, any consistent set.
@@ -128,6 +105,7 @@ class Fit:
     prediction_errors: list[PyTree]
     channels: list[Channel]
     sigma: float
+    sigmas: list[PyTree]
     cost: float
     names: tuple[str, ...]
     remarks: list[str]
@@ -143,11 +121,17 @@ class Fit:
     x_covariance: Float[np.ndarray, "x x"]
     inflation: Float[np.ndarray, " p"]
     correlated: int
+    led_in: tuple[str, ...] = ()
 
     @property
     def freedom(self) -> int:
         """Degrees of freedom: measurements minus determined unknowns."""
         return max(self.measurements - self.unknown_count, 0)
+
+    @property
+    def white_standard_errors(self) -> dict[str, PyTree]:
+        """The standard errors as if residuals were white, structured like `estimates`."""
+        return self.problem.free.by_name(np.sqrt(np.diag(self.covariance)) / self.inflation)
 
     @property
     def misfit(self) -> float:
@@ -158,12 +142,17 @@ class Fit:
     @property
     def aic(self) -> float:
         """Akaike's criterion; of two models of the same data the one with the smaller value is better. Takes residuals as independent."""
-        return self.misfit + 2 * (self.unknown_count + (not self.absolute))
+        return self.misfit + 2 * self._fitted
 
     @property
     def bic(self) -> float:
         """Schwarz's criterion, which penalises parameters more than Akaike's. Takes residuals as independent, too."""
-        return self.misfit + float(np.log(self.measurements)) * (self.unknown_count + (not self.absolute))
+        return self.misfit + float(np.log(self.measurements)) * self._fitted
+
+    @property
+    def _fitted(self) -> int:
+        """The number of unknowns, estimated sigmas among them."""
+        return self.unknown_count + (0 if self.absolute else max(len(sigmas_of(self.problem)), 1))
 
     @property
     def sigma_scale(self) -> float:
@@ -231,24 +220,8 @@ class Fit:
 
         **Raises:** `ValueError` where the motion cannot be computed, or `level` is out of range.
         """
-        free = self.problem.free
-        model = dataclasses.replace(self.problem.model, loss=None)
-        single = Problem.of(model, free, [with_zero_values(model, free, experiment)])
-        y = jnp.asarray(self.x[: free.size])
-        found = linearise(single, jnp.concatenate([y, jnp.zeros(single.size - free.size)]))
-        reason = failure_of(found)
-        if reason:
-            raise ValueError(f"`experiment` must have a motion at the estimates, but it ended with: {reason}")
-        part = found.batches[0]
-        J = np.asarray(part.jacobian[0][:, : free.size])
-        errors = self.sigma_scale * np.sqrt(np.maximum(np.einsum("ij,jk,ik->i", J, self.x_covariance[: free.size, : free.size], J), 0))
-        values = jax.tree.map(lambda x: x[0], part.channels)
-        standard_errors = ravel_pytree(values)[1](jnp.asarray(errors))
-        t = self.quantile(level)
-        lower, upper = (jax.tree.map(lambda v, e, s=s: v + s * t * e, values, standard_errors) for s in (-1, 1))
-        one = jax.tree.map(lambda x: x[0] if eqx.is_array(x) else x, single.batches[0])
-        motion = _motion(single.model, free.insert(free.theta(y)), one)
-        return Prediction(values, standard_errors, lower, upper, motion)
+        covariance = self.sigma_scale**2 * self.x_covariance
+        return predicted(self.problem, self.x, covariance, experiment, self.quantile(level))
 
     def to_dict(self, *, level: float = 0.95) -> dict[str, Any]:
         """The fit as plain data for `json.dumps`. None stands for a number that does not exist, e.g. the error of an undetermined one.
@@ -258,7 +231,7 @@ class Fit:
         - `"channels"`, and the fields and properties of `Fit` that are numbers or text, under their names.
         """
         copied = ("names", "correlation", "covariance", "remarks", "sigma", "absolute", "cost", "costs", "aic", "bic", "measurements")
-        parts = {name: getattr(self, name) for name in (*copied, "freedom", "converged", "reason", "steps", "params")}
+        parts = {name: getattr(self, name) for name in (*copied, "freedom", "converged", "reason", "steps", "led_in", "params")}
         rows, channels = list(self._rows(level)), [channel._asdict() for channel in self.channels]
         return jsonable({"parameters": rows, "level": level} | parts | {"channels": channels})
 
@@ -288,8 +261,3 @@ class Fit:
 
     def __repr__(self) -> str:
         return card(self)
-
-
-@compiled
-def _motion(model, params, e):
-    return model.predicted(params, e, jnp.zeros(e.unknowns))[1]

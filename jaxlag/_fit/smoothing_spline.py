@@ -13,11 +13,12 @@ from .._program.jit import jitted
 from .experiment import Experiment, start_entries, with_own
 
 DEGREE = 5  # accelerations are twice differentiable
-GROWTH = 1.4  # from one number of intervals between knots to the next that is tried
-MOST_INTERVALS = 600
+MOST_INTERVALS = 2000
 MOST_COEFFICIENTS = 0.7  # of the measurements
 ITERATIONS = 8  # of Gauss and Newton, where sensors are not linear in the motion
 START_WEIGHT = 1e3  # of the known start, relative to the sensors
+REWEIGHTED = 2  # times, where channels have no sigma
+ROUNDING = 1e-6  # of a channel: no sensor is trusted more
 PENALTY = 1e-6  # of differences of third order, relative to the sensors: decides only where nothing is measured
 
 
@@ -30,11 +31,12 @@ class Smooth(NamedTuple):
     a: np.ndarray
 
 
-def smooth(experiment: Experiment, params: Any, *, between: bool = False) -> Smooth:
-    """The motion at the samples, or `between` them: halfway, where an input with zero-order hold does not jump.
+def smooth(experiment: Experiment, params: Any, at: np.ndarray | None = None) -> Smooth:
+    """The motion at the times `at`, by default at the samples.
 
     Splines of degree five, fitted by least squares to what the sensors saw. Generalised cross-validation chooses how many intervals
-    between knots there are. A known start is kept; where no sensor tells, the splines are as smooth as possible.
+    between knots there are. Channels without `sigma` are weighted by their residuals. A known start is kept; where no sensor tells, the
+    splines are as smooth as possible.
 
     **Source:** Craven & Wahba, Numer. Math. 31 (1979) 377-403; de Boor, A Practical Guide to Splines, chapter XIV.
     """
@@ -42,23 +44,37 @@ def smooth(experiment: Experiment, params: Any, *, between: bool = False) -> Smo
         raise ValueError("`delay` must be None where the motion is read off the measurements, but there is one. Shift `ts` by it.")
     ts = np.asarray(experiment.ts)
     sensors = _Sensors(experiment, with_own(params, experiment.params))
+    splines, C = _cross_validated(sensors, ts)
+    for _ in range(REWEIGHTED if experiment.sigma is None and sensors.channels > 1 else 0):
+        if not sensors.weigh(splines, C):
+            break
+        splines, C = _cross_validated(sensors, ts)
+    at = ts if at is None else at
+    return Smooth(at, *(splines.motion(at, C, d) for d in range(3)))
+
+
+def _cross_validated(sensors, ts):
+    """The splines with the least score, and their coefficients."""
     measured = int(np.sum(np.isfinite(sensors.measured)))
-    best, most = None, max(4, min(len(ts) // 2, measured // (2 * sensors.n), MOST_INTERVALS))
-    intervals = 4.0
-    while intervals <= most:
-        splines = _Splines(ts, int(intervals))
+    most = max(4, min(len(ts) // 2, measured // (2 * sensors.n), MOST_INTERVALS))
+    found = {}
+
+    def attempt(intervals):
+        splines = _Splines(ts, intervals)
         C, squares = _fitted(sensors, splines)
         if C.size < MOST_COEFFICIENTS * measured:
-            score = squares * measured / (measured - C.size) ** 2
-            if best is None or score < best[0]:
-                best = score, splines, C
-        intervals *= GROWTH
-    if best is None:
+            found[squares * measured / (measured - C.size) ** 2] = splines, C
+
+    for doubled in range(2, int(np.log2(most)) + 1):
+        attempt(2**doubled)
+    if not found:
         splines = _Splines(ts, 1)
-        best = 0.0, splines, _fitted(sensors, splines)[0]
-    _, splines, C = best
-    at = (ts[1:] + ts[:-1]) / 2 if between else ts
-    return Smooth(at, *(splines.basis(at, d) @ C for d in range(3)))
+        return splines, _fitted(sensors, splines)[0]
+    best = found[min(found)][0].intervals
+    for between in (best / 2**0.5, best * 2**0.5):
+        if 4 <= between <= most:
+            attempt(int(between))
+    return found[min(found)]
 
 
 class _Sensors:
@@ -73,6 +89,7 @@ class _Sensors:
         self.known = np.array([not any(is_within(entry, name) for name in e.unknown) for entry in entries])
         flat = lambda tree: np.concatenate([np.reshape(x, (e.ts.size, -1)) for x in jax.tree.leaves(tree)], axis=1).astype(float)
         self.measured = flat(e.values)
+        self.channels = self.measured.shape[1]
         self.weights = 1 / flat(e.sigma) if e.sigma is not None else np.ones_like(self.measured)
 
         def channels(t, x):
@@ -94,6 +111,17 @@ class _Sensors:
         r = np.where(there, self.measured - h, 0) * weights
         return r, np.where(there[:, :, None], J, 0) * weights[:, :, None]
 
+    def weigh(self, splines, C):
+        """Weighs each channel by one over the size of its residuals; whether that changed their ratios by more than a tenth."""
+        h, _ = self._linearised(jnp.asarray(splines.ts), jnp.asarray(np.concatenate(splines.motions(C), axis=1)))
+        off = self.measured - np.asarray(h)
+        there = np.isfinite(off)
+        rms = lambda x: np.sqrt(np.sum(np.where(there, x, 0) ** 2, axis=0) / np.maximum(np.sum(there, axis=0), 1))
+        size = np.maximum(rms(off), ROUNDING * rms(self.measured))
+        change = self.weights[0] * np.where(size > 0, size, 1)
+        self.weights = self.weights / change
+        return np.max(change) > 1.1 * np.min(change)
+
 
 class _UnknownForces(dict):
     """Constraint forces, which a spline does not know: a channel that uses them counts as missing."""
@@ -107,46 +135,56 @@ class _Splines:
 
     def __init__(self, ts, intervals):
         knots = np.quantile(ts, np.linspace(0, 1, intervals + 1))
-        self.ts, self.interval = ts, (ts[-1] - ts[0]) / intervals
+        self.ts, self.intervals, self.interval = ts, intervals, (ts[-1] - ts[0]) / intervals
         self.knots = np.concatenate([np.full(DEGREE, knots[0]), knots, np.full(DEGREE, knots[-1])])
         self.count = len(self.knots) - DEGREE - 1
-        self.bases = [self.basis(ts, d) for d in range(3)]
+        self.first = np.clip(np.searchsorted(self.knots, ts, side="right") - 1 - DEGREE, 0, self.count - DEGREE - 1)
+        self.near = self.first[:, None] + np.arange(DEGREE + 1)  # only six splines overlap at a time
+        self.values = [self._values(d) for d in range(3)]
 
-    def basis(self, ts, derivative):
-        """Values of the splines, or of their derivatives, at the times: (times, splines)."""
+    def motion(self, ts, C, derivative):
+        """The derivative of the splines with these coefficients: (times, n)."""
         from scipy.interpolate import BSpline  # SciPy is a dependency of JAX; imported here because that takes a while
 
-        spline = BSpline(self.knots, np.eye(self.count), DEGREE)
+        spline = BSpline(self.knots, C, DEGREE)
         return (spline.derivative(derivative) if derivative else spline)(ts)
 
+    def motions(self, C):
+        """Positions, velocities and accelerations at the samples."""
+        return [np.einsum("tk,tkn->tn", B, C[self.near]) for B in self.values]
+
+    def _values(self, derivative):
+        """Of the splines `near` each sample, (T, 6): every sixth spline may share a coefficient."""
+        every_sixth = np.eye(DEGREE + 1)[np.arange(self.count) % (DEGREE + 1)]
+        return np.take_along_axis(self.motion(self.ts, every_sixth, derivative), self.near % (DEGREE + 1), axis=1)
+
     def jacobian(self, J):
-        """Σ J_d ⊗ B_d: a row for each sample and channel, a column for each (spline, coordinate); only six splines overlap at a time."""
+        """Σ J_d ⊗ B_d: a row for each sample and channel, a column for each (spline, coordinate)."""
         from scipy import sparse
 
         Js = np.split(J, 3, axis=2)
         T, channels, n = Js[0].shape
-        first = np.clip(np.searchsorted(self.knots, self.ts, side="right") - 1 - DEGREE, 0, self.count - DEGREE - 1)
-        near = first[:, None] + np.arange(DEGREE + 1)
-        nonzero = [np.take_along_axis(B, near, axis=1)[:, None, :, None] for B in self.bases]
-        entries = sum(J[:, :, None, :] * B for J, B in zip(Js, nonzero, strict=True))
+        entries = sum(J[:, :, None, :] * B[:, None, :, None] for J, B in zip(Js, self.values, strict=True))
         row = np.arange(T * channels).reshape(T, channels, 1, 1)
-        column = (near[:, :, None] * n + np.arange(n))[:, None]
+        column = (self.near[:, :, None] * n + np.arange(n))[:, None]
         row, column = (np.broadcast_to(index, entries.shape).ravel() for index in (row, column))
         return sparse.csr_matrix((entries.ravel(), (row, column)), shape=(T * channels, self.count * n))
 
 
 def _fitted(sensors, splines):
-    """Coefficients of the motion (splines, n) by Gauss and Newton, and the sum of squares before the last step."""
+    """Coefficients of the motion (splines, n) by Gauss and Newton, and the sum of squares: one step where sensors are linear."""
     C = np.zeros((splines.count, sensors.n))
     C[:] = sensors.start[: sensors.n]
-    best, squares = C, np.inf
-    for iteration in range(ITERATIONS):
-        r, J = sensors.residuals(splines.ts, [B @ C for B in splines.bases])
-        if iteration and np.sum(r**2) > (1 - 1e-6) * squares:
+    best, squares, before = C, np.inf, None
+    for _ in range(ITERATIONS):
+        r, J = sensors.residuals(splines.ts, splines.motions(C))
+        if before is not None and np.sum(r**2) > (1 - 1e-6) * squares:
             return best, squares
         best, squares = C, np.sum(r**2)
-        C = C + _step(sensors, splines, C, r, splines.jacobian(J))
-    return C, squares
+        if before is not None and np.array_equal(J, before):
+            return best, squares
+        before, C = J, C + _step(sensors, splines, C, r, splines.jacobian(J))
+    return best, squares
 
 
 def _step(sensors, splines, C, r, A):
@@ -156,7 +194,8 @@ def _step(sensors, splines, C, r, A):
     size = np.sqrt(A.multiply(A).sum() / max(C.size, 1))
     S, off = _known_start(sensors, splines, C, START_WEIGHT * size)
     S = sparse.csr_matrix(S.reshape(-1, C.size))
-    P = sparse.kron(sparse.csr_matrix(np.diff(np.eye(splines.count), 3, axis=0)), sparse.eye(sensors.n)) * (PENALTY * size)
+    third = sparse.diags([-1.0, 3.0, -3.0, 1.0], [0, 1, 2, 3], shape=(splines.count - 3, splines.count))
+    P = sparse.kron(third, sparse.eye(sensors.n)) * (PENALTY * size)
     right = A.T @ r.ravel() + S.T @ off - P.T @ (P @ C.ravel())
     return sparse.linalg.spsolve(A.T @ A + S.T @ S + P.T @ P, right).reshape(C.shape)
 
@@ -166,7 +205,8 @@ def _known_start(sensors, splines, C, weight):
     rows, off = [], []
     for i in np.flatnonzero(sensors.known):
         d, j = divmod(i, sensors.n)
-        first = splines.bases[d][0]
+        first = np.zeros(splines.count)
+        first[splines.near[0]] = splines.values[d][0]
         unit = np.zeros(sensors.n)
         unit[j] = weight * splines.interval**d
         rows.append(np.outer(first, unit).ravel())

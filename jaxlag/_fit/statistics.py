@@ -9,6 +9,8 @@ from typing import Any
 import jax
 import numpy as np
 
+from .autocorrelation import independent_samples
+from .channel_sigma import too_short
 from .channels import channels_of
 from .experiment import Experiment
 from .experiment_statistics import own_estimates, predictions_of, with_estimates
@@ -16,8 +18,9 @@ from .identifiability import correlation_of
 from .levenberg_marquardt import CONVERGED, REASONS, UNRELATED, Outcome
 from .minimum import Minimum
 from .multiple_shooting import Segments
+from .parameter_stability import different_halves
 from .problem import Problem
-from .remarks import NO_ERRORS, UNRELATED_SIZE, on_bounds, on_misfit, on_undetermined
+from .remarks import NO_ERRORS, UNRELATED_SIZE, on_bounds, on_halves, on_misfit, on_too_short, on_undetermined
 from .result import Fit
 from .uncertainty import Uncertainty, uncertainty_of, undetermined_parameters
 
@@ -39,7 +42,7 @@ def report(problem: Problem, experiments: Sequence[Experiment], outcome: Outcome
         **_unknowns(minimum, uncertainty, scale),
         **predictions,
         **_end(minimum),
-        remarks=_remarks(minimum, uncertainty, noise["sigma"], predictions["channels"]),
+        remarks=[*_on_sigma(minimum), *_remarks(minimum, uncertainty, noise["sigma"], predictions["channels"])],
     )
 
 
@@ -48,11 +51,13 @@ def _noise(minimum: Minimum, uncertainty: Uncertainty) -> Fields:
     r = minimum.measured
     unknown_count = minimum.x.size - uncertainty.known.null.shape[1] - len(np.asarray(minimum.found.gaps_jacobian))
     squares = np.sum(np.asarray(minimum.found.residuals)[: minimum.size + minimum.flat.size] ** 2)
+    sigma = _sigma(r, minimum.problem, max(r.size - unknown_count, 0))
     return {
         "measurements": r.size,
         "unknown_count": unknown_count,
         "absolute": minimum.absolute,
-        "sigma": _sigma(r, minimum.problem, max(r.size - unknown_count, 0)),
+        "sigma": sigma,
+        "sigmas": _sigmas(minimum, sigma),
         "cost": float(squares / 2),
     }
 
@@ -67,6 +72,15 @@ def _sigma(r, problem, freedom):
     s = float(problem.scale)
     influence = np.asarray(loss.influence(r / s))
     return float(s * np.sqrt(influence @ influence / freedom) / np.mean(np.abs(r / s) <= loss.delta))
+
+
+def _sigmas(minimum, sigma):
+    """For each experiment the sigma of each channel, estimated or given."""
+    if minimum.absolute:
+        mean = lambda z, s: np.sqrt(np.nanmean(np.where(np.isfinite(z), np.asarray(s) ** 2, np.nan), axis=0))
+        return [jax.tree.map(mean, e.values, e.sigma) for e in minimum.experiments]
+    firsts = [segments[0] for segments in minimum.segments_of_each()]
+    return [jax.tree.map(lambda s, row=row: sigma * np.asarray(s)[row, 0], minimum.problem.batches[k].sigma) for k, row, _ in firsts]
 
 
 def _parameters(minimum: Minimum, uncertainty: Uncertainty, scale: float) -> Fields:
@@ -122,7 +136,14 @@ def _remarks(minimum, uncertainty, sigma, channels):
         r = np.nan_to_num(np.asarray(minimum.found.residuals), posinf=0.0)  # of a motion that could not be computed
         at_bounds = list(on_bounds(free, minimum.theta, r @ np.asarray(minimum.found.jacobian)[:, :p]))
     times_noise = sigma if minimum.absolute else 1.0
-    return [*remarks, *at_bounds, *on_misfit(_relative_size(minimum), times_noise, channels, explained=bool(at_bounds))]
+    independent = independent_samples(minimum.measured.size, uncertainty.correlated)
+    halves = on_halves(free.entries, different_halves(minimum, uncertainty), len(minimum.experiments))
+    misfit = on_misfit(_relative_size(minimum), times_noise, independent, halves, channels, explained=bool(at_bounds))
+    return [*remarks, *at_bounds, *misfit]
+
+
+def _on_sigma(minimum):
+    return [] if minimum.absolute else on_too_short(too_short(minimum.problem))
 
 
 def _end(minimum: Minimum) -> Fields:

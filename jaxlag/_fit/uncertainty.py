@@ -32,7 +32,7 @@ def uncertainty_of(minimum: Minimum) -> Uncertainty:
         known = Determined(np.full((size, size), np.nan), np.ones(size, bool), np.zeros((size, 0)))
         return Uncertainty(known, None, np.ones(p), 0)
     known = determined_by(J, np.asarray(minimum.found.gaps_jacobian))
-    covariance, correlated = _sandwich(minimum, J, known.covariance)
+    covariance, correlated = sandwich(minimum, J, known.covariance, _influences(minimum))
     after, before = (np.diag(c)[:p] for c in (covariance, known.covariance))
     inflation = np.sqrt(np.where(before > 0, after / np.where(before > 0, before, 1), 1))
     return Uncertainty(known._replace(covariance=covariance), J, inflation, correlated)
@@ -49,13 +49,17 @@ def _jacobian(minimum):
     return J
 
 
-def _sandwich(minimum, J, covariance):
-    """The covariance over σ² of all unknowns, with the sandwich where residuals are correlated; and over how many samples they are."""
-    p, loss = minimum.size, minimum.problem.model.loss
-    weighted = minimum.weighted
-    if loss is not None:
-        weighted = [np.asarray(loss.influence(r / minimum.problem.scale)) for r in weighted]
-    begins = p + np.cumsum([0, *(r.size for r in weighted)])
+def _influences(minimum):
+    """The weighted residuals of each batch, limited by a robust loss."""
+    loss = minimum.problem.model.loss
+    return minimum.weighted if loss is None else [np.asarray(loss.influence(r / minimum.problem.scale)) for r in minimum.weighted]
+
+
+def sandwich(minimum: Minimum, J: np.ndarray, covariance: np.ndarray, weighted: list[np.ndarray]) -> tuple[np.ndarray, int]:
+    """The covariance over σ² of what the columns of J belong to, with the sandwich where residuals are correlated; and over how many
+    samples they are. `weighted`: the residuals of each batch, like those of the minimum; `covariance`: as if they were white.
+    """
+    p, begins = minimum.size, minimum.size + np.cumsum([0, *(r.size for r in weighted)])
 
     def of_experiment(segments, rows_of):
         """Rows of its segments one after the other, (samples, channels, ...)."""

@@ -55,7 +55,7 @@ class FrictionElements(NamedTuple):
 
     def sums(self, rows: Float[Array, " r"]) -> Float[Array, " e"]:
         """Of each element's rows."""
-        return jnp.zeros(self.size, rows.dtype).at[self.element_of_row].add(rows)
+        return jnp.sum(jnp.where(self.element_of_row == np.arange(self.size)[:, None], rows[None], 0), axis=1)
 
     def norms(self, rows: Float[Array, " r"]) -> Float[Array, " e"]:
         """Of each element's rows, with a zero derivative at zero."""
@@ -246,10 +246,14 @@ class _Term(NamedTuple):
 
 
 def _outputs(structure: Structure, jaxpr: Jaxpr, consts: Sequence[Any], state: tuple) -> list[np.ndarray]:
-    """The outputs of a program at an unknown state, with what is known of what it closes over."""
+    """The outputs of a program at an unknown state, with what is known of what it closes over.
+
+    The velocities come first: what a slip velocity begins with has a positive sign.
+    """
     structure.reset()
+    ahead = [structure.unknown(x, i, int(i == 2)) for i, x in reversed([*enumerate(state)])][::-1]
     known = [structure.known(np.asarray(x)) if is_numeric(x) else structure.unknown(x) for x in consts]
-    return structure.run(jaxpr, [*known, *(structure.unknown(x, i, int(i == 2)) for i, x in enumerate(state))])
+    return structure.run(jaxpr, [*known, *ahead])
 
 
 def _norm(rows: Float[Array, " n"]) -> Float[Array, ""]:

@@ -17,6 +17,7 @@ from jaxtyping import Array, Bool, Float
 
 from .._model.flat import Flat
 from .._model.numbers import count, number
+from .._program.scalarise import scalarised
 from .friction_elements import FrictionElements, find_elements
 from .load_sharing import shared
 from .saddle_point import constrained_acceleration
@@ -65,6 +66,10 @@ class Friction(NamedTuple):
 
 def friction(flat: Flat, elements: FrictionElements, sigma, t, q, v, feedback=None) -> Friction:
     """Friction forces on the slip velocities; `margin` < 0 where a mode has ended: the slip has reversed, or the bound is exceeded."""
+    return scalarised(lambda sigma, t, q, v: _friction(flat, elements, sigma, t, q, v, feedback))(sigma, t, q, v)
+
+
+def _friction(flat, elements, sigma, t, q, v, feedback):
     stuck, of = sticking(elements, sigma), elements.element_of_row
     qddot, multipliers, _ = constrained_acceleration(in_mode(flat, elements, sigma), t, q, v, feedback)
     slip, slip_rate = jax.jvp(elements.slip, (t, q, v), (jnp.ones_like(t), v, qddot))

@@ -11,6 +11,7 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, PyTree
 
 from .injection import asks_for, call, described
+from .signal import at_time
 from .system import CONSTRAINT_SLOTS, System, role
 
 
@@ -71,7 +72,7 @@ class _Bound:
         """What one of the user's functions returns."""
         name, function = term
         state = {"t": t, "q": self.unravel(q)} | ({} if v is None else {"qdot": self.unravel(v)}) | more
-        return call(function, role(slot, name), self.params, **state)
+        return call(function, role(slot, name), at_time(self.params, t), **state)
 
     def lagrangian(self, t, q, v):
         terms = (jnp.asarray(self.value("lagrangian", term, t, q, v), q.dtype) for term in self.system.lagrangian)
@@ -95,7 +96,7 @@ class _Bound:
         return jnp.concatenate([jnp.zeros(0, q.dtype), *parts])
 
     def position(self, at, t, q):
-        return jax.tree.map(lambda x: jnp.asarray(x, q.dtype), call(at, "a position map", self.params, t=t, q=self.unravel(q)))
+        return jax.tree.map(lambda x: jnp.asarray(x, q.dtype), call(at, "a position map", at_time(self.params, t), t=t, q=self.unravel(q)))
 
     def unravel_multipliers(self, multipliers):
         return dict(zip(self.system.constraints, self.unravel_residuals(multipliers[: self.rows]), strict=True))

@@ -1,5 +1,6 @@
 """Measured inputs: samples at some times, as a function of all times."""
 
+import dataclasses
 from typing import Any
 
 import equinox as eqx
@@ -10,7 +11,7 @@ from jaxtyping import Array, ArrayLike, Float, PyTree
 
 from .._program.jit import is_concrete
 from .deprecation import warn_renamed
-from .numbers import numbers
+from .numbers import number, numbers
 from .signal_interpolation import AbstractInterpolation, Cubic, Linear, ZeroOrderHold, second_derivatives
 
 OLD_KINDS = {"hold": ZeroOrderHold(), "linear": Linear(), "cubic": Cubic()}
@@ -36,11 +37,12 @@ class Signal(eqx.Module):
 
     - `ts`: the sample times, increasing, at least two, shape (T,). Under `vmap` pad a shorter signal with its last time and value.
     - `values`: one scalar, vector or array for each time, shape (T, ...); u(t) has their precision. Any consistent units.
+    - `delay`: a time by which u comes later than its samples, u(t) = u_i for t_i ≤ t − delay; may be free in a fit.
     - `interpolation`: `ZeroOrderHold()`, the default, `Linear()` or `Cubic()`. Its old spelling, `kind="hold"`, `"linear"` or `"cubic"`,
       gives a `DeprecationWarning`.
 
-    **Fields:** `ts`, `values` and `interpolation` as given; `second_derivatives`: u'' at the samples of a cubic signal, shape (T, ...),
-    which `simulate` computes once per motion; otherwise None.
+    **Fields:** `ts`, `values`, `delay` and `interpolation` as given; `times`: `ts` with the delay; `second_derivatives`: u'' at the samples
+    of a cubic signal, shape (T, ...), which `simulate` computes once per motion; otherwise None.
 
     **Returns:** when called with t, a scalar or an array of shape S: u(t), of shape S + (...). Differentiable in the values, exactly, and
     in t and the times of linear and cubic signals. The derivative by the times at which a zero-order hold jumps is not computed; it
@@ -63,6 +65,7 @@ class Signal(eqx.Module):
     ts: Float[Array, " T"]
     values: Float[Array, "T ..."]
     second_derivatives: Float[Array, "T ..."] | None  # u'' at the samples, where `with_second_derivatives` has computed them
+    delay: Float[Array, ""]
     interpolation: AbstractInterpolation = eqx.field(static=True)
 
     def __init__(
@@ -71,18 +74,25 @@ class Signal(eqx.Module):
         values: Any,
         interpolation: Any = ZeroOrderHold(),  # an `AbstractInterpolation`: `_interpolation` checks it
         *,
+        delay: Any = 0.0,
         kind: str | None = None,
     ):
         ts, values = numbers(ts, "`ts`"), numbers(values, "`values`")
         self.interpolation = _interpolation(interpolation if kind is None else kind)
         _check(ts, values)
         self.ts, self.values, self.second_derivatives = jnp.asarray(ts), jnp.asarray(values), None
+        self.delay = jnp.asarray(number(delay, "`delay`", ts.dtype, cure="Give one time, by which all samples are later."))
 
     def __call__(self, t: ArrayLike) -> Float[Array, "..."]:
         """u(t); of several times, one row for each."""
         t = 1.0 * jnp.asarray(t)
-        ts = self.ts.astype(t.dtype)  # jumps are where the integrator, which counts its time in this precision, steps on them
+        ts = self.times.astype(t.dtype)  # jumps are where the integrator, which counts its time in this precision, steps on them
         return self.interpolation.evaluate(self, ts, t, jnp.searchsorted(ts, t, side="right") - 1)
+
+    @property
+    def times(self) -> Float[Array, " T"]:
+        """When u has its values: the sample times and the delay."""
+        return self.ts + self.delay
 
     @property
     def kind(self) -> str:
@@ -126,7 +136,7 @@ def with_second_derivatives(params: PyTree) -> PyTree:
 def jump_times(params: PyTree, dtype: Any) -> Float[Array, " jumps"] | None:
     """Where the zero-order holds in `params` jump, not differentiated; None where there are none."""
     held = [leaf for leaf in jax.tree.leaves(params, is_leaf=is_signal) if is_signal(leaf) and leaf.interpolation.jumps]
-    return jax.lax.stop_gradient(jnp.concatenate([signal.ts[1:] for signal in held]).astype(dtype)) if held else None
+    return jax.lax.stop_gradient(jnp.concatenate([signal.times[1:] for signal in held]).astype(dtype)) if held else None
 
 
 def least_spacing(params: PyTree, dtype: Any) -> Float[Array, ""]:
@@ -136,25 +146,49 @@ def least_spacing(params: PyTree, dtype: Any) -> Float[Array, ""]:
     return jnp.min(jnp.where(apart > 0, apart, jnp.inf), initial=jnp.inf)
 
 
+class Piece(eqx.Module):
+    """A signal between two of its samples: called with the time `now`, it need not look for them."""
+
+    ts: Float[Array, "2"]
+    values: Float[Array, "2 ..."]
+    interpolation: AbstractInterpolation = eqx.field(static=True)
+    number: int = eqx.field(static=True)
+    now: Any = None
+
+    def __call__(self, t: ArrayLike) -> Float[Array, "..."]:
+        """u(now)."""
+        if t is not self.now:
+            raise CalledElsewhere(self.number)
+        assert isinstance(t, jax.Array)
+        return self.interpolation.evaluate(self, self.ts.astype(t.dtype), t, 0)
+
+
+class CalledElsewhere(Exception):
+    """A function asks for a signal at another time than now, as one that delays it does."""
+
+
+def is_broken(node: Any) -> bool:
+    """Whether a node of a pytree is a signal that jumps or bends at its samples."""
+    return is_signal(node) and node.interpolation.is_broken
+
+
+def broken_signals(params: PyTree) -> list[Signal]:
+    """Those in `params`, in order."""
+    return [leaf for leaf in jax.tree.leaves(params, is_leaf=is_signal) if is_broken(leaf)]
+
+
+def at_time(params: PyTree, t: Any) -> PyTree:
+    """`params` with each piece of a signal at the time t."""
+    is_piece = lambda node: isinstance(node, Piece)
+    if not any(map(is_piece, jax.tree.leaves(params, is_leaf=is_piece))):
+        return params
+    return jax.tree.map(lambda node: dataclasses.replace(node, now=t) if is_piece(node) else node, params, is_leaf=is_piece)
+
+
 def moves_smoothly(moving: PyTree, params: PyTree) -> bool:
     """Whether no signal in `params` jumps, and none is among what moves."""
     signals = [leaf for leaf in jax.tree.leaves(moving, is_leaf=is_signal) if is_signal(leaf)]
     return not jax.tree.leaves(signals) and jump_times(params, float) is None
-
-
-def delayed(params: PyTree, by: Float[Array, ""]) -> PyTree:
-    """`params` with each zero-order hold delayed by the time `by`."""
-    return jax.tree.map(
-        lambda node: _Delayed(node, by) if is_signal(node) and node.interpolation.jumps else node, params, is_leaf=is_signal
-    )
-
-
-class _Delayed(eqx.Module):
-    signal: Signal
-    by: Float[Array, ""]
-
-    def __call__(self, t):
-        return self.signal(t - self.by)
 
 
 def is_signal(node: Any) -> bool:

@@ -13,6 +13,7 @@ class AbstractInterpolation(eqx.Module):
     """How the values between two samples follow from the samples."""
 
     jumps: ClassVar[bool] = False  # at the samples
+    is_broken: ClassVar[bool] = False  # there: it jumps or bends
     needs_second_derivatives: ClassVar[bool] = False
 
     @abc.abstractmethod
@@ -38,6 +39,7 @@ class ZeroOrderHold(AbstractInterpolation):
     """
 
     jumps: ClassVar[bool] = True
+    is_broken: ClassVar[bool] = True
 
     def evaluate(self, signal: Any, ts: Float[Array, " T"], t: Float[Array, "*n"], i: Any) -> Float[Array, "..."]:
         """The value of the last sample; of the first one before it."""
@@ -59,6 +61,8 @@ class Linear(AbstractInterpolation):
     u(0.75)  # -0.5
     ```
     """
+
+    is_broken: ClassVar[bool] = True
 
     def evaluate(self, signal: Any, ts: Float[Array, " T"], t: Float[Array, "*n"], i: Any) -> Float[Array, "..."]:
         """The chord between two samples; the end value outside of them."""

@@ -31,9 +31,11 @@ from .._mechanics.stick_slip import (
     sticking,
 )
 from .._model.flat import Flat, bind
+from .._model.signal import broken_signals
 from .._model.system import System
 from .._program.jit import jitted
 from .._program.scalarise import scalarised
+from .interval_inputs import called_elsewhere, pieces_at
 from .protocol import Arguments
 
 PROJECTION = "projection"  # name of the work that projection does
@@ -103,23 +105,32 @@ class EquationsOfMotion:
     formulation: Formulation
     rows: int = 0  # slip velocities with dry friction
     elements: int = 0  # elements of dry friction
+    elsewhere: frozenset[int] = frozenset()  # signals that are asked for at other times than the present
 
     @classmethod
-    def of(cls, system: System, q0: PyTree, formulation: Formulation, flat: Flat, t, q, v) -> "EquationsOfMotion":
-        """Looks for dry friction in the system `flat` at the start, in shapes alone."""
+    def of(cls, system: System, q0: PyTree, formulation: Formulation, params: PyTree, t, q, v) -> "EquationsOfMotion":
+        """Looks for dry friction at the start, in shapes alone."""
         leaves, structure = jax.tree.flatten(q0)
         like = structure, tuple((leaf.shape, leaf.dtype) for leaf in leaves)
-        elements = formulation.friction.elements(flat, t, q, v)
-        return cls(system, like, formulation, *((0, 0) if elements is None else (elements.element_of_row.size, elements.size)))
+        elsewhere = (
+            called_elsewhere(lambda params: _values(bind(system, q0, params), t, q, v), params) if broken_signals(params) else frozenset()
+        )
+        alone = cls(system, like, formulation, elsewhere=elsewhere)
+        elements = formulation.friction.elements(alone.flat_at(t, params), t, q, v)
+        return alone if elements is None else dataclasses.replace(alone, rows=elements.element_of_row.size, elements=elements.size)
 
     def flat(self, params: PyTree) -> Flat:
         """The system over flat vectors."""
         structure, shapes = self.like
         return bind(self.system, jax.tree.unflatten(structure, [jax.ShapeDtypeStruct(*shape) for shape in shapes]), params)
 
+    def flat_at(self, t, params: PyTree) -> Flat:
+        """The system over flat vectors at the time t: its inputs are looked up once."""
+        return self.flat(pieces_at(params, self.elsewhere, t))
+
     def mode(self, t, q, v, sigma, args: Arguments) -> tuple[Flat, Flat, FrictionElements | None]:
         """The system, the system in the mode σ, and its elements of dry friction where there are any."""
-        flat, treatment = self.flat(args.params), self.formulation.friction
+        flat, treatment = self.flat_at(t, args.params), self.formulation.friction
         if not self.rows:
             return flat, treatment.smoothed(flat, t, q, v), None
         elements = treatment.elements(flat, t, q, v)
@@ -211,6 +222,13 @@ class EquationsOfMotion:
         named = dict(zip(self.works, works, strict=True)) if self.works else None
         unraveled = flat.unravel(q), flat.unravel(v), flat.unravel(qddot), flat.unravel_multipliers(multipliers)
         return Sample(*unraveled, named, friction_states, counts), Evidence(sound, jax.lax.stop_gradient(violation))
+
+
+def _values(flat: Flat, t, q, v):
+    """What all functions of a system return."""
+    multipliers = jnp.zeros(flat.rows, v.dtype)
+    given = [D(t, q, v, multipliers) for D in (*flat.dissipations.values(), *flat.forces.values())]
+    return flat.lagrangian(t, q, v), flat.holonomic(t, q), flat.nonholonomic(t, q, v), given
 
 
 @jitted  # so that diffrax's many calls trace it once

@@ -11,20 +11,20 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool
+from jaxtyping import Array, Bool, PyTree
 
 from .._mechanics.projection import Baumgarte, NoStabilisation, Projection, nearest_state
 from .._mechanics.stick_slip import Regularised, StickSlip
 from .._model.numbers import count, number
-from .._model.signal import jump_times, moves_smoothly
+from .._model.signal import broken_signals, moves_smoothly
 from .._program.single_kernel import in_one_kernel
 from .first_order import EquationsOfMotion, Formulation
-from .jumps import after_jump
+from .interval_loop import integrated
 from .progress import Bar
 from .protocol import Arguments, FirstOrderSystem
 from .results import RESULTS, from_diffrax
 from .runge_kutta import Dop853, ExplicitRungeKutta, is_explicit
-from .step_size import GuardedController, ResumingController
+from .step_size import GuardedController
 from .stick_slip_solver import StickSlipSolver
 from .variational import VariationalEquations, derived, with_variations
 from .wrapped_solver import ProjectedSolver, SamplingAdjoint
@@ -97,7 +97,7 @@ class Initial(NamedTuple):
 
 def initialised(equations: EquationsOfMotion, t0, q, v, params) -> Initial:
     """The start, put on the constraints."""
-    nearest = nearest_state(equations.flat(params), t0, q, v)
+    nearest = nearest_state(equations.flat_at(t0, params), t0, q, v)
     start = equations.start(t0, nearest.q, nearest.v, params)
     moved = jax.lax.stop_gradient(jnp.max(jnp.abs(jnp.concatenate([nearest.q - q, nearest.v - v]))))
     conditions = (
@@ -126,27 +126,23 @@ def states_at(
     equations: FirstOrderSystem, options: SolverOptions, adjoint: dfx.AbstractAdjoint, t0, y0, ts, args: Arguments, tolerances
 ) -> tuple[Array, RESULTS, dict]:
     """States at the samples, by diffrax, the reason it stopped, and, among the counts, the `last` time and state that it reached."""
+    if has_nodes(equations, args.params):
+        reverse = not isinstance(adjoint, dfx.ForwardMode)
+        return on_nodes(equations, options, y0, args.params, args.scales, ts, tolerances, reverse=reverse)
     rtol, atol = tolerances
     rounding = jnp.finfo(y0.dtype).eps * jnp.maximum(jnp.abs(ts[0]), jnp.abs(ts[-1]))
-    controller = GuardedController(rtol, atol, dtmin=4 * rounding, force_dtmin=False, norm=equations.error_norm)
-    end, jumps, restart = ts[-1], jump_times(args.params, ts.dtype), None
-    if jumps is not None:
-        resuming = ResumingController(rtol, atol, smallest=4 * rounding, norm=equations.error_norm)
-        controller = dfx.ClipStepSizeController(resuming, jump_ts=jumps)
-        end = end + 256 * rounding  # a jump at the last sample is stepped on too: diffrax rounds what is within 100 ulp of the end
-        restart = functools.partial(after_jump, equations)
     alone = in_one_kernel if isinstance(adjoint, dfx.ForwardMode) else lambda function: function
     projected = alone(equations.projected) if equations.projection else None
     solution = dfx.diffeqsolve.__wrapped__(  # all is within a program already, and `equinox.filter_jit` would keep what it is given
         dfx.ODETerm(alone(equations.rates)),
-        _wrapped(options, equations, projected, restart, adjoint),
+        _wrapped(options, equations, projected, adjoint),
         t0,
-        end,
+        ts[-1],
         None,
         y0,
         args,
         saveat=dfx.SaveAt(t1=True),
-        stepsize_controller=controller,
+        stepsize_controller=GuardedController(rtol, atol, dtmin=4 * rounding, force_dtmin=False, norm=equations.error_norm),
         adjoint=SamplingAdjoint(adjoint, ts),
         max_steps=options.max_steps,
         throw=False,
@@ -158,16 +154,33 @@ def states_at(
     return ys, from_diffrax(solution.result), stats | {"last": jax.lax.stop_gradient((last_t[0], last_y[0]))}
 
 
-def _wrapped(options, equations, projected, restart, adjoint):
+def _wrapped(options, equations, projected, adjoint):
     """The chosen solver, with what the equations ask for at the ends of its steps."""
     solver = options.solver
     if isinstance(solver, ExplicitRungeKutta) and isinstance(adjoint, dfx.ForwardMode):
         solver = dataclasses.replace(solver, reverse=False)
     if isinstance(equations, EquationsOfMotion) and equations.rows:
-        return StickSlipSolver(solver, projected, 2 * equations.size, restart, equations)
-    if projected is not None or restart is not None or options.formulation.works:
-        return ProjectedSolver(solver, projected, 2 * equations.size, restart)
+        return StickSlipSolver(solver, projected, 2 * equations.size, equations)
+    if projected is not None or options.formulation.works:
+        return ProjectedSolver(solver, projected, 2 * equations.size)
     return solver
+
+
+def has_nodes(equations: FirstOrderSystem, params: PyTree) -> bool:
+    """Whether steps end where an input jumps or bends."""
+    return isinstance(equations, EquationsOfMotion) and bool(broken_signals(params))
+
+
+def on_nodes(
+    equations: FirstOrderSystem, options: SolverOptions, y0, params, scales, ts, tolerances, *, directions=(), reverse=False
+) -> tuple[Array, RESULTS, dict]:
+    """States at the samples, from node to node, as `states_at`; with the variations along directions of params, for each order."""
+    adjoint = dfx.RecursiveCheckpointAdjoint() if reverse else dfx.ForwardMode()
+    solver = _wrapped(options, equations, equations.projected if equations.projection else None, adjoint)
+    meter = Meter() if options.progress else dfx.NoProgressMeter()
+    numbers = y0, params, scales, ts, tolerances
+    ys, (result, stats) = integrated(equations, solver, options.max_steps, meter, *numbers, directions, reverse=reverse)
+    return ys, from_diffrax(result), stats
 
 
 class Variations(NamedTuple):
@@ -197,7 +210,8 @@ class Variations(NamedTuple):
 
 def is_variational(equations: FirstOrderSystem, options: SolverOptions, varying_params, params) -> bool:
     """Whether the derivative of the motion is that of the variational equations: no mode, jump or implicit stage within a step."""
-    return not equations.rows and is_explicit(options.solver) and moves_smoothly(varying_params, params)
+    smooth = not has_nodes(equations, params) and moves_smoothly(varying_params, params)
+    return not equations.rows and is_explicit(options.solver) and smooth
 
 
 class Meter(dfx.TextProgressMeter):

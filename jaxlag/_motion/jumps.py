@@ -1,7 +1,6 @@
 """The state behind a jump of an input."""
 
 import jax.numpy as jnp
-from equinox.internal import prevbefore
 
 from .._mechanics.power import energy_exchange
 from .._mechanics.stick_slip import select_mode, slip_of
@@ -12,8 +11,8 @@ from .protocol import Arguments
 
 
 @jitted
-def after_jump(equations: EquationsOfMotion, t, y, args: Arguments):
-    """y behind a jump of an input at t, and whether a friction mode is consistent with the forces there.
+def after_jump(equations: EquationsOfMotion, t, y, before: Arguments, args: Arguments):
+    """y behind a jump of an input at t, from the arguments `before` it, and whether a friction mode is consistent with the forces there.
 
     A velocity constraint that jumps takes q̇ along by an impulse, which is the projection in the metric of M. Friction is bounded and
     has no part in it: where there is slip afterwards, it goes on; where there is none, it sticks or breaks away.
@@ -21,7 +20,7 @@ def after_jump(equations: EquationsOfMotion, t, y, args: Arguments):
     q, v, works, sigma, *counts = equations.parts(y)
     flat, _, elements = equations.mode(t, q, v, sigma, args)
     if equations.works:
-        lift = energy_exchange(flat, t, q, v)[0] - energy_exchange(flat, prevbefore(prevbefore(t)), q, v)[0]
+        lift = energy_exchange(flat, t, q, v)[0] - energy_exchange(equations.flat(before.params), t, q, v)[0]
         works = works.at[equations.works.index(EXPLICIT_TIME)].add(lift)
     slipping = jnp.concatenate([q, v, works, jnp.ones_like(sigma), *counts])
     y = slipping if equations.projection is None else equations.projected(t, slipping, args)

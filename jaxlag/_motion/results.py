@@ -57,6 +57,17 @@ def from_diffrax(result: Any) -> RESULTS:
     return eqx.tree_at(lambda r: r._value, successful, result._value)
 
 
+def number_of(result: Any) -> Any:
+    """The number of a reason of diffrax, for a loop that holds numbers only."""
+    return result._value
+
+
+def numbered(number: Any) -> dfx.RESULTS:
+    """The reason of diffrax with this number."""
+    successful: Any = dfx.RESULTS.successful
+    return eqx.tree_at(lambda r: r._value, successful, number.astype(successful._value.dtype))
+
+
 OF_THE_INPUT = (
     RESULTS.not_finite,
     RESULTS.unordered,

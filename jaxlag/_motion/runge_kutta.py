@@ -67,7 +67,7 @@ class ExplicitRungeKutta(dfx.AbstractAdaptiveSolver):
             i, c, weights = row
             t = jnp.where(c == 1, t1, t0 + c * (t1 - t0))  # not rounded beyond t1, where an input may jump
             new = terms.vf(t, jax.tree.map(jnp.add, y0, changes(weights, f)), args)
-            return jax.tree.map(lambda f, new: jax.lax.dynamic_update_index_in_dim(f, new, i, 0), f, new), None
+            return jax.tree.map(lambda f, new: with_row(f, new, i), f, new), None
 
         # One loop, so that the equations are compiled once. What is not there yet counts as nothing.
         size, dtype = len(scheme.c), jnp.result_type(*jax.tree.leaves(y0))
@@ -98,6 +98,13 @@ def is_explicit(solver: dfx.AbstractSolver) -> bool:
 def as_rows(rows, size, dtype) -> np.ndarray:
     """Weights as an array, each row with zeros up to `size`."""
     return np.array([[*row, *[0.0] * (size - len(row))] for row in rows], dtype)
+
+
+def with_row(f, new, i):
+    """f with the row i replaced; few numbers by a choice, as the derivative of an update in place is a scatter, a call of its own."""
+    if f.size > LARGE * len(f):
+        return jax.lax.dynamic_update_index_in_dim(f, new, i, 0)
+    return jnp.where((np.arange(len(f)) == i).reshape(-1, *[1] * new.ndim), new[None], f)
 
 
 def weighted(weights, f):

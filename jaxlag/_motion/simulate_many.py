@@ -133,8 +133,8 @@ def _differing(everything, over):
 def _simulate_many(system, options, common_steps, own, shared, ts, tolerances):
     first = eqx.combine(jax.tree.map(lambda leaf: leaf[0], own), shared)
     q0, qdot0 = state(first["q0"], first["qdot0"], ("q0", "qdot0"))
-    flat, t0, q, v = checked(system, ts[0], q0, qdot0, first["params"])
-    equations = EquationsOfMotion.of(system, q0, options.formulation, flat, t0, q, v)
+    _, t0, q, v = checked(system, ts[0], q0, qdot0, first["params"])
+    equations = EquationsOfMotion.of(system, q0, options.formulation, first["params"], t0, q, v)
     members, (numbers, rest) = jax.tree.leaves(own)[0].shape[0], eqx.partition(shared, eqx.is_array)
     if _share_steps(common_steps, equations, first["params"], own):
         batch = lambda own, *given: _in_batches(system, equations, options, own, eqx.combine(given[0], rest), *given[1:])

@@ -16,7 +16,7 @@ from .._model.system import System
 from .._model.validation import checked
 from .first_order import EquationsOfMotion, Sample
 from .guarantees import verified
-from .integrate import SolverOptions, Variations, initialised, is_variational, states_at, with_status
+from .integrate import SolverOptions, Variations, has_nodes, initialised, is_variational, on_nodes, states_at, with_status
 from .protocol import Arguments, Scales
 from .provenance import Provenance
 from .trajectory import FrictionState, Trajectory
@@ -77,7 +77,8 @@ class SolutionMap:
         """The samples and their derivatives along directions, for each order; by the variational equations where they hold."""
         equations, (t0, q, v) = self._equations(inputs, ts)
         varying = [split_varying(inputs, of_order)[0].params for of_order in directions]
-        if not is_variational(equations, self.options, varying, inputs.params):
+        by_steps = has_nodes(equations, inputs.params) and self.options.adjoint is None
+        if not by_steps and not is_variational(equations, self.options, varying, inputs.params):
             return pushforward(self.solve)(inputs, directions, ts)
 
         def initial(inputs):
@@ -89,14 +90,20 @@ class SolutionMap:
         for of_order in directions:
             variations = variations.along(of_order, (of_order.params, None), of_order.t0, arguments)
         y0, start = variations.initial(inputs)
-        args = Arguments(with_second_derivatives(inputs.params), directions=variations.directions)
-        solution = states_at(variations.equations, self.options, dfx.ForwardMode(), t0, y0, ts, args, inputs.tolerances)
-        return self._samples_and_variations(equations, inputs, directions, ts, *solution, start)
+        smooth, tolerances = with_second_derivatives(inputs.params), inputs.tolerances
+        if by_steps:
+            numbers = smooth, Scales.of(tolerances, ts, smooth), ts, tolerances
+            found = on_nodes(equations, self.options, y0, *numbers, directions=tuple(of_order.params for of_order in directions))
+            return self._samples_and_variations(equations, inputs, directions, ts, *found, start)
+        args = Arguments(smooth, directions=variations.directions)
+        ys, result, stats = states_at(variations.equations, self.options, dfx.ForwardMode(), t0, y0, ts, args, tolerances)
+        last_t, last_y = stats["last"]
+        stats = stats | {"last": (last_t, last_y[(..., *[0] * len(directions))])}
+        return self._samples_and_variations(equations, inputs, directions, ts, ys, result, stats, start)
 
     def _samples_and_variations(self, equations, inputs, directions, ts, ys, result, stats, start):
         motion = lambda ys: ys[(..., *[0] * len(directions))]  # without variations
-        last_t, last_y = stats["last"]
-        stats = stats | {"start_moved": start.moved, "last": (last_t, motion(last_y))}
+        stats = stats | {"start_moved": start.moved}
         states, result = with_status(motion(ys), result, start.conditions, (inputs, ts))
         known = jnp.isfinite(states).reshape(*states.shape, *[1] * len(directions))
 
@@ -136,8 +143,8 @@ class SolutionMap:
         return jax.vmap(of_one)(ts, samples.ys)
 
     def _equations(self, inputs: Inputs, ts: Array) -> tuple[EquationsOfMotion, tuple[Array, Array, Array]]:
-        flat, t0, q, v = checked(self.system, _first_time(inputs, ts), inputs.q0, inputs.qdot0, inputs.params)
-        return EquationsOfMotion.of(self.system, inputs.q0, self.options.formulation, flat, t0, q, v), (t0, q, v)
+        _, t0, q, v = checked(self.system, _first_time(inputs, ts), inputs.q0, inputs.qdot0, inputs.params)
+        return EquationsOfMotion.of(self.system, inputs.q0, self.options.formulation, inputs.params, t0, q, v), (t0, q, v)
 
 
 def _first_time(inputs: Inputs, ts: Array) -> Array:

@@ -74,11 +74,12 @@ def first_end(margins: Callable, path: Callable, t0, t1, elements: int, scales: 
 
     def closer(search):
         low, high, found, rounds, sections, *_, largest = search
-        ts = jnp.where(found, _around(low, high, *search[5:7]), low + (high - low) / LOOKS * np.arange(LOOKS + 1)).at[-1].set(high)
+        ts = jnp.where(found, _around(low, high, *search[5:7]), low + (high - low) / LOOKS * np.arange(LOOKS + 1))
+        ts = jnp.where(np.arange(ts.size) == ts.size - 1, high, ts)
         part = jnp.diff(ts)[:, None]
         value, slope, change = look(ts)
         largest = jnp.maximum(largest, jnp.max(jnp.abs(value), axis=0))
-        value = value.at[:, elements:].add(1e-9 * largest[None, elements:])  # a bound of zero is none that is negative
+        value = value + (np.where(np.arange(2 * elements) < elements, 0, 1e-9) * largest)[None]  # a bound of zero is none that is negative
         beyond = jnp.any(value[1:] < 0, axis=1)
         doubtful = jnp.any(_dips(value, slope, part) & (part > near) | (value[:-1] + value[1:] < change) & (part > brief), axis=1)
         wanted = beyond | (doubtful & ~found)
@@ -135,7 +136,14 @@ def _around(low, high, before, behind):
     share = jnp.where(behind < 0, before / jnp.where(behind < 0, before - behind, 1), 1)
     root = low + (high - low) * jnp.clip(jnp.min(share), 0, 1)
     near = (high - low) * np.array([*NEARER, *(-d for d in NEARER)])
-    return jnp.sort(jnp.clip(jnp.stack([low, high, (low + high) / 2, *(root + near)]), low, high))
+    return _ascending(jnp.clip(jnp.stack([low, high, (low + high) / 2, *(root + near)]), low, high))
+
+
+def _ascending(x):
+    """A few numbers in order: each goes to where as many are less, or equal and before it. (A sort is a call of its own.)"""
+    row, column, i = x[None], x[:, None], np.arange(x.size)
+    rank = jnp.sum((row < column) | ((row == column) & (i < i[:, None])), axis=1)
+    return jnp.sum(jnp.where(rank[None] == i[:, None], row, 0), axis=1)
 
 
 def _dips(value, slope, part):

@@ -99,10 +99,9 @@ class StickSlipSolver(ProjectedSolver):
         return jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), jax.eval_shape(make)), jnp.array(True)
 
     def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
-        y0, starts = self.restarted(t0, y0, args, made_jump)
         solver_state, is_new = solver_state
         made_jump = made_jump | is_new
-        piece = lambda *given: Piece(*self.projected_step(terms, *given[:3], args, *given[3:]))
+        piece = lambda *given: Piece(*ProjectedSolver.step(self, terms, *given[:3], args, *given[3:]))
         given = t0, t1, y0, solver_state, jnp.asarray(made_jump)
         nothing = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), jax.eval_shape(piece, *given))
         no, zeros = jnp.array(False), jnp.zeros(self.equations.elements, y0.dtype)
@@ -111,7 +110,7 @@ class StickSlipSolver(ProjectedSolver):
         run = functools.partial(self._run, piece, given, args)
         needed = lambda split, phase: jax.lax.cond((phase == WHOLE) | split.seen.ended, run, lambda split, _: split, split, phase)
         split, _ = jax.lax.scan(lambda split, phase: (needed(split, phase), None), uncut, PHASES)
-        y1, error, dense, solver_state, result = self._joined(split, t0, t1, y0, args, starts)
+        y1, error, dense, solver_state, result = self._joined(split, t0, t1, y0, args)
         return y1, error, dense, (solver_state, jnp.array(False)), result
 
     def _run(self, piece, given, args, split: Split, phase) -> Split:
@@ -153,7 +152,7 @@ class StickSlipSolver(ProjectedSolver):
         y, consistent, at_rest = self.equations.changed(split.cut.time, split.first.y, args, ended)
         return split._replace(cut=split.cut._replace(y=y, consistent=consistent, usable=split.cut.usable & at_rest))
 
-    def _joined(self, split: Split, t0, t1, y0, args, starts):
+    def _joined(self, split: Split, t0, t1, y0, args):
         """What diffrax asks of a step, from its pieces."""
         (first, second, cut, seen), ended = split, split.seen.ended
         error = jnp.where(ended, jnp.maximum(jnp.abs(first.error), jnp.abs(second.error)), first.error)
@@ -163,7 +162,7 @@ class StickSlipSolver(ProjectedSolver):
         refused = (ended & ~cut.usable) | seen.unsure | shrinking
         error = jnp.where(refused, jnp.inf, error)
         error = jnp.where(is_hidden(rates, _nodes(self.solver), t0, t1, y0, args.scales), jnp.inf, error)
-        consistent = (~ended | cut.consistent | ~cut.usable) & starts
+        consistent = ~ended | cut.consistent | ~cut.usable
         result = dfx.RESULTS.where(consistent, dfx.RESULTS.successful, under_diffrax(RESULTS.no_friction))
         result = dfx.RESULTS.where(seen.negative & ~shrinking, under_diffrax(RESULTS.negative_bound), result)
         result = dfx.RESULTS.where(self.equations.exhausted(second.y), under_diffrax(RESULTS.chattering), result)

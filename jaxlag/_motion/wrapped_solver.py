@@ -1,15 +1,12 @@
-"""A solver of diffrax, wrapped: the end of each step is put back on the constraints, and a step starts behind a jump of an input."""
+"""A solver of diffrax, wrapped: the end of each step is put back on the constraints."""
 
 from collections.abc import Callable
 
 import diffrax as dfx
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
-
-from .._model.signal import delayed
 
 
 class SamplingAdjoint(dfx.AbstractAdjoint):
@@ -32,14 +29,12 @@ class SamplingAdjoint(dfx.AbstractAdjoint):
 class ProjectedSolver(dfx.AbstractWrappedSolver, dfx.AbstractAdaptiveSolver):
     """Any solver that estimates its error, with the end of each step put back on the constraints.
 
-    `projected(t, y, args)` does that; the error of the first `controlled` entries of y alone sets the steps. Where an input has jumped,
-    a step starts from `restart(t, y, args)`.
+    `projected(t, y, args)` does that; the error of the first `controlled` entries of y alone sets the steps.
     """
 
     solver: dfx.AbstractAdaptiveSolver
     projected: Callable | None = eqx.field(static=True)
     controlled: int = eqx.field(static=True)
-    restart: Callable | None = eqx.field(static=True)
 
     @property
     def term_structure(self):
@@ -78,39 +73,11 @@ class ProjectedSolver(dfx.AbstractWrappedSolver, dfx.AbstractAdaptiveSolver):
         return self.solver.func(terms, t0, y0, args)
 
     def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
-        y0, _ = self.restarted(t0, y0, args, made_jump)
-        return self.projected_step(terms, t0, t1, y0, args, solver_state, made_jump)
-
-    def restarted(self, t0, y0, args, made_jump):
-        """Where a step starts, and whether a friction mode is consistent with the forces there."""
-        if self.restart is None:
-            return y0, jnp.array(True)
-        return jax.lax.cond(made_jump, lambda y: self.restart(t0, y, args), lambda y: (y, jnp.array(True)), y0)
-
-    def projected_step(self, terms, t0, t1, y0, args, solver_state, made_jump):
         """One step of the solver, its end put back on the constraints."""
-        terms, given = self._held_at_the_end(terms, t1, args)
-        y1, error, dense, solver_state, result = self.solver.step(terms, t0, t1, y0, given, solver_state, made_jump)
+        y1, error, dense, solver_state, result = self.solver.step(terms, t0, t1, y0, args, solver_state, made_jump)
         error = jnp.where((np.arange(len(error)) < self.controlled).reshape(-1, *[1] * (error.ndim - 1)), error, 0)
         if self.projected is not None:
             y1 = self.projected(t1, y1, args)
             # A step that cannot be put back is rejected, and tried again with half the length or less.
             error = jnp.where(jnp.all(jnp.isfinite(y1)), error, jnp.inf)
         return y1, error, dense | {"y1": y1}, solver_state, result
-
-    def _held_at_the_end(self, terms, t1, args):
-        """Terms and args with which a stage beyond t1 sees held inputs as they are at t1, in front of the jump there."""
-        if self.restart is None or not _looks_ahead(self.solver):
-            return terms, args
-
-        def rates(t, y, given):
-            args, end = given
-            return terms.vf(t, y, args._replace(params=delayed(args.params, jnp.maximum(t - end, 0))))
-
-        return dfx.ODETerm(rates), (args, t1)
-
-
-def _looks_ahead(solver) -> bool:
-    """Whether a stage lies beyond the end of the step, as of Kvaerno4 and Kvaerno5, which would feel its way to each jump."""
-    tableau = getattr(solver, "tableau", None)
-    return tableau is not None and any(c > 1 for c in tableau.c)

@@ -113,7 +113,8 @@ def _custom_jvp_as_scalar_code(equation, *arrays):
     def body(real, others):
         results = evaluate(equation.params["call_jaxpr"], JAX_ALGEBRA, *rebuild(merged(real, others)))
         outputs = zip(results, equation.outvars, strict=True)
-        return _depending_on([*real, *others], [jax.numpy.asarray(x, variable.aval.dtype) for array, variable in outputs for x in array.flat])
+        found = [jax.numpy.asarray(x, variable.aval.dtype) for array, variable in outputs for x in array.flat]
+        return _depending_on([*real, *others], found)
 
     def rule(primals, tangents):
         (real, others), (change, _) = primals, tangents

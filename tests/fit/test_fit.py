@@ -45,7 +45,7 @@ def test_without_noise_the_truth_comes_back():
 
 
 def by_scipy(seed):
-    """curve_fit over the equations of the lecture."""
+    """curve_fit over the equations of the lecture, in turns with the root mean square of each channel's residuals."""
     ts, values = drive(seed)
     measured = np.concatenate([values[name] for name in ("y", "phi", "xdot")])
 
@@ -62,23 +62,30 @@ def by_scipy(seed):
         steps = [1e-5 * value * e for value, e in zip(p, np.eye(3), strict=True)]
         return np.stack([(model(_, *(p + h)) - model(_, *(p - h))) / (2 * np.max(h)) for h in steps], axis=1)
 
-    return curve_fit(model, ts, measured, p0=[6000.0, 20000.0, 0.3], jac=slope, xtol=1e-12, ftol=1e-14)
+    found, sigmas = [6000.0, 20000.0, 0.3], np.ones(3)
+    for _ in range(4):
+        weights = np.repeat(sigmas, len(ts))
+        found, covariance = curve_fit(model, ts, measured, p0=found, jac=slope, sigma=weights, xtol=1e-12, ftol=1e-14)
+        sigmas = np.sqrt(np.mean(np.reshape(measured - model(ts, *found), (3, -1)) ** 2, axis=1))
+    return found, covariance, sigmas
 
 
 def test_estimates_and_errors_are_those_of_scipy():
     fit = jl.fit(vehicle.system, experiment(3), GUESS, free=("b", "c", "k"), rtol=1e-10, atol=1e-12)
-    estimates, covariance = by_scipy(3)
+    estimates, covariance, sigmas = by_scipy(3)
     order = [fit.names.index(name) for name in ("b", "c", "k")]
     np.testing.assert_allclose([fit.estimates[name] for name in ("b", "c", "k")], estimates, rtol=1e-6)
     errors = np.sqrt(np.diag(fit.covariance))[order]
     np.testing.assert_allclose(errors, np.sqrt(np.diag(covariance)), rtol=1e-4)
+    np.testing.assert_allclose([fit.sigmas[0][name] for name in ("y", "phi", "xdot")], np.sqrt(900 / 897) * sigmas, rtol=1e-4)
     np.testing.assert_allclose(fit.correlation[1, 0], covariance[1, 0] / np.sqrt(covariance[0, 0] * covariance[1, 1]), atol=1e-3)
 
 
 def test_a_given_sigma_gives_absolute_errors():
     free = ("b", "c", "k")
     estimated = jl.fit(vehicle.system, experiment(4), GUESS, free=free)
-    with_sigma = jl.Experiment(*drive(4), vehicle.q0, vehicle.qdot0, observe=vehicle.observe, sigma=2e-3)
+    twice = {name: 2 * sigma for name, sigma in estimated.sigmas[0].items()}
+    with_sigma = jl.Experiment(*drive(4), vehicle.q0, vehicle.qdot0, observe=vehicle.observe, sigma=twice)
     given = jl.fit(vehicle.system, with_sigma, GUESS, free=free)
     np.testing.assert_allclose(given.estimates["c"], estimated.estimates["c"], rtol=1e-6)
     np.testing.assert_allclose(given.sigma, 0.5, rtol=0.1)  # the noise is half of what was said

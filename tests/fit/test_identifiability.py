@@ -9,6 +9,7 @@ import optax
 import oscillator as osc
 import pytest
 from scipy import optimize, stats
+from scipy.integrate import solve_ivp
 
 import jaxlag as jl
 from jaxlag._fit import identifiability, levenberg_marquardt
@@ -467,3 +468,23 @@ def test_a_direction_that_is_known_to_be_hidden_is_found_beneath_the_error_of_in
     assert identifiability.determined_by(J, np.zeros((0, 3))).null.shape == (3, 0)
     (direction,) = identifiability.determined_by(J, np.zeros((0, 3)), hidden=1).null.T
     np.testing.assert_allclose(direction / direction[0], hidden / hidden[0], rtol=1e-6)
+
+
+def test_the_delay_and_the_gain_of_an_actuator():
+    """They are parameters like others: k u(t − τ) of an input that is linear between its samples; against SciPy."""
+    ts = np.linspace(0.0, 10.0, 201)
+    u = np.sin(1.3 * ts) + 0.5 * np.sin(3.1 * ts)
+    rates = lambda t, s: [s[1], -4.0 * s[0] - 0.3 * s[1] + 1.7 * np.interp(t - 0.23, ts, u)]
+    x = solve_ivp(rates, (0.0, 10.0), [0.0, 0.0], t_eval=ts, rtol=1e-9, atol=1e-11, max_step=0.01).y[0]
+    record = jl.Experiment(ts, x + 1e-3 * np.random.default_rng(0).standard_normal(201), 0.0, 0.0)
+    system = jl.System(
+        lambda q, qdot, c: 0.5 * qdot**2 - 0.5 * c * q**2,
+        dissipation=lambda qdot, b: 0.5 * b * qdot**2,
+        force=lambda t, u, k, tau: k * u(t - tau),
+    )
+    truth = {"c": 4.0, "b": 0.3, "k": 1.7, "tau": 0.23}
+    start = {"c": 4.5, "b": 0.2, "k": 1.2, "tau": 0.1, "u": jl.Signal(ts, u, jl.Linear())}
+    found = jl.fit(system, record, start, free=tuple(truth))
+    assert found.converged and found.standard_errors["tau"] < 2e-4
+    for name, value in truth.items():
+        assert abs(found.estimates[name] - value) < 3.5 * found.standard_errors[name], name

@@ -122,7 +122,7 @@ def test_gaps_that_do_not_close_are_reported(monkeypatch):
     def stuck(linearise, x, **_):
         r, J, found = linearise(x)
         nothing = jnp.zeros(0)
-        return Outcome(Iterate(x, r, J, found, float(r @ r) / 2, nothing, nothing, np.asarray(STALLED)), 1, np.ones(1))
+        return Outcome(Iterate(x, r, J, found, float(r @ r) / 2, *[nothing] * 5, np.asarray(STALLED)), 1, np.ones(1))
 
     monkeypatch.setattr(multiple_shooting, "levenberg_marquardt", stuck)
     found = jl.fit(osc.SYSTEM, osc.record(0), osc.START, free=("c", "b"), segments=3)

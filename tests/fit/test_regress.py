@@ -1,4 +1,4 @@
-"""Inverse-dynamics identification, and the friction of a drive axis by both methods."""
+"""Regression on the equations of motion, and the friction of a drive axis by both methods."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -136,3 +136,44 @@ def test_an_unknown_multiplier_is_eliminated():
     )
     found = jl.regress(system, jl.Experiment(ts, values, values[0], np.zeros(2)), {"g": 8.0, "d": 1.0, "l": 1.0}, free=("g", "d", "l"))
     np.testing.assert_allclose([found.estimates[name] for name in ("g", "d", "l")], [9.81, d, l], rtol=2e-3)
+
+
+def test_nonholonomic_forces_are_eliminated_without_accelerations():
+    """A skate on an inclined plane, in closed form: x = g' sin²(ωt)/(2ω²), y = g'(ωt − ½ sin 2ωt)/(2ω²), φ = ωt (Neimark & Fufaev)."""
+    ts, w, g = np.linspace(0, 6, 400), 1.3, 3.0
+    path = {"phi": w * ts, "x": g / (2 * w**2) * np.sin(w * ts) ** 2, "y": g / (2 * w**2) * (w * ts - 0.5 * np.sin(2 * w * ts))}
+    skate = jl.System(
+        lambda q, qdot, g: 0.5 * (qdot["x"] ** 2 + qdot["y"] ** 2 + 0.1 * qdot["phi"] ** 2) + g * q["x"],
+        dissipation=lambda qdot, d: 0.5 * d * (qdot["x"] ** 2 + qdot["y"] ** 2),
+        nonholonomic=lambda q, qdot: qdot["x"] * jnp.sin(q["phi"]) - qdot["y"] * jnp.cos(q["phi"]),
+    )
+    noisy = {name: x + 1e-4 * np.random.default_rng(i).standard_normal(400) for i, (name, x) in enumerate(path.items())}
+    start = {name: 0.0 for name in path}
+    e = jl.Experiment(ts, noisy, start, {"phi": w, "x": 0.0, "y": 0.0})
+    found = jl.regress(skate, e, {"g": np.nan, "d": np.nan}, free=("g", "d"))
+    assert found.linear and abs(found.estimates["g"] / g - 1) < 1e-3 and abs(found.estimates["d"]) < 1e-3
+
+
+def test_standard_errors_hold_for_coloured_noise():
+    """A pendulum in Cartesian coordinates; the noise of both is correlated over twenty samples. Up to one in seven may be outside."""
+    from scipy.integrate import solve_ivp
+    from scipy.signal import lfilter
+
+    ts, l, d = np.linspace(0, 10, 500), 0.7, 0.4
+    phi = solve_ivp(lambda t, s: [s[1], -9.81 / l * np.sin(s[0]) - d * s[1]], (0, 10), [1.2, 0], t_eval=ts, rtol=1e-11, atol=1e-12).y[0]
+    values = np.stack([l * np.sin(phi), -l * np.cos(phi)], axis=1)
+    system = jl.System(
+        lambda q, qdot, g: 0.5 * qdot @ qdot - g * q[1],
+        dissipation=lambda qdot, d: 0.5 * d * qdot @ qdot,
+        holonomic={"rod": lambda q: q @ q - l**2},
+    )
+
+    def inside(seed):
+        e = np.random.default_rng(seed).standard_normal((1000, 2))
+        noise = 0.004 * lfilter([np.sqrt(1 - 0.9**2)], [1.0, -0.9], e, axis=0)[500:]
+        record = jl.Experiment(ts, values + noise, values[0], np.zeros(2), unknown=("q0", "qdot0"))
+        found = jl.regress(system, record, {"g": np.nan, "d": np.nan}, free=("g", "d"))
+        return [abs(found.estimates[n] - true) < 1.96 * found.standard_errors[n] for n, true in (("g", 9.81), ("d", d))]
+
+    held = np.mean([inside(seed) for seed in range(30)])
+    assert 0.85 <= held <= 0.99

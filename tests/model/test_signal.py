@@ -237,7 +237,7 @@ def test_a_block_breaks_away_and_sticks_where_inputs_jump():
     bound = Signal(*INPUTS["F"])(ALONG)
     assert np.all(np.abs(motion.friction["belt"].force) <= bound * (1 + 1e-9))
     assert 0.2 < np.mean(stuck) < 0.8 and motion.stats["transitions"][-1] == 9
-    assert motion.stats["num_steps"] < 2 * JUMPS.size  # uniform accelerations: a step from jump to jump
+    assert motion.stats["num_steps"] <= ALONG.size + 9  # uniform accelerations: a step from node to node, and to each transition
 
 
 def check_derivative_of_a_ride(inputs, derivative):
@@ -335,10 +335,9 @@ def test_new_values_trace_nothing(monkeypatch):
 
 
 def test_without_held_signals_nothing_changes(monkeypatch):
-    monkeypatch.setattr(integrate, "ResumingController", None)
-    monkeypatch.setattr(integrate, "after_jump", None)
-    cart = jl.System(lambda qdot: 0.5 * qdot**2, force={"linear": lambda t, u: u(t)})
-    end = jl.simulate(cart, 0.0, 0.0, [0.0, 1.0], {"u": Signal([0, 1], [0, 6], Linear())}).q[-1]
+    monkeypatch.setattr(integrate, "integrated", None)
+    cart = jl.System(lambda qdot: 0.5 * qdot**2, force={"cubic": lambda t, u: u(t)})
+    end = jl.simulate(cart, 0.0, 0.0, [0.0, 1.0], {"u": Signal([0, 1], [0, 6], Cubic())}).q[-1]
     np.testing.assert_allclose(end, 1.0, rtol=1e-12)
 
 

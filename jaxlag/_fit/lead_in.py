@@ -1,0 +1,118 @@
+"""Leading a fit in from a poor start: regression on the equations of motion, then segments, then the whole motion."""
+
+import dataclasses
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import jax
+import numpy as np
+from jaxtyping import PyTree
+
+from .._model.numbers import count
+from .experiment import Experiment
+from .levenberg_marquardt import REASONS, STEP_LIMIT
+from .multiple_shooting import whole
+from .parameters import Free
+from .regress import Regression
+from .result import Fit
+
+FIRST_STEPS = 30  # of the whole motion from the start of `regress`; those that do not converge are long in vain
+EXPLAINED = 0.75  # mean R² of the channels from which on a fit needs no segments; noise alone may make that of one small
+SAMPLES = 10  # in a segment at least, where their number is not given,
+SEGMENTS = 20  # and as many of them at most
+AT_BOUND = 0.01  # margins from its bound; an estimate that is closer is moved inside
+MARGIN = 0.1  # of the distance between the bounds, or of the size of the parameter: how far inside at most, or where no error is known
+
+
+@dataclasses.dataclass(frozen=True)
+class Regress:
+    """Leads a fit in from a poor start, as `start` of `fit`: by `regress`, which needs no start; then the whole motion; where that does not
+    explain the measurements, segments (multiple shooting), and the whole motion from there.
+
+    The most likely of the fits is returned, and its card says what was done. An estimate of `regress` at a bound is moved inside, by its
+    standard error.
+
+    - `segments`: how many each record is cut into; by default 20, or fewer where they would have less than ten samples.
+    - `width`: of the windows of `regress`, a time in the unit of the samples; by default chosen by the data.
+
+    **Raises:** `ValueError` where `segments` is not a whole number from 2 on.
+
+    **Source:** Bock, Recent advances in parameter identification techniques for o.d.e. (1983).
+
+    ```python
+    import jax.numpy as jnp
+    import jaxlag as jl
+    oscillator = jl.System(lambda q, qdot, c: 0.5 * qdot**2 - 0.5 * c * q**2)
+    ts = jnp.linspace(0.0, 30.0, 300)
+    record = jl.Experiment(ts, jnp.cos(2.0 * ts), q0=1.0, qdot0=0.0)
+    jl.fit(oscillator, record, {"c": 30.0}, free=("c",), start=jl.Regress()).estimates["c"]  # 4.0
+    ```
+    """
+
+    segments: int | None = None
+    width: float | None = None
+
+    def __post_init__(self) -> None:
+        if self.segments is not None:
+            count(self.segments, "`segments`", least=2, cure="Use some tens for a long or chaotic record.")
+
+
+def _segments(start, experiments):
+    """Their number; 1 where the records are too short, or cannot be cut."""
+    if any(whole(e) for e in experiments):
+        return 1
+    return start.segments or min(SEGMENTS, *(e.ts.size // SAMPLES for e in experiments))
+
+
+def led_in(
+    fit_from: Callable[..., Fit], start: Regress, experiments: Sequence[Experiment], params: PyTree, said: str, max_steps: int
+) -> Fit:
+    """The best of the fits on the way. `fit_from(experiments, params, max_steps, segments)` is a fit; `said`: what was done before."""
+    steps, fits = [said], []
+
+    def stage(name, *where, **more):
+        try:
+            fits.append(fit_from(*where, **more))
+        except ValueError as error:
+            if "start" not in str(error) and "segment" not in str(error):
+                raise
+            steps.append(f"{name}: could not be computed")
+            return None
+        steps.append(f"{name}: {fits[-1].steps} steps{'' if fits[-1].converged else ', not converged'}")
+        return fits[-1]
+
+    segments, most = _segments(start, experiments), max_steps
+    found = stage("whole motion", experiments, params, max_steps=min(most, FIRST_STEPS))
+    if segments > 1 and not (found and _explains(found)):
+        found = stage(f"{segments} segments", experiments, params, max_steps=most, segments=segments)
+        if found:
+            stage("whole motion", found.experiments, found.params, max_steps=most)
+    elif found and found.reason == REASONS[STEP_LIMIT] and most > FIRST_STEPS:
+        stage("whole motion", found.experiments, found.params, max_steps=most - FIRST_STEPS)
+    if not fits:
+        raise ValueError("`start` must lead to a motion that can be computed, but none could. Give other `params`, or more segments.")
+    best = min(fits, key=lambda fit: np.nan_to_num(fit.misfit, nan=np.inf))
+    steps += [] if best is fits[-1] else [f"the best of them is number {fits.index(best) + 1}"]
+    return dataclasses.replace(best, led_in=tuple(steps))
+
+
+def _explains(fit):
+    return np.mean([channel.r_squared for channel in fit.channels]) >= EXPLAINED
+
+
+def inside_bounds(found: Regression, free: Sequence[str], bounds: Any) -> tuple[PyTree, str]:
+    """The parameters found, those at a bound moved inside; and words for what was done."""
+    chosen = Free.of(found.params, free, bounds)
+    flat = lambda tree: np.concatenate([np.ravel(np.asarray(x)) for name in free for x in jax.tree.leaves(tree[name])])
+    errors, theta, said = flat(found.standard_errors), np.array(chosen.start), []
+    for i, name in enumerate(chosen.entries):
+        lower, upper = float(chosen.lower[i]), float(chosen.upper[i])
+        most = MARGIN * min(upper - lower, max(abs(theta[i]), 1.0)) if np.isinf(errors[i]) else MARGIN * (upper - lower)
+        margin = min(errors[i], most) or MARGIN
+        moved = np.clip(theta[i], lower + AT_BOUND * margin, upper - AT_BOUND * margin)
+        if moved != theta[i]:
+            bound = lower if moved > theta[i] else upper
+            theta[i] = bound + np.copysign(margin, moved - theta[i])
+            said.append(f"{name} moved inside from its bound {bound:g} to {theta[i]:.3g}")
+    moved_inside = f" ({'; '.join(said)})" if said else ""
+    return chosen.insert(np.asarray(theta, chosen.start.dtype)), f"regress{moved_inside}"

@@ -1,0 +1,84 @@
+"""Whether the two halves of a record want the same parameters: they do not where the model misses something."""
+
+from typing import NamedTuple
+
+import jax
+import numpy as np
+
+from .autocorrelation import independent_samples
+from .identifiability import MANY, determined_by
+from .minimum import Minimum
+from .uncertainty import Uncertainty, sandwich
+
+DIFFERENT = 1e-4  # p-value below which the halves differ
+
+
+class Halves(NamedTuple):
+    """The parameter that differs most: its index, and (estimate, standard error) from the first and the second half."""
+
+    parameter: int
+    first: tuple[float, float]
+    second: tuple[float, float]
+
+
+def different_halves(minimum: Minimum, uncertainty: Uncertainty) -> Halves | None:
+    r"""The parameter that differs most between the halves of the records, where they differ at all.
+
+    Each half has its own parameters, θ and θ + δ, in the model linearised at its minimum. With the covariance C of δ, the sandwich where
+    what is then left of the residuals is correlated, $\delta^T C^{-1} \delta / p$ has the F distribution where the model is right; the
+    residuals count as `independent_samples`. Of random records of 200 and 1000 samples, one in 200 or fewer was said to differ for noise of
+    any correlation, and of 60 samples none for white noise (tests/benchmarks/bench_coverage.py counts them).
+
+    **Source:** Chow, Econometrica 28 (1960) 591; Andrews & Fair, Rev. Econ. Stud. 55 (1988) 615.
+    """
+    from scipy import special
+
+    p, J = minimum.size, uncertainty.jacobian
+    if J is None or not 0 < p <= MANY or minimum.problem.model.loss is not None or minimum.measured.size < 4 * J.shape[1]:
+        return None
+    second = np.concatenate([np.zeros(p, bool), *(rows.ravel() for rows in _second_halves(minimum))])
+    both = np.hstack([J, J[:, :p] * second[:, None]])
+    gaps = np.asarray(minimum.found.gaps_jacobian)
+    known = determined_by(both, np.hstack([gaps, np.zeros((len(gaps), p))]))
+    own = np.flatnonzero(known.determined[-p:]) + J.shape[1]
+    r = np.concatenate([-np.asarray(minimum.found.residuals)[:p], np.nan_to_num(minimum.flat)])
+    found = known.covariance @ (both.T @ r)
+    left = r - both @ found
+    ends = np.cumsum([p, *(part.size for part in minimum.weighted)])
+    weighted = [left[a:b].reshape(part.shape) + 0 * part for a, b, part in zip(ends, ends[1:], minimum.weighted, strict=False)]
+    covariance, correlated = sandwich(minimum, both, known.covariance, weighted)
+    covariance = covariance * (left @ left) / max(minimum.measured.size - both.shape[1], 1)
+    deviation = np.sqrt(np.diag(covariance)[own])
+    if not own.size or not np.all(deviation > 0):
+        return None
+    F = found[own] @ np.linalg.lstsq(covariance[np.ix_(own, own)], found[own], rcond=None)[0] / own.size
+    if special.fdtrc(own.size, independent_samples(minimum.measured.size, correlated), F) >= DIFFERENT:
+        return None
+    i = int(own[np.argmax(np.abs(found[own]) / deviation)] - J.shape[1])
+    return Halves(i, *_estimates(minimum, i, J.shape[1] + i, found, covariance))
+
+
+def _estimates(minimum, i, j, found, covariance):
+    """Parameter i of the first half, and with its change j of the second, each with its standard error."""
+    first, change = minimum.slope[i] * found[i], minimum.slope[i] * found[j]
+    variance = covariance[i, i], covariance[i, i] + 2 * covariance[i, j] + covariance[j, j]
+    errors = minimum.slope[i] * np.sqrt(np.maximum(variance, 0))
+    theta = minimum.theta[i] + first
+    return (float(theta), float(errors[0])), (float(theta + change), float(errors[1]))
+
+
+def _second_halves(minimum):
+    """For each batch, which of its residuals are in the second half of their record, shaped like them."""
+    halves = [np.zeros(part.shape, bool) for part in minimum.weighted]
+    for e, segments in zip(minimum.experiments, minimum.segments_of_each(), strict=True):
+        middle = (e.ts[0] + e.ts[-1]) / 2
+        for k, row, _ in segments:
+            batch = minimum.problem.batches[k]
+            late, widths = np.asarray(batch.ts)[row] >= middle, _widths(batch)
+            halves[k][row] = np.concatenate([np.repeat(late, width) for width in widths])
+    return halves
+
+
+def _widths(batch):
+    """The number of scalar channels of each leaf of the values."""
+    return [int(np.prod(leaf.shape[2:])) for leaf in jax.tree.leaves(batch.values)]

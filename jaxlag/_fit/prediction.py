@@ -1,0 +1,67 @@
+"""What an experiment should show according to a fit."""
+
+import dataclasses
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.flatten_util import ravel_pytree
+from jaxtyping import PyTree
+
+from .._motion.trajectory import Trajectory
+from .._program.jit import compiled
+from .experiment import Experiment
+from .problem import Problem, failure_of, linearise, with_zero_values
+
+
+class Prediction(NamedTuple):
+    """What an experiment should show according to a fit, as `Fit.predict` returns it.
+
+    - `values`: structured like the experiment's `values`; leaves (T, ...) in the units of the channels.
+    - `standard_errors`: of `values`, from the uncertainty of the parameters; structured like them.
+    - `lower`, `upper`: the confidence band; structured like `values`.
+    - `motion`: the `Trajectory` behind them.
+
+    ```python
+    import jax.numpy as jnp
+    import jaxlag as jl
+    oscillator = jl.System(lambda q, qdot, c: 0.5 * qdot**2 - 0.5 * c * q**2)
+    ts = jnp.linspace(0.0, 3.0, 50)
+    fit = jl.fit(oscillator, jl.Experiment(ts, jnp.cos(2.0 * ts), 1.0, 0.0), {"c": 3.0}, free=("c",))
+    prediction = fit.predict(jl.Experiment(ts, None, 0.0, 2.0))
+    prediction.values.shape  # (50,)
+    ```
+    """
+
+    values: PyTree
+    standard_errors: PyTree
+    lower: PyTree
+    upper: PyTree
+    motion: Trajectory
+
+
+def predicted(problem: Problem, x: np.ndarray, covariance: Any, experiment: Experiment, t: float) -> Prediction:
+    """What the experiment should show at the unknowns x, whose covariance is known; `t` of the ends θ̂ ± t · standard error."""
+    free = problem.free
+    model = dataclasses.replace(problem.model, loss=None)
+    single = Problem.of(model, free, [with_zero_values(model, free, experiment)])
+    y = jnp.asarray(x[: free.size])
+    found = linearise(single, jnp.concatenate([y, jnp.zeros(single.size - free.size)]))
+    reason = failure_of(found)
+    if reason:
+        raise ValueError(f"`experiment` must have a motion at the estimates, but it ended with: {reason}")
+    part = found.batches[0]
+    J = np.asarray(part.jacobian[0][:, : free.size])
+    errors = np.sqrt(np.maximum(np.einsum("ij,jk,ik->i", J, covariance[: free.size, : free.size], J), 0))
+    values = jax.tree.map(lambda x: x[0], part.channels)
+    standard_errors = ravel_pytree(values)[1](jnp.asarray(errors))
+    lower, upper = (jax.tree.map(lambda v, e, s=s: v + s * t * e, values, standard_errors) for s in (-1, 1))
+    one = jax.tree.map(lambda x: x[0] if eqx.is_array(x) else x, single.batches[0])
+    return Prediction(values, standard_errors, lower, upper, _motion(single.model, free.insert(free.theta(y)), one))
+
+
+@compiled
+def _motion(model, params, e):
+    return model.predicted(params, e, jnp.zeros(e.unknowns))[1]

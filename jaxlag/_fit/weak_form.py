@@ -1,0 +1,126 @@
+"""The equations of motion along a known motion, as what is integrated against test functions."""
+
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import PyTree
+
+from .._mechanics.friction_elements import find_elements
+from .._mechanics.lagrange import applied_force, constraint_rows, inertia
+from .._mechanics.pseudo_inverse import pseudo_inverse
+from .._model.flat import bind
+from .._model.signal import jump_times
+from .._model.system import System
+from .._program.jit import compiled
+from .experiment import Experiment, with_own
+from .parameters import Free
+from .smoothing_spline import smooth
+from .windows import Windows
+
+SLOW = 0.03  # of the largest slip velocity: below it, friction may stick, and its force is unknown
+ENOUGH_NODES = 3000  # of a record; up to three in each interval
+
+
+class WeakForm(eqx.Module):
+    r"""The equations of motion of a record, before they are integrated.
+
+    With a test function $\varphi(t)$ and $P = 1 - G^T (G G^T)^+ G$, which has no part along the constraint forces, integration by parts of
+    $\int \varphi P (\dot p - F) dt = 0$, where p = ∂L/∂q̇ and F = ∂L/∂q − ∂D/∂q̇ + Q, gives
+
+    $$ \int \dot\varphi\, P p \, dt + \int \varphi\, (\dot P p + P F) \, dt = 0 $$
+
+    P depends on t and q alone, since constraints are affine in q̇: its rate needs no acceleration, and nothing is neglected.
+    """
+
+    system: System = eqx.field(static=True)
+    like: PyTree
+    own: dict[str, Any]
+    nodes: Any  # of the quadrature, (N,)
+    motion: tuple  # q, v, a there
+
+    def linearised(self, free: Free, y: Any) -> tuple[np.ndarray, np.ndarray]:
+        """P p, Ṗ p + P F and the constraints at all nodes, (N, 2n + m), and their Jacobian, (N, 2n + m, p)."""
+        terms, J = _linearised(self, free, y)
+        return np.asarray(terms), np.asarray(J)
+
+    def terms(self, params, t, q, v, a):
+        """P p, Ṗ p + P F, then the residuals of the constraints."""
+        flat = bind(self.system, self.like, with_own(params, self.own))
+        p, force = jax.grad(flat.lagrangian, argnums=2)(t, q, v), jax.grad(flat.lagrangian, argnums=1)(t, q, v)
+        applied = lambda multipliers: applied_force(flat, t, q, v, multipliers)
+        G = constraint_rows(flat, t, q, v)[1]
+        multipliers = jnp.zeros(len(G), q.dtype)
+        if not len(G):
+            return jnp.concatenate([p, force + applied(multipliers)])
+        if flat.needs_multipliers:  # the only place where the acceleration is needed
+            M, inertial = inertia(flat, t, q, v)
+            multipliers = pseudo_inverse(G @ G.T) @ (G @ (M.mv(a) - inertial - applied(multipliers)))
+
+        def projected(t, q, x):
+            G = constraint_rows(flat, t, q, v)[1]
+            return x - G.T @ (pseudo_inverse(G @ G.T) @ (G @ x))
+
+        Pp, rate = jax.jvp(lambda t, q: projected(t, q, p), (t, q), (jnp.ones_like(t), v))
+        force = projected(t, q, force + applied(multipliers))
+        return jnp.concatenate([Pp, rate + force, flat.holonomic(t, q), flat.nonholonomic(t, q, v)])
+
+
+class Record(NamedTuple):
+    """An experiment, smoothed, as the regression sees it: its weak form, and N nodes with weights of a quadrature."""
+
+    form: WeakForm
+    nodes: np.ndarray
+    quadrature: np.ndarray
+    moves: np.ndarray  # (N,), whether all dry friction slides there
+    span: tuple[float, float]
+    interval: float  # between samples, on average
+
+    @classmethod
+    def of(cls, system: System, e: Experiment, params: PyTree) -> "Record":
+        """From the measurements."""
+        own, ts = with_own(params, e.params), np.asarray(e.ts, float)
+        nodes, quadrature = _quadrature(ts, jump_times(own, float))
+        motion = tuple(jnp.asarray(x, e.ts.dtype) for x in smooth(e, params, nodes)[1:])
+        form = WeakForm(system, e.q0, e.params, jnp.asarray(nodes, e.ts.dtype), motion)
+        arrays = jax.tree.map(lambda x: jnp.asarray(x) if isinstance(x, float) else x, own)
+        slip, moves = _slips(system, e.q0, arrays, form.nodes, *motion[:2]), np.ones(nodes.size, bool)
+        if slip is not None:
+            speed = np.abs(np.asarray(slip))
+            moves = np.all(speed > SLOW * np.max(speed, axis=0), axis=1)
+        return cls(form, nodes, quadrature, moves, (ts[0], ts[-1]), (ts[-1] - ts[0]) / max(ts.size - 1, 1))
+
+    def windows(self, half: float) -> Windows:
+        """The windows of this half width along the record."""
+        return Windows.along(self.nodes, self.quadrature, self.moves, self.span, half)
+
+    def parts(self, terms: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """What `WeakForm.terms` returns, or its Jacobian: of the momentum, of the forces and of the constraints."""
+        n = self.form.motion[0].shape[1]
+        return terms[:, :n], terms[:, n : 2 * n], terms[:, 2 * n :]
+
+
+def _quadrature(ts, jumps):
+    """Nodes and weights of Gauss and Legendre for the intervals between samples and jumps, within which inputs are smooth."""
+    edges = np.unique(ts if jumps is None else np.concatenate([ts, np.clip(np.asarray(jumps), ts[0], ts[-1])]))
+    x, w = np.polynomial.legendre.leggauss(int(np.clip(np.ceil(ENOUGH_NODES / edges.size), 1, 3)))
+    half = np.diff(edges)[:, None] / 2
+    return (edges[:-1, None] + half * (1 + x)).ravel(), (half * w).ravel()
+
+
+@eqx.filter_jit  # so that all parameters are traced: a friction coefficient of 0 is still friction
+def _slips(system, like, params, ts, q, v):
+    """Slip velocities of dry friction along a record, (T, slips); None where there is no dry friction."""
+    elements = find_elements(bind(system, like, params), ts[0], q[0], v[0])
+    return None if elements is None else jax.vmap(elements.slip)(ts, q, v)
+
+
+@compiled
+def _linearised(form, free, y):
+    def terms(y):
+        params = free.insert(free.theta(y))
+        return jax.vmap(lambda t, q, v, a: form.terms(params, t, q, v, a))(form.nodes, *form.motion)
+
+    return terms(y), jax.jacfwd(terms)(y)

@@ -1,0 +1,185 @@
+"""Measured inputs as the loop from node to node reads them: row by row, out of one vector."""
+
+import functools
+import math
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int, PyTree
+
+from .._model.signal import CalledElsewhere, Piece, Signal, broken_signals, is_broken, is_signal
+from .._model.signal_interpolation import AbstractInterpolation
+
+
+class Rows(NamedTuple):
+    """An array within a vector, read row by row."""
+
+    vector: Float[Array, " n"]
+    start: int
+    shape: tuple[int, ...]
+    dtype: Any
+
+    def at(self, i: Any, count: int = 1) -> Array:
+        """Rows from the i-th on."""
+        width = math.prod(self.shape[1:])
+        part = jax.lax.dynamic_slice_in_dim(self.vector, self.start + i * width, count * width)
+        return part.reshape(count, *self.shape[1:]).astype(self.dtype)
+
+
+class Record(NamedTuple):
+    """Times and values of a signal, row by row, and its delay."""
+
+    ts: Rows
+    values: Rows
+    delay: Float[Array, ""]
+    interpolation: AbstractInterpolation
+
+    @classmethod
+    def of(cls, signal: Signal) -> "Record":
+        """Of a signal's own arrays."""
+        rows = lambda x: Rows(jnp.ravel(x), 0, x.shape, x.dtype)
+        return cls(rows(signal.ts), rows(signal.values), signal.delay, signal.interpolation)
+
+    def piece(self, number: int, following: Int[Array, ""]) -> Piece:
+        """The signal between the samples before `following` and there; before the first and behind the last it keeps the end value."""
+        first = jnp.clip(following - 1, 0, self.ts.shape[0] - 2)
+        ts, values = self.ts.at(first, 2), self.values.at(first, 2)
+        if self.interpolation.jumps:
+            values = jnp.where(following > first + 1, values[::-1], values)
+        return Piece(ts + self.delay, values, self.interpolation, number)
+
+    def time(self, i: Int[Array, ""], t) -> Float[Array, ""]:
+        """That of sample i, infinite where there is none after t."""
+        size = self.ts.shape[0]
+        found = (self.ts.at(jnp.minimum(i, size - 1))[0] + self.delay).astype(t.dtype)
+        return jnp.where((i < size) & (found > t), found, jnp.inf)
+
+
+class Place(eqx.Module):
+    """The place in params of a signal that does not vary, apart from its delay: its samples are in a record."""
+
+    number: int = eqx.field(static=True)
+    delay: Any
+
+
+def _is_input(node: Any) -> bool:
+    return isinstance(node, Place) or is_signal(node)
+
+
+class Inputs:
+    """The inputs among params that jump or bend at their samples."""
+
+    def __init__(self, columns: dict[int, tuple[Rows, Rows, Any]], elsewhere: frozenset[int], params: PyTree):
+        self.params, self.elsewhere, self.records = params, elsewhere, []
+        for node in jax.tree.leaves(params, is_leaf=_is_input):
+            if isinstance(node, Place):
+                ts, values, interpolation = columns[node.number]
+                self.records.append(Record(ts, values, node.delay, interpolation))
+            elif is_broken(node):
+                self.records.append(Record.of(node))
+
+    @property
+    def jump(self) -> list[bool]:
+        """Which of them jump."""
+        return [record.interpolation.jumps for record in self.records]
+
+    def times(self, following: tuple[Int[Array, ""], ...], t) -> list[Float[Array, ""]]:
+        """When the next sample of each comes."""
+        return [record.time(i, t) for record, i in zip(self.records, following, strict=True)]
+
+    def pieces(self, following: tuple[Int[Array, ""], ...]) -> PyTree:
+        """Params with the inputs as they are up to the next sample of each."""
+        between = iter([record.piece(k, i) for k, (record, i) in enumerate(zip(self.records, following, strict=True))])
+        return _replaced(self.params, self.elsewhere, lambda k, node: next(between), lambda: next(between))
+
+
+def _replaced(params: PyTree, kept: frozenset[int], new: Callable, skipped: Callable = lambda: None) -> PyTree:
+    """Params with something new(number, node) in place of each input, apart from those that are `kept`."""
+    count = iter(range(10**9))
+
+    def of(node):
+        if not (isinstance(node, Place) or is_broken(node)):
+            return node
+        k = next(count)
+        if k in kept:
+            skipped()
+            return node
+        return new(k, node)
+
+    return jax.tree.map(of, params, is_leaf=_is_input)
+
+
+class Recorded(NamedTuple):
+    """Params and their directions with places for the signals that do not vary; and these signals, by their number."""
+
+    params: PyTree
+    directions: tuple
+    signals: dict[int, Signal]
+
+    @classmethod
+    def of(cls, elsewhere: frozenset[int], params: PyTree, directions: tuple) -> "Recorded":
+        """Those of params, but for signals whose samples vary along directions."""
+        signals = broken_signals(params)
+        varying = {k for of_order in directions for k, s in enumerate(broken_signals(of_order)) if s.ts is not None or s.values is not None}
+        kept = frozenset(elsewhere | varying)
+        place = lambda k, node: Place(k, node.delay)
+        recorded = {k: signal for k, signal in enumerate(signals) if k not in kept}
+        return cls(_replaced(params, kept, place), tuple(_replaced(d, kept, place) for d in directions), recorded)
+
+
+def called_elsewhere(values: Callable, params: PyTree) -> frozenset[int]:
+    """The signals that some function asks for at another time than the present, by their number; `values(params)` are all functions'."""
+    found: set[int] = set()
+    while True:
+        try:
+            jax.eval_shape(functools.partial(_of_pieces, values, params, frozenset(found)))
+        except CalledElsewhere as error:
+            found.add(error.args[0])
+        else:
+            return frozenset(found)
+
+
+def _of_pieces(values, params, kept):
+    return values(_replaced(params, kept, _first_piece))
+
+
+def _first_piece(number: int, signal: Signal) -> Piece:
+    return Record.of(signal).piece(number, jnp.array(1))
+
+
+def pieces_at(params: PyTree, elsewhere: frozenset[int], t: Any) -> PyTree:
+    """Params with the inputs as they are around the time t, but for those that are asked for `elsewhere`."""
+
+    def of(number, signal):
+        following = jnp.searchsorted(signal.times.astype(jnp.result_type(t)), jax.lax.stop_gradient(t), side="right")
+        return Record.of(signal).piece(number, following)
+
+    return _replaced(params, elsewhere, of)
+
+
+def packed(small: PyTree, large: list[Array]) -> tuple[Array, Callable, Callable]:
+    """All numbers as one vector; a vector ↦ the small ones as they were; a vector ↦ the large arrays as `Rows`."""
+    numbers, rest = eqx.partition(small, _is_packable)
+    leaves, structure = jax.tree.flatten(numbers)
+    dtype = jnp.result_type(float, *(x.dtype for x in (*leaves, *large) if x.dtype.kind == "f"))
+    arrays = [*leaves, *large]
+    starts = [0]
+    for x in arrays:
+        starts.append(starts[-1] + x.size)
+
+    def unpack(vector):
+        parts = [vector[a : a + x.size].reshape(x.shape) for a, x in zip(starts, leaves, strict=False)]
+        exact = [p.astype(x.dtype) if x.dtype.kind == "f" else jnp.round(p).astype(x.dtype) for p, x in zip(parts, leaves, strict=True)]
+        return eqx.combine(jax.tree.unflatten(structure, exact), rest)
+
+    def rows(vector):
+        return [Rows(vector, a, x.shape, x.dtype) for a, x in zip(starts[len(leaves) :], large, strict=False)]
+
+    return jnp.concatenate([jnp.ravel(x).astype(dtype) for x in arrays]), unpack, rows
+
+
+def _is_packable(x: Any) -> Bool[Array, ""] | bool:
+    return eqx.is_array(x) and x.dtype != jax.dtypes.float0 and x.dtype.kind in "fbiu" and not jnp.issubdtype(x.dtype, jax.dtypes.extended)

@@ -1,0 +1,261 @@
+"""Integration from node to node: a node is a sample of the motion, or a time at which a measured input jumps or bends.
+
+A step ends at each node, so that between two of them an input is a constant or a line, which need not be looked up. The steps, their
+control and their stages are diffrax's and the solver's; the loop around them, short as it is, runs in one kernel on a CPU. Variations
+are the derivative of each step and not of the loop, which stays the same.
+"""
+
+import dataclasses
+import functools
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import diffrax as dfx
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from equinox.internal import while_loop
+from jaxtyping import Array, Bool, Float, Int, PyTree
+
+from .._model.signal import broken_signals
+from .._program.whole_kernel import in_whole_kernel
+from .interval_inputs import Inputs, Recorded, Rows, packed
+from .jumps import after_jump
+from .protocol import Arguments
+from .results import RESULTS, number_of, numbered, under_diffrax
+from .runge_kutta import ExplicitRungeKutta
+from .step_size import ResumingController
+from .variational import derived, with_variations
+
+
+class Moving(NamedTuple):
+    """What a step moves and is differentiated; leaves have their variations as last axes, one for each order."""
+
+    t: Float[Array, ""]
+    y: Array
+    solver_state: PyTree
+
+
+class Steps(NamedTuple):
+    """What controls the steps and counts them, not differentiated."""
+
+    length: Float[Array, ""]  # planned, of the next step
+    solver_state: PyTree
+    controller_state: PyTree
+    has_jumped: Bool[Array, ""]
+    following: tuple[Int[Array, ""], ...]  # of each signal, its first sample after t
+    sample: Int[Array, ""]  # the next one
+    result: dfx.RESULTS
+    accepted: Int[Array, ""]
+    rejected: Int[Array, ""]
+
+    @property
+    def goes_on(self) -> Bool[Array, ""]:
+        """Whether no step has failed."""
+        return self.result == dfx.RESULTS.successful
+
+
+class Numbers(NamedTuple):
+    """The numbers that the loop reads at each turn."""
+
+    params: PyTree
+    scales: Any
+    tolerances: tuple[Array, Array]
+    directions: tuple
+
+
+class IntervalLoop(NamedTuple):
+    """The loop, apart from its numbers."""
+
+    equations: Any
+    solver: Any
+    max_steps: int
+    meter: dfx.AbstractProgressMeter
+    ts: Rows
+    inputs: Callable[[PyTree], Inputs]
+
+    def sample_time(self, sample: Int[Array, ""]) -> Float[Array, ""]:
+        """Of a sample of the motion, or of the last."""
+        return self.ts.at(jnp.minimum(sample, self.ts.shape[0] - 1))[0]
+
+    def run(self, y0, following, numbers: Numbers, saved: Any, write: Callable, loop: Callable) -> tuple[Moving, Steps, Any]:
+        """From the first sample to the last, or as far as it goes; with what was saved at the samples."""
+        first, last = (self.ts.at(i)[0] for i in (0, self.ts.shape[0] - 1))
+        rtol, atol = numbers.tolerances
+        rounding = jnp.finfo(y0.dtype).eps * jnp.maximum(jnp.abs(first), jnp.abs(last))
+        controller = ResumingController(rtol, atol, smallest=4 * rounding, norm=self.equations.error_norm)
+        stepping = self._replace(solver=_with_tolerances(self.solver, controller))
+        now = lambda moving: _alone(moving.t, numbers)
+
+        def turn(carry):
+            moving, steps, saved, meter = carry
+            sample = steps.sample
+            moving, (steps, is_sample) = stepping._varied(controller, rounding, steps, numbers)(moving)
+            meter = self.meter.step(meter, (now(moving) - first) / (last - first))
+            return moving, steps, write(saved, sample, moving.y, is_sample), meter
+
+        def going_on(carry):
+            moving, steps, *_ = carry
+            within = (steps.sample < self.ts.shape[0]) & (self.sample_time(steps.sample) > now(moving))  # the last may be repeated
+            going = (steps.result == dfx.RESULTS.successful) & (steps.accepted + steps.rejected < self.max_steps)
+            return within & going
+
+        moving, steps = stepping._start(controller, first, last, y0, following, numbers)
+        moving, steps, saved, meter = loop(going_on, turn, (moving, steps, saved, self.meter.init()))
+        self.meter.close(meter)
+        return moving, steps, saved
+
+    def _start(self, controller, first, last, y0, following, numbers: Numbers) -> tuple[Moving, Steps]:
+        """The first step is planned as diffrax plans it."""
+        term, y = dfx.ODETerm(self.equations.rates), _alone(y0, numbers)
+        args = Arguments(self.inputs(numbers.params).pieces(following), numbers.scales)
+        t1, controller_state = controller.init(term, first, last, y, None, args, self.solver.func, self.solver.error_order(term))
+        state, is_new = _initial_state(self.solver, term, first, t1, y, args)
+        changing, rest = eqx.partition(state, eqx.is_inexact_array)
+        unvaried = lambda x: functools.reduce(_with_zeros, y0.shape[y.ndim :], x)
+        moving = Moving(unvaried(first), y0, jax.tree.map(unvaried, changing))
+        zero = jnp.array(0)
+        return moving, Steps(t1 - first, rest, controller_state, is_new, following, zero + 1, dfx.RESULTS.successful, zero, zero)
+
+    def _varied(self, controller, rounding, steps: Steps, numbers: Numbers) -> Callable:
+        """A step of what moves, with its variations along the directions of params, for each order."""
+
+        def of_order(function, directions):
+            def varied(moving, params):
+                alone, change = (jax.tree.map(lambda x, part=part: x[part], moving) for part in ((..., 0), (..., slice(1, None))))
+                (value, change), aux = derived(lambda both: function(*both), (change, directions))((alone, params))
+                return jax.tree.map(with_variations, value, change), aux
+
+            return varied
+
+        function = lambda moving, params: self._step(controller, rounding, moving, params, steps, numbers.scales)
+        for directions in numbers.directions:
+            function = of_order(function, directions)
+        return lambda moving: function(moving, numbers.params)
+
+    def _step(self, controller, rounding, moving: Moving, params, steps: Steps, scales) -> tuple[Moving, tuple[Steps, Any]]:
+        """One step, tried: up to the next node at most, and behind the jump there where it is one."""
+        inputs, sample, t = self.inputs(params), self.sample_time(steps.sample), moving.t
+        coming = inputs.times(steps.following, t)
+        node, end = functools.reduce(jnp.minimum, coming, sample), t + steps.length
+        t1 = jnp.where(end + rounding >= node, node, end)
+        args = Arguments(inputs.pieces(steps.following), scales)
+        state = eqx.combine(moving.solver_state, steps.solver_state)
+        keep, y, state, planned, control, result = self._tried(controller, t, t1, moving.y, args, state, steps)
+
+        passed = [keep & (t1 == node) & (time == node) for time in coming]
+        following = tuple(i + by for i, by in zip(steps.following, passed, strict=True))
+        jumps = functools.reduce(jnp.logical_or, (by for by, jumps in zip(passed, inputs.jump, strict=True) if jumps), jnp.array(False))
+        behind = lambda y: after_jump(self.equations, t1, y, args, Arguments(inputs.pieces(following), scales))
+        y, consistent = jax.lax.cond(jumps, behind, lambda y: (y, jnp.array(True)), y)
+        result = dfx.RESULTS.where(consistent, result, under_diffrax(RESULTS.no_friction))
+        is_sample = keep & (t1 == node) & (sample == node)
+        changing, rest = eqx.partition(state, eqx.is_inexact_array)
+        counts = steps.sample + is_sample, result, steps.accepted + keep, steps.rejected + ~keep
+        after = Steps(planned, rest, control, jumps | (steps.has_jumped & ~keep), following, *counts)
+        return Moving(jnp.where(keep, t1, t), y, changing), jax.lax.stop_gradient((after, is_sample))
+
+    def _tried(self, controller, t0, t1, y0, args, state, steps: Steps):
+        """A step of the solver, and whether it is kept."""
+        term = dfx.ODETerm(self.equations.rates)
+        y1, error, _, new, result = self.solver.step(term, t0, t1, y0, args, state, steps.has_jumped)
+        given = jax.lax.stop_gradient((t0, t1, y0, y1, args, error))
+        keep, t, end, _, control, controlled = controller.adapt_step_size(*given, self.solver.error_order(term), steps.controller_state)
+        y, state = jax.tree.map(lambda new, old: jnp.where(keep, new, old), (y1, new), (y0, state))
+        return keep, y, state, end - t, control, dfx.RESULTS.where(result == dfx.RESULTS.successful, controlled, result)
+
+
+def _alone(x: Array, numbers: Numbers) -> Array:
+    """Without its variations."""
+    return x[(..., *[0] * len(numbers.directions))]
+
+
+def _with_zeros(x: Array, size: int) -> Array:
+    """With variations of zero as a last axis of this size."""
+    return with_variations(x, jnp.zeros((*x.shape, size - 1), x.dtype))
+
+
+def _with_tolerances(solver, controller):
+    """An implicit solver, with the tolerances of the steps for its equations, as diffrax has it."""
+    inner = getattr(solver, "solver", solver)
+    if not isinstance(inner, dfx.AbstractImplicitSolver):
+        return solver
+    names = [name for name in ("rtol", "atol", "norm") if not _is_given(getattr(inner.root_finder, name))]
+    root_finder = dataclasses.replace(inner.root_finder, **{name: getattr(controller, name) for name in names})
+    inner = dataclasses.replace(inner, root_finder=root_finder)
+    return dataclasses.replace(solver, solver=inner) if hasattr(solver, "solver") else inner
+
+
+def _is_given(tolerance):
+    return callable(tolerance) or eqx.is_inexact_array_like(tolerance)
+
+
+def _initial_state(solver, term, t0, t1, y0, args):
+    """The state of the solver, and whether it has yet to be made: by the first step, where that does so behind a jump as well."""
+    make = lambda: solver.init(term, t0, t1, y0, args)
+    if not isinstance(getattr(solver, "solver", solver), ExplicitRungeKutta):
+        return make(), jnp.array(False)
+    return jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), jax.eval_shape(make)), jnp.array(True)
+
+
+def integrated(equations, solver, max_steps, meter, y0, params, scales, ts, tolerances, directions=(), *, reverse=False):
+    """States at the samples; and, not differentiated, the reason it ended, counts, and the `last` time and state.
+
+    With `directions` of params, one tree for each order, the states and y0 have their variations as last axes. `reverse`: whether reverse
+    mode goes through the loop.
+    """
+    start = jax.lax.stop_gradient(ts[0])
+    following = tuple(jnp.searchsorted(s.times.astype(ts.dtype), start, side="right").astype(int) for s in broken_signals(params))
+    recorded = Recorded.of(equations.elsewhere, params, directions)
+    large = [ts, *(array for signal in recorded.signals.values() for array in (signal.ts, signal.values))]
+    given, unpack, rows = packed((y0, following, Numbers(recorded.params, scales, tolerances, recorded.directions)), large)
+
+    def started(given):
+        ts, *columns = rows(given)
+        of = {k: (*columns[2 * i : 2 * i + 2], s.interpolation) for i, (k, s) in enumerate(recorded.signals.items())}
+        loop = IntervalLoop(equations, solver, max_steps, meter, ts, lambda params: Inputs(of, equations.elsewhere, params))
+        return functools.partial(loop.run, *unpack(given))
+
+    unknown = jnp.full((ts.size - 1, *y0.shape), jnp.inf, y0.dtype)
+    saved = jnp.concatenate([y0[None], unknown])
+    if reverse:
+        write = lambda saved, i, y, wanted: saved.at[i].set(y, pred=wanted)
+        checkpointed = functools.partial(while_loop, max_steps=max_steps, buffers=lambda carry: carry[2], kind="checkpointed")
+        moving, steps, ys = started(given)(saved, write, checkpointed)
+        return _results(ys, _end(moving, steps), ts, max_steps)
+
+    like = y0[(0, *[slice(None)] * len(directions))], y0, *[jnp.zeros((), int)] * 4
+    space, unpack_end, _ = packed(like, [])
+
+    def run(given, saved):
+        write = functools.partial(_written, ts.size, y0.size)
+        moving, steps, saved = started(given)(saved, write, jax.lax.while_loop)
+        end = packed(_end(moving, steps), [])[0].astype(saved.dtype)
+        return jax.lax.dynamic_update_slice_in_dim(saved, end, ts.size * y0.size, 0)
+
+    found = in_whole_kernel(run)(given, jnp.concatenate([saved.ravel(), 0 * space]))
+    return _results(found[: saved.size].reshape(saved.shape), unpack_end(found[saved.size :]), ts, max_steps)
+
+
+def _end(moving: Moving, steps: Steps):
+    """What is of interest of the last state: t, y, the number of the result, counts of steps, the next sample."""
+    return moving.t, moving.y, number_of(steps.result), steps.accepted, steps.rejected, steps.sample
+
+
+def _written(length, width, saved, i, y, wanted):
+    """The vector of all samples with y as the i-th, where that is wanted."""
+    at = jnp.minimum(i, length - 1) * width
+    y = jnp.where(wanted, y.ravel(), jax.lax.dynamic_slice_in_dim(saved, at, width))
+    return jax.lax.dynamic_update_slice_in_dim(saved, y, at, 0)
+
+
+def _results(ys, end, ts, max_steps):
+    t, y, number, accepted, rejected, sample = end
+    t = t[(0,) * t.ndim]
+    repeated = (jnp.arange(ts.size) >= sample) & (ts == t)  # the last time, as padding has it
+    ys = jnp.where(repeated.reshape(-1, *[1] * y.ndim), y, ys)
+    result = numbered(number)
+    unfinished = (result == dfx.RESULTS.successful) & (ts[-1] > t) & (accepted + rejected >= max_steps)
+    result = dfx.RESULTS.where(unfinished, dfx.RESULTS.max_steps_reached, result)
+    stats = {"num_steps": accepted + rejected, "num_accepted_steps": accepted, "num_rejected_steps": rejected}
+    return ys, (result, stats | {"last": jax.lax.stop_gradient((t, y[(slice(None), *[0] * (y.ndim - 1))]))})

@@ -1,0 +1,96 @@
+"""A whole loop in one kernel: a CPU runs it like compiled C, instead of calling some hundred kernels a turn.
+
+XLA compiles a loop into one kernel by itself if a turn reads and writes less than 1 kB. Larger ones it compiles likewise where the call
+of a program says so. That is asked for where the program is of a kind that such a kernel may hold: nothing in it calls a library. Two
+more conditions are met by a choice that the compiler cannot foresee: it uses every argument, and what depends on it is not spread over
+threads.
+"""
+
+import math
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import jax
+import jax.custom_batching
+import jax.numpy as jnp
+from jax.experimental.xla_metadata import set_xla_metadata
+from jax.extend import core
+from jaxtyping import Array, Float
+
+from .walker import called_program
+
+ELEMENTWISE = (
+    "abs acos acosh add add_any and asin asinh atan atan2 atanh bitcast_convert_type cbrt ceil clamp convert_element_type copy cos cosh "
+    "div eq erf erf_inv exp exp2 expm1 floor ge gt integer_pow is_finite le log log1p logistic lt lt_to max min mul ne neg nextafter not "
+    "or pow reduce_precision rem round rsqrt select_n shift_left shift_right_arithmetic shift_right_logical sign sin sinh sqrt square "
+    "stop_gradient sub tan tanh xor"
+)
+STRUCTURE = (
+    "argmax argmin broadcast_in_dim concatenate dot_general dynamic_slice dynamic_update_slice gather iota nonbatchable "
+    "optimization_barrier pad platform_index reduce_and reduce_max reduce_min reduce_or reduce_prod reduce_sum reshape rev slice split "
+    "squeeze stack transpose"
+)
+CALLS = "closed_call cond core_call custom_jvp_call custom_linear_solve jit pjit scan while"
+SUMS = frozenset(("dot_general", "reduce_and", "reduce_max", "reduce_min", "reduce_or", "reduce_prod", "reduce_sum"))
+MOST_TERMS = 4095  # of a sum: more of them XLA leaves to a library; products of matrices far later
+ALLOWED = frozenset(f"{ELEMENTWISE} {STRUCTURE} {CALLS}".split())
+
+
+def in_whole_kernel(function: Callable) -> Callable:
+    """`function(given, result) -> result` of vectors of any length, compiled into one kernel where a CPU can; otherwise as it is.
+
+    It writes into `result` in place. Where the first number given is NaN, so are the results. Members of a batch run one after the other.
+    Where it is differentiated, the program within is.
+    """
+
+    def wrapped(given: Float[Array, " n"], result: Float[Array, " m"]) -> Float[Array, " m"]:
+        program = jax.make_jaxpr(function)(given, result)
+        run = lambda given, result: core.jaxpr_as_fun(program)(given, result)[0]
+        if jax.default_backend() != "cpu" or not _is_allowed(program):
+            return run(given, result)
+
+        def chosen(given, result):
+            is_number = given[0] == given[0]  # unless it is NaN
+            return jax.lax.cond(is_number, run, lambda given, result: jnp.full_like(result, jnp.nan), given, result)
+
+        @jax.custom_jvp
+        @jax.custom_batching.sequential_vmap
+        def call(given, result):
+            unknown = jax.lax.optimization_barrier((given, result))  # a constant would be moved into the program, its argument be unused
+            return set_xla_metadata(jax.jit(chosen)(*unknown), inlineable="false", xla_cpu_small_call="true")
+
+        call.defjvp(lambda primals, tangents: jax.jvp(run, primals, tangents))
+        return call(given, result)
+
+    return wrapped
+
+
+def _is_allowed(program) -> bool:
+    """Whether such a kernel can hold it; closed-over arrays would be further arguments."""
+    closed_over = any(isinstance(x, jax.core.Tracer) for x in program.consts)
+    return not closed_over and all(e.primitive.name in ALLOWED and _terms(e) <= MOST_TERMS for e in _lowered(program))
+
+
+def _terms(equation) -> int:
+    """How many numbers a sum or a product of matrices adds up."""
+    if equation.primitive.name not in SUMS:
+        return 0
+    size = equation.invars[0].aval.size
+    if equation.primitive.name != "dot_general":
+        return size
+    (contracted, _), (batch, _) = equation.params["dimension_numbers"]
+    left = math.prod(equation.invars[0].aval.shape[i] for i in (*contracted, *batch))
+    return size * equation.invars[1].aval.size // max(left, 1)
+
+
+def _lowered(program: Any) -> Iterator[Any]:
+    """All equations that are lowered; of a solve, and of a function with a derivative rule, these are its own alone."""
+    for equation in getattr(program, "jaxpr", program).eqns:
+        yield equation
+        if equation.primitive.name in ("custom_linear_solve", "custom_jvp_call"):
+            yield from _lowered(called_program(equation))
+            continue
+        for value in equation.params.values():
+            for part in value if isinstance(value, (tuple, list)) else [value]:
+                if hasattr(part, "eqns") or hasattr(part, "jaxpr"):
+                    yield from _lowered(part)

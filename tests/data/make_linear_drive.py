@@ -1,0 +1,56 @@
+"""A linear drive under a digital controller, by NumPy alone: exact between the samples, with sticking.
+
+    M q̈ + F_v q̇ + F_c sign(q̇) = K u − offset,    u = K_v (K_p (r − q) − q̇), within ±10 V, held for a millisecond
+
+with the figures of A. Janot, M. Gautier & M. Brunot, Data set and reference models of EMPS, Workshop on Nonlinear System Identification
+Benchmarks (2019), rounded: K 35.15 N/V, K_p 160.18 1/s, K_v 243.45 V s/m. The controller sees a quantised position, and its difference
+as q̇. Nothing of jaxlag enters.
+"""
+
+import numpy as np
+
+TRUE = {"M": 95.0, "Fv": 200.0, "Fc": 20.0, "offset": -3.0}
+K, KP, KV, LIMIT = 35.15, 160.18, 243.45, 10.0
+STEP, SAMPLES, QUANTUM = 1e-3, 24841, 1e-6  # s, and m
+GOALS = (0.15, 0.02, 0.22, 0.05, 0.25, 0.0, 0.12, 0.2, 0.03, 0.24, 0.1, 0.0)  # m
+SPEEDS = (0.1, 0.15, 0.2, 0.12, 0.18, 0.25, 0.1, 0.2, 0.15, 0.22, 0.12, 0.1)  # m/s, on average times 1.5
+
+
+def held(q, v, force, left, M, Fv, Fc, offset):
+    """Position and velocity after a time under a constant force: exponentials, from one rest to the next."""
+    force = force - offset
+    while left > 0:
+        if v == 0 and abs(force) <= Fc:
+            return q, 0.0
+        final = (force - Fc * np.sign(v if v else force)) / Fv
+        share = final / (final - v) if v and final != v else -1
+        until = min(left, -np.log(share) * M / Fv if 0 < share < 1 else np.inf)
+        decayed = np.exp(-Fv * until / M)
+        q, v = q + final * until + (v - final) * (1 - decayed) * M / Fv, final + (v - final) * decayed if until == left else 0.0
+        left -= until
+    return q, v
+
+
+def path():
+    """Where the drive is to go: from goal to goal with a short rest at each."""
+    r, at, k = np.zeros(SAMPLES), 0.0, 500
+    for goal, speed in zip(GOALS, SPEEDS, strict=True):
+        count = int(1.5 * abs(goal - at) / speed / STEP)
+        s = np.arange(count) / count
+        r[k : k + count] = (at + (goal - at) * (10 * s**3 - 15 * s**4 + 6 * s**5))[: max(SAMPLES - k, 0)]
+        r[k + count :] = goal
+        at, k = goal, k + count + 200
+    return r
+
+
+def recording():
+    """Times, quantised positions, true velocities and commands, (24841,) each."""
+    ts, r = np.arange(SAMPLES) * STEP, path()
+    q, v, before = 0.0, 0.0, 0.0
+    seen, speeds, commands = np.empty(SAMPLES), np.empty(SAMPLES), np.empty(SAMPLES)
+    for k in range(SAMPLES):
+        seen[k], speeds[k] = np.round(q / QUANTUM) * QUANTUM, v
+        commands[k] = np.clip(KV * (KP * (r[k] - seen[k]) - (seen[k] - before) / STEP), -LIMIT, LIMIT)
+        before = seen[k]
+        q, v = held(q, v, K * commands[k], STEP, **TRUE)
+    return ts, seen, speeds, commands

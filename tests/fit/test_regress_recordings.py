@@ -1,0 +1,85 @@
+"""Regression on recordings as machines give them: a drive under its controller, and a real pendulum."""
+
+from pathlib import Path
+
+import jax.numpy as jnp
+import make_linear_drive as drive
+import numpy as np
+import pytest
+
+import jaxlag as jl
+
+DATA = Path(__file__).parents[1] / "data"
+DRIVE = jl.System(
+    lambda qdot, M: 0.5 * M * qdot**2,
+    dissipation=lambda qdot, Fv, Fc: 0.5 * Fv * qdot**2 + Fc * jnp.abs(qdot),
+    force=lambda t, u, offset: drive.K * u(t) - offset,
+)
+PENDULUM = jl.System(
+    lambda q, qdot, J, ml: 0.5 * J * qdot**2 + ml * 9.81 * jnp.cos(q),
+    dissipation=lambda qdot, b, F: 0.5 * b * qdot**2 + F * jnp.abs(qdot),
+    force=lambda t, torque: torque(t),
+)
+
+
+@pytest.fixture(scope="module")
+def driven():
+    table = np.genfromtxt(DATA / "driven_pendulum.csv", delimiter=",", names=True)
+    return table, jl.Signal(table["t"], table["torque"])
+
+
+def test_a_drive_that_sticks_at_times_under_a_digital_controller():
+    """24 841 samples; the maker knows nothing of jaxlag."""
+    ts, q, v, u = drive.recording()
+    assert np.mean(v == 0) > 0.1 and np.std(np.diff(u)) > 0.1  # it sticks, and the command chatters
+    record = jl.Experiment(ts, q, 0.0, 0.0, params={"u": jl.Signal(ts, u)})
+    found = jl.regress(DRIVE, record, dict.fromkeys(drive.TRUE, np.nan), free=tuple(drive.TRUE))
+    assert found.linear and not found.reversals and f"{found.windows} windows, {found.width:.3g} wide" in repr(found)
+    for name, true in drive.TRUE.items():
+        assert abs(found.estimates[name] / true - 1) < 1e-3, name
+
+
+@pytest.mark.parametrize("sensors", ["angle", "angle and rate", "with their sigma"])
+def test_a_real_pendulum_whose_torque_chatters(driven, sensors):
+    """A point mass on a rod of 0.5 m, so J/(m l) is 0.5 m; its accelerations gave J = 0.0009 kg m²."""
+    table, torque = driven
+    both = {"angle": table["angle"], "rate": table["rate"]}
+    observe = lambda q, qdot: {"angle": q, "rate": qdot}
+    values, more = (both, {"observe": observe}) if sensors != "angle" else (table["angle"], {})
+    sigma = {"angle": 1e-3, "rate": 0.8} if sensors == "with their sigma" else None
+    record = jl.Experiment(table["t"], values, table["angle"][0], 0.0, params={"torque": torque}, sigma=sigma, **more)
+    free = ("J", "ml", "b", "F")
+    found = jl.regress(PENDULUM, record, dict.fromkeys(free, np.nan), free=free)
+    J, ml = found.estimates["J"], found.estimates["ml"]
+    assert 0.14 < J < 0.18 and 0.48 < J / ml < 0.52
+    assert 0.01 < found.standard_errors["J"] < 0.03  # two trials of others: 0.147 to 0.172
+    assert found.reversals and "in some of them dry friction reverses" in repr(found)
+
+
+def test_a_width_may_be_given(driven):
+    table, torque = driven
+    record = jl.Experiment(table["t"], table["angle"], table["angle"][0], 0.0, params={"torque": torque})
+    free = ("J", "ml", "b", "F")
+    found = jl.regress(PENDULUM, record, dict.fromkeys(free, np.nan), free=free, width=0.3)
+    assert found.width == pytest.approx(0.3) and 0.48 < found.estimates["J"] / found.estimates["ml"] < 0.52
+    for width in (0.0, -1.0, 4.0, np.nan):
+        with pytest.raises(ValueError, match=r"`width` must be (positive and at most the length of the longest record, 3.89|finite)"):
+            jl.regress(PENDULUM, record, dict.fromkeys(free, np.nan), free=free, width=width)
+
+
+def test_a_free_swing_over_many_periods_is_not_averaged_away():
+    """36.7 s at 50 Hz. Its makers' values give g m a/J = 64.2 s⁻²; in windows of several periods nothing is left of it."""
+    table = np.genfromtxt(DATA / "single_pendulum_swing.csv", delimiter=",", names=True)
+    swing = jl.System(lambda q, qdot, w2: 0.5 * qdot**2 - w2 * jnp.cos(q), dissipation=lambda qdot, k: 0.5 * k * qdot**2)
+    values, observe = {"angle": table["angle"], "rate": table["rate"]}, lambda q, qdot: {"angle": q, "rate": qdot}
+    record = jl.Experiment(table["t"], values, table["angle"][0], table["rate"][0], observe=observe, unknown=("q0", "qdot0"))
+    found = jl.regress(swing, record, {"w2": np.nan, "k": np.nan}, free=("w2", "k"))
+    assert abs(found.estimates["w2"] / 64.0 - 1) < 0.005 and 0.04 < found.estimates["k"] < 0.08
+    assert found.width < 1.0
+
+
+def test_what_never_moves_has_no_windows():
+    ts = np.linspace(0, 1, 100)
+    record = jl.Experiment(ts, np.zeros(100), 0.0, 0.0, params={"u": jl.Signal(ts, np.zeros(100))})
+    with pytest.raises(ValueError, match="must be long enough for windows on which the equations of motion are tested"):
+        jl.regress(DRIVE, record, {"M": 1.0, "Fv": 1.0, "Fc": np.nan, "offset": 0.1}, free=("Fc",))
