@@ -29,9 +29,9 @@ class Signal(eqx.Module):
     zero. `Linear` where mechanics differentiates u once: in a velocity constraint, where each jump of a zero-order hold is an impulse,
     and beside q̇ in L, where such impulses are left out. `Cubic` where mechanics differentiates u twice: in a position constraint.
 
-    **Steps:** `simulate` ends a step at each sample of a zero-order hold in `params` and begins the next one behind it, so leave out
-    samples at which nothing changes. With the other interpolations the tolerances alone set the steps, and a short pulse after a long
-    rest may fall between two of them: take a zero-order hold there.
+    **Steps:** `simulate` ends a step at each sample of a zero-order hold or a linear signal in `params`, so leave out samples at which
+    nothing changes. With cubic signals the tolerances alone set the steps, and a short pulse after a long rest may fall between two of
+    them: take another interpolation there. Give a delay as `delay` and not by `u(t - late)`, whose jumps are not looked for.
 
     **Arguments:**
 
@@ -45,8 +45,8 @@ class Signal(eqx.Module):
     of a cubic signal, shape (T, ...), which `simulate` computes once per motion; otherwise None.
 
     **Returns:** when called with t, a scalar or an array of shape S: u(t), of shape S + (...). Differentiable in the values, exactly, and
-    in t and the times of linear and cubic signals. The derivative by the times at which a zero-order hold jumps is not computed; it
-    counts as zero.
+    in t and the times of linear and cubic signals. By the times at which a zero-order hold jumps, that of u(t) is zero, and that of a
+    motion is exact: its steps end there.
 
     **Raises:** `ValueError` or `TypeError` where times or values are not real, are missing, or do not match in number; `TypeError` where
     `interpolation` is none of the three.

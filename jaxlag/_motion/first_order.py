@@ -35,7 +35,7 @@ from .._model.signal import broken_signals
 from .._model.system import System
 from .._program.jit import jitted
 from .._program.scalarise import scalarised
-from .interval_inputs import called_elsewhere, pieces_at
+from .interval_inputs import called_elsewhere, pieces_at, warn_of_delays
 from .protocol import Arguments
 
 PROJECTION = "projection"  # name of the work that projection does
@@ -115,6 +115,7 @@ class EquationsOfMotion:
         elsewhere = (
             called_elsewhere(lambda params: _values(bind(system, q0, params), t, q, v), params) if broken_signals(params) else frozenset()
         )
+        warn_of_delays(params, elsewhere)
         alone = cls(system, like, formulation, elsewhere=elsewhere)
         elements = formulation.friction.elements(alone.flat_at(t, params), t, q, v)
         return alone if elements is None else dataclasses.replace(alone, rows=elements.element_of_row.size, elements=elements.size)

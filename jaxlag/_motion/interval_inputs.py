@@ -2,6 +2,7 @@
 
 import functools
 import math
+import warnings
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -140,6 +141,16 @@ def called_elsewhere(values: Callable, params: PyTree) -> frozenset[int]:
             found.add(error.args[0])
         else:
             return frozenset(found)
+
+
+def warn_of_delays(params: PyTree, elsewhere: frozenset[int]) -> None:
+    """Of jumps at times that are not known, which steps go over and derivatives leave out."""
+    if any(signal.interpolation.jumps for k, signal in enumerate(broken_signals(params)) if k in elsewhere):
+        warnings.warn(
+            "a zero-order hold must be asked for the present time, u(t), for steps to end where it jumps, but a function asks for another "
+            "time: its derivative by that time counts as zero. Delay it by `Signal(..., delay=...)`.",
+            stacklevel=2,
+        )
 
 
 def _of_pieces(values, params, kept):

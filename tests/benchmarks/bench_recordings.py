@@ -1,10 +1,13 @@
-"""A linear drive recorded at 1 kHz under its digital controller, with dry friction that sticks: what identification costs and gives.
+"""A linear drive recorded at 1 kHz under its digital controller, with dry friction that sticks: what motions and identification cost.
+
+Motions and Jacobians stand beside Runge and Kutta's scheme by hand, in `lax.scan`, which knows nothing of friction that sticks.
 
 The data come from NumPy's exact piecewise solution (tests/data/make_linear_drive.py). Run:
 
 python tests/benchmarks/bench_recordings.py
 """
 
+import functools
 import sys
 import time
 from pathlib import Path
@@ -39,9 +42,64 @@ def regression(ts, q, u) -> None:
         print(f"  {name:6} off by {100 * abs(float(found.estimates[name]) / true - 1):.1e} %")
 
 
+def by_hand(x, ts, u, F=True):
+    """q̇ and q at the samples, by the scheme of order 4."""
+    M, Fv, Fc, offset = x
+
+    def rate(y, u):
+        return jnp.array([y[1], (drive.K * u - offset - Fv * y[1] - F * Fc * jnp.sign(y[1])) / M])
+
+    def step(y, given):
+        u, h = given
+        a = rate(y, u)
+        b = rate(y + h / 2 * a, u)
+        c = rate(y + h / 2 * b, u)
+        y = y + h / 6 * (a + 2 * b + 2 * c + rate(y + h * c, u))
+        return y, y
+
+    return jax.lax.scan(step, jnp.zeros(2), (u[:-1], jnp.diff(ts)))[1]
+
+
+def median(run, count=7) -> float:
+    """Milliseconds of a call, once compiled."""
+    jax.block_until_ready(run())
+    times = []
+    for _ in range(count):
+        begin = time.perf_counter()
+        jax.block_until_ready(run())
+        times.append(1e3 * (time.perf_counter() - begin))
+    return float(np.median(times))
+
+
+def costs(motion, x) -> str:
+    """Of a motion as a function of four parameters, and of its Jacobian."""
+    value, jacobian = jax.jit(motion), jax.jit(jax.jacfwd(motion))
+    return f"{median(lambda: value(x)):.1f} ms, with its Jacobian {median(lambda: jacobian(x), 3):.0f} ms"
+
+
+def motions(ts, u) -> None:
+    """Prints what motions cost."""
+    x, signal = jnp.array(list(drive.TRUE.values())), jl.Signal(ts, u)
+    smooth = jl.System(
+        lambda qdot, M: 0.5 * M * qdot**2,
+        dissipation=lambda qdot, Fv: 0.5 * Fv * qdot**2,
+        force=lambda t, u, offset: drive.K * u(t) - offset,
+    )
+
+    def simulated(system, solver):
+        params = lambda x: dict(zip(drive.TRUE, x, strict=True)) | {"u": signal}
+        return lambda x: jl.simulate(system, 0.0, 0.0, ts, params(x), solver=solver, throw=False).q
+
+    for name, system, F in (("without friction", smooth, False), ("with dry friction", SYSTEM, True)):
+        for solver in (jl.Dop853(), jl.Dopri5()):
+            print(f"{name}, {type(solver).__name__}: {costs(simulated(system, solver), x)}")
+        print(f"{name}, by hand: {costs(functools.partial(by_hand, ts=ts, u=u, F=F), x)}")
+
+
 def main() -> None:
     """Prints all."""
     ts, q, _, u = drive.recording()
+    motions(ts, u)
     regression(ts, q, u)
 
 

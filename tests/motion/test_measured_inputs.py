@@ -135,6 +135,15 @@ def test_a_delay_and_its_derivative(derivative):
     np.testing.assert_allclose(derivative(late)(delay), expected, rtol=1e-6)
 
 
+@pytest.mark.parametrize("derivative", [jax.jacfwd, jax.jacrev])
+def test_the_derivative_by_the_times_of_jumps(derivative):
+    """q(1) = Σ (uᵢ − uᵢ₋₁) (1 − tᵢ)²/2."""
+    times, values = jnp.array([0.0, 0.31, 0.7]), np.array([1.0, -2.0, 3.0])
+    cart = jl.System(lambda qdot: 0.5 * qdot**2, force=lambda t, u: u(t))
+    found = derivative(lambda times: jl.simulate(cart, 0.0, 0.0, [0.0, 1.0], {"u": jl.Signal(times, values)}).q[-1])(times)
+    np.testing.assert_allclose(found, [0.0, 3 * 0.69, -5 * 0.3], atol=1e-12)
+
+
 def test_a_force_that_asks_for_another_time():
     """A signal that a function delays by itself is looked up, and right."""
     system = jl.System(lambda qdot, m: 0.5 * m * qdot**2, force=lambda t, u, late: u(t - late))
@@ -142,6 +151,8 @@ def test_a_force_that_asks_for_another_time():
     by_hand = jl.simulate(system, 0.0, 0.0, ts, {"m": M, "u": signal, "late": 0.01}, rtol=1e-11, atol=1e-13).q
     delayed = jl.simulate(CART, 0.0, 0.0, ts, {"m": M, "b": 0.0, "u": jl.Signal(TIMES, VALUES, jl.Linear(), delay=0.01)}).q
     np.testing.assert_allclose(by_hand, delayed, atol=1e-9)
+    with pytest.warns(UserWarning, match=r"Signal\(\.\.\., delay="):
+        jl.simulate(system, 0.0, 0.0, ts, {"m": M, "u": HELD, "late": 0.01})
 
 
 def test_two_signals_at_times_of_their_own_before_and_behind_their_samples():
