@@ -96,11 +96,23 @@ def motions(ts, u) -> None:
         print(f"{name}, by hand: {costs(functools.partial(by_hand, ts=ts, u=u, F=F), x)}")
 
 
+def fitted(ts, q, u) -> None:
+    """Prints the time and the errors of `fit` from twice the truth."""
+    record = jl.Experiment(ts, q, 0.0, 0.0, params={"u": jl.Signal(ts, u)})
+    twice = {name: 2 * true for name, true in drive.TRUE.items()}
+    for call in ("first call", "again"):
+        begin = time.perf_counter()
+        found = jl.fit(SYSTEM, record, twice, free=tuple(drive.TRUE), solver=jl.Dopri5())
+        print(f"fit, {call}: {time.perf_counter() - begin:.2f} s")
+    print(found)
+
+
 def main() -> None:
     """Prints all."""
     ts, q, _, u = drive.recording()
     motions(ts, u)
     regression(ts, q, u)
+    fitted(ts, q, u)
 
 
 if __name__ == "__main__":
