@@ -1,5 +1,6 @@
 """Statistics that belong to each experiment: its own estimates, its predictions and residuals, with their errors."""
 
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -10,7 +11,8 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import PyTree
 
 from .._model.paths import is_within
-from .experiment import Experiment
+from .._model.signal import is_signal
+from .experiment import Experiment, with_own
 from .identifiability import Determined
 from .minimum import Minimum
 
@@ -100,3 +102,16 @@ def _deviations(minimum, k, row, covariance):
     leaves, structure = jax.tree.flatten(values)
     parts = np.split(there, np.cumsum([leaf.size for leaf in leaves])[:-1])
     return jax.tree.unflatten(structure, [part.reshape(leaf.shape) for part, leaf in zip(parts, leaves, strict=True)])
+
+
+def ended_inputs(experiments: Sequence[Experiment], params: PyTree) -> dict[str, tuple[float, float]]:
+    """Signals whose last sample comes more than a spacing of their samples before that of a record: its time, and that of the record."""
+    found = {}
+    for e in experiments:
+        paths, last = jax.tree_util.tree_flatten_with_path(with_own(params, e.params), is_leaf=is_signal)[0], float(e.ts[-1])
+        for path, signal in paths:
+            if is_signal(signal):
+                times = np.asarray(signal.times)
+                if times[-1] + 1.5 * np.max(np.diff(times)) < last:
+                    found[jax.tree_util.keystr(path, simple=True, separator=".")] = float(times[-1]), last
+    return found

@@ -1,6 +1,6 @@
 """The remarks on the card of a fit: sentences on what is not determined, held at a bound, or not explained by the model."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
 
@@ -79,6 +79,11 @@ def on_too_short(names: Sequence[str]) -> list[str]:
     have, own = ("has", "a sigma of its own") if len(names) == 1 else ("have", "sigmas of their own")
     shown = _listed(names) if len(names) <= MANY else f"{names[0]}, … {names[-1]}"
     return [f"{shown} {have} too few measurements for {own}: each channel is weighted by its spread; give `sigma`"]
+
+
+def on_inputs(ended: Mapping[str, tuple[float, float]]) -> list[str]:
+    """Inputs with the times of their last sample and of that of the record."""
+    return [f"{name} ends at t = {end:g} and keeps its value to the end of the record at {last:g}" for name, (end, last) in ended.items()]
 
 
 def on_misfit(

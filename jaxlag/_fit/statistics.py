@@ -13,14 +13,14 @@ from .autocorrelation import independent_samples
 from .channel_sigma import too_short
 from .channels import channels_of
 from .experiment import Experiment
-from .experiment_statistics import own_estimates, predictions_of, with_estimates
+from .experiment_statistics import ended_inputs, own_estimates, predictions_of, with_estimates
 from .identifiability import correlation_of
 from .levenberg_marquardt import CONVERGED, REASONS, UNRELATED, Outcome
 from .minimum import Minimum
 from .multiple_shooting import Segments
 from .parameter_stability import different_halves
 from .problem import Problem
-from .remarks import NO_ERRORS, UNRELATED_SIZE, on_bounds, on_halves, on_misfit, on_too_short, on_undetermined
+from .remarks import NO_ERRORS, UNRELATED_SIZE, on_bounds, on_halves, on_inputs, on_misfit, on_too_short, on_undetermined
 from .result import Fit
 from .uncertainty import Uncertainty, uncertainty_of, undetermined_parameters
 
@@ -139,7 +139,7 @@ def _remarks(minimum, uncertainty, sigma, channels):
     independent = independent_samples(minimum.measured.size, uncertainty.correlated)
     halves = on_halves(free.entries, different_halves(minimum, uncertainty), len(minimum.experiments))
     misfit = on_misfit(_relative_size(minimum), times_noise, independent, halves, channels, explained=bool(at_bounds))
-    return [*remarks, *at_bounds, *misfit]
+    return [*remarks, *at_bounds, *on_inputs(ended_inputs(minimum.experiments, free.params)), *misfit]
 
 
 def _on_sigma(minimum):

@@ -172,3 +172,13 @@ def test_a_step_too_small_to_be_seen_is_taken():
     error = np.sqrt(2 * expected.cost / 49 / (expected.jac.T @ expected.jac)[0, 0])
     assert int(outcome.best.status) == CONVERGED and len(looks) <= 9
     np.testing.assert_allclose(outcome.best.y[0], expected.x[0], atol=1e-4 * error)
+
+
+def test_an_input_that_ends_before_the_record_is_remarked():
+    cart = jl.System(lambda qdot, m: 0.5 * m * qdot**2, force=lambda t, u: u(t))
+    ts = np.linspace(0.0, 2.0, 21)
+    short, whole = (jl.Signal(np.linspace(0.0, end, 6), np.ones(6), jl.Linear()) for end in (1.0, 1.8))
+    for push, remarked in ((short, True), (whole, False)):
+        fit = jl.fit(cart, jl.Experiment(ts, ts**2 / 4, 0.0, 0.0, params={"u": push}), {"m": 1.0}, free=("m",))
+        np.testing.assert_allclose(fit.estimates["m"], 2.0, rtol=1e-6)
+        assert (fit.remarks == ["u ends at t = 1 and keeps its value to the end of the record at 2"]) == remarked
