@@ -159,8 +159,9 @@ class IntervalLoop(NamedTuple):
         """A step of the solver, and whether it is kept."""
         term = dfx.ODETerm(self.equations.rates)
         y1, error, _, new, result = self.solver.step(term, t0, t1, y0, args, state, steps.has_jumped)
-        given = jax.lax.stop_gradient((t0, t1, y0, y1, args, error))
-        keep, t, end, _, control, controlled = controller.adapt_step_size(*given, self.solver.error_order(term), steps.controller_state)
+        *states, error = jax.lax.stop_gradient((t0, t1, y0, y1, error))
+        more = error, self.solver.error_order(term), steps.controller_state
+        keep, t, end, _, control, controlled = controller.adapt_step_size(*states, args, *more)
         y, state = jax.tree.map(lambda new, old: jnp.where(keep, new, old), (y1, new), (y0, state))
         return keep, y, state, end - t, control, dfx.RESULTS.where(result == dfx.RESULTS.successful, controlled, result)
 

@@ -209,6 +209,17 @@ def test_single_precision():
     np.testing.assert_allclose(found, exactly(SAMPLES["coarse"])[:, 0], atol=2e-4)
 
 
+def test_other_entries_of_params_stay_what_they_are():
+    """Integers, truth values, text and a cubic signal beside the held one."""
+    system = jl.System(lambda qdot, n: 0.5 * n * qdot**2, force=lambda t, u, w, on, name: u(t) + w(t) * on if name == "both" else u(t))
+    w = jl.Signal(np.linspace(0, 2, 9), np.ones(9), jl.Cubic())
+    params = {"n": np.array(2), "on": np.array(True), "name": "both", "w": w, "u": HELD}
+    slope = lambda c: jl.simulate(system, 0.0, 0.0, SAMPLES["coarse"], params | {"c": c}).qdot[-1]
+    alone = jl.simulate(CART, 0.0, 0.0, SAMPLES["coarse"], {"m": M, "b": 0.0, "u": HELD}).qdot[-1]
+    np.testing.assert_allclose(slope(1.0), alone + 1.6 / M, rtol=1e-10)
+    assert jax.grad(slope)(1.0) == 0
+
+
 def test_a_failure_has_its_reason():
     motion = jl.simulate(CART, 0.0, 0.0, SAMPLES["coarse"], PARAMS | {"u": HELD}, max_steps=50, throw=False)
     assert motion.result == jl.RESULTS.max_steps_reached
