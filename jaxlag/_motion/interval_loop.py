@@ -49,11 +49,6 @@ class Steps(NamedTuple):
     accepted: Int[Array, ""]
     rejected: Int[Array, ""]
 
-    @property
-    def goes_on(self) -> Bool[Array, ""]:
-        """Whether no step has failed."""
-        return self.result == dfx.RESULTS.successful
-
 
 class Numbers(NamedTuple):
     """The numbers that the loop reads at each turn."""
