@@ -1,6 +1,7 @@
 """The standard deviation of each channel's noise, estimated along with the parameters where it is not given."""
 
 import dataclasses
+import math
 from collections.abc import Callable
 from typing import Any
 
@@ -20,6 +21,8 @@ ByChannel = dict[str, Any]
 
 def too_short(problem: Problem) -> list[str]:
     """Of several channels those with no more measurements than there are unknowns: these could fit them exactly, with a sigma of zero."""
+    if _is_alone(problem):
+        return []
     measured = _by_channel(problem, lambda batch, _: batch.values)
     gaps = 0 if problem.continuity is None else problem.continuity.dual.size
     return [name for name, z in measured.items() if z.size <= problem.size - gaps] if len(measured) > 1 else []
@@ -27,6 +30,8 @@ def too_short(problem: Problem) -> list[str]:
 
 def weighted_by_spread(problem: Problem) -> Problem:
     """The problem with each channel divided by the spread of its measurements, so that its minimum does not depend on units."""
+    if _is_alone(problem):
+        return problem
     measured = _by_channel(problem, lambda batch, _: batch.values)
     relative, _ = _relative_to_mean({name: _spread(z) for name, z in measured.items()}, measured)
     return _with(problem, relative)
@@ -55,6 +60,12 @@ def weighted_by_residuals(problem: Problem, found: Linearisation) -> tuple[Probl
     scale = np.asarray(scale if robust else 1.0, problem.scale.dtype)
     changes = [abs(np.log(after[name] * scale / (before[name] * problem.scale))) for name in after]
     return dataclasses.replace(_with(problem, after), scale=scale), float(np.max(changes))
+
+
+def _is_alone(problem: Problem) -> bool:
+    """Whether there is one channel, whose sigma is the mean of all."""
+    shapes = [leaf.shape for batch in problem.batches for leaf in jax.tree.leaves(batch.values)]
+    return len(shapes) == 1 and math.prod(shapes[0][2:]) == 1
 
 
 def sigmas_of(problem: Problem) -> ByChannel:

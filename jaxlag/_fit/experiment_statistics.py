@@ -108,9 +108,10 @@ def ended_inputs(experiments: Sequence[Experiment], params: PyTree) -> dict[str,
     """Signals whose last sample comes more than a spacing of their samples before that of a record: its time, and that of the record."""
     found = {}
     for e in experiments:
-        own, last = with_own(params, e.params), float(e.ts[-1])
+        own = with_own(params, e.params)
         if not any(map(is_signal, jax.tree.leaves(own, is_leaf=is_signal))):
             continue
+        last = float(e.ts[-1])
         for path, signal in jax.tree_util.tree_flatten_with_path(own, is_leaf=is_signal)[0]:
             if is_signal(signal):
                 times = np.asarray(signal.times)

@@ -15,7 +15,7 @@ from .channels import channels_of
 from .experiment import Experiment
 from .experiment_statistics import ended_inputs, own_estimates, predictions_of, with_estimates
 from .identifiability import correlation_of
-from .levenberg_marquardt import CONVERGED, REASONS, UNRELATED, Outcome
+from .levenberg_marquardt import CONVERGED, INTERRUPTED, REASONS, STEP_LIMIT, UNRELATED, Outcome
 from .minimum import Minimum
 from .multiple_shooting import Segments
 from .parameter_stability import different_halves
@@ -137,7 +137,9 @@ def _remarks(minimum, uncertainty, sigma, channels):
         at_bounds = list(on_bounds(free, minimum.theta, r @ np.asarray(minimum.found.jacobian)[:, :p]))
     times_noise = sigma if minimum.absolute else 1.0
     independent = independent_samples(minimum.measured.size, uncertainty.correlated)
-    halves = on_halves(free.entries, different_halves(minimum, uncertainty), len(minimum.experiments))
+    unfinished = int(minimum.outcome.best.status) in (STEP_LIMIT, INTERRUPTED)  # halves are compared at a minimum
+    different = None if unfinished else different_halves(minimum, uncertainty)
+    halves = on_halves(free.entries, different, len(minimum.experiments))
     misfit = on_misfit(_relative_size(minimum), times_noise, independent, halves, channels, explained=bool(at_bounds))
     return [*remarks, *at_bounds, *on_inputs(ended_inputs(minimum.experiments, free.params)), *misfit]
 
