@@ -4,6 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 import oscillator as osc
 import pytest
+from make_linear_drive import held
 
 import jaxlag as jl
 
@@ -13,21 +14,6 @@ AXIS = jl.System(
     force=lambda t, u, offset: u(t) - offset,
 )
 TRUE = {"M": 2.0, "Fv": 3.0, "Fc": 4.0, "offset": 0.5}
-
-
-def held(q, v, u, left, M, Fv, Fc, offset):
-    """Position and velocity after a time under a constant force: piecewise exponentials, in closed form."""
-    u = u - offset
-    while left > 0:
-        if v == 0 and abs(u) <= Fc:
-            return q, 0.0
-        final = (u - Fc * (np.sign(v) if v else np.sign(u))) / Fv
-        share = final / (final - v) if v and final != v else -1
-        until = min(left, -np.log(share) * M / Fv if 0 < share < 1 else np.inf)
-        decayed = np.exp(-Fv * until / M)
-        q, v = q + final * until + (v - final) * (1 - decayed) * M / Fv, final + (v - final) * decayed if until == left else 0.0
-        left -= until
-    return q, v
 
 
 def closed_loop(noise, seed=0, T=8.0, dt=0.01):
