@@ -12,8 +12,8 @@ TEXTS = {
     "docs/architecture.md": "architecture.md",
 }
 REFERENCE = {
-    "Systems": "System virtual_work rate substitute Signal ZeroOrderHold Linear Cubic dissipation.sliding dissipation.viscous "
-    "dissipation.drag dissipation.power_law dissipation.stribeck dissipation.speed",
+    "Systems": "System State Sampled virtual_work rate substitute Signal ZeroOrderHold Linear Cubic dissipation.sliding "
+    "dissipation.viscous dissipation.drag dissipation.power_law dissipation.stribeck dissipation.speed",
     "At one state": "acceleration Acceleration mass_matrix momentum energy constraint_jacobian constraint_residual constraint_force powers "
     "Residual consistent_state examine Examination",
     "Motions": "simulate simulate_many Trajectory FrictionState RESULTS Instant Interpolated load Dop853 Dopri5 Projection Baumgarte "

@@ -49,6 +49,7 @@ from ._motion.runge_kutta import Dop853 as Dop853, Dopri5 as Dopri5
 from ._motion.results import RESULTS as RESULTS
 from ._model.signal import Signal as Signal
 from ._model.signal_interpolation import Cubic as Cubic, Linear as Linear, ZeroOrderHold as ZeroOrderHold
+from ._model.states import Sampled as Sampled, State as State
 from ._model.system import System as System
 from ._motion.trajectory import (
     Instant as Instant,

@@ -138,8 +138,8 @@ def _forces(motion: Trajectory, at: np.ndarray, name: str, on: Mapping[str, Call
     """The forces of a constraint on its points in each frame, interpolated between the samples."""
     system, params, ts = motion.provenance.system, motion.provenance.params, np.asarray(motion.ts)
     positions = lambda t, q, params: [ravel_pytree(call(x, f"`points` {point!r}", params, t=t, q=q))[0] for point, x in on.items()]
-    force = lambda t, q, qdot: jnp.stack(constraint_force(system, q, qdot, params, t=t, at=positions)[name])
-    F = np.asarray(jax.jit(jax.vmap(force))(motion.ts, motion.q, motion.qdot))
+    force = lambda t, q, qdot, states: jnp.stack(constraint_force(system, q, qdot, params, t=t, states=states, at=positions)[name])
+    F = np.asarray(jax.jit(jax.vmap(force))(motion.ts, motion.q, motion.qdot, motion.states))
     known = np.all(np.isfinite(F), axis=(1, 2))
     if 2 * np.sum(known) < ts.size:
         raise ValueError(

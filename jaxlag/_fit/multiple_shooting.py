@@ -39,6 +39,8 @@ def cut(problem: Problem, experiments: Sequence[Experiment], count: int) -> Segm
     """Each experiment in `count` segments, which start on splines through the measurements."""
     segments: list[Experiment] = []
     of, samples, pairs, starts = [], [], [], []
+    if problem.model.system.states:
+        raise ValueError("`segments` must be 1 where the system has states, whose values at the cuts are unknown, but is more. Omit it.")
     for i, e in enumerate(experiments):
         _check(e, count)
         motion = smooth(e, problem.free.params)

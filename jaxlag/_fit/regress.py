@@ -107,8 +107,8 @@ def regress(
     **Returns:** a `Regression`. Its standard errors come from the scatter of the windows: they hold for coloured noise and for forces
     that the model lacks, not for a bias of all windows alike. Estimates of `fit` are more accurate where noise is all that is wrong.
 
-    **Raises:** `ValueError` where `free` names no parameter, the equations contain only ratios of the parameters, the sensors do not see
-    the motion, or they have a delay; where `width` is not positive, or fits no window into the records.
+    **Raises:** `ValueError` where the system has states beside q, `free` names no parameter, the equations contain only ratios of the
+    parameters, the sensors do not see the motion, or they have a delay; where `width` is not positive, or fits no window into the records.
 
     **Source:** Shinbrot, Trans. ASME 79 (1957) 582 (method of modulating functions); Messenger & Bortz, J. Comput. Phys. 443 (2021)
     110525 (weak form); Gautier & Khalil, IEEE Trans. Robot. Autom. 6 (1990) 368; Goldenshluger & Nemirovski, Math. Methods Stat. 6
@@ -123,6 +123,11 @@ def regress(
     jl.regress(oscillator, record, {"c": jnp.nan}, free=("c",)).estimates["c"]  # 4.0
     ```
     """
+    if system.states:
+        raise ValueError(
+            f"`system` must be one whose forces follow from what is measured, but has states: {', '.join(dict(system.states))}. "
+            "Put their recorded values into params as `Signal`s, in a system without these states, or use `fit`."
+        )
     experiments, params = measured(experiments, params)
     params = Free.of(params, free, bounds).with_default_starts()
     chosen = Free.of(params, free, bounds)

@@ -39,10 +39,11 @@ class Model:
             ts = jnp.concatenate([ts[:1], jnp.where(delayed > ts[0], delayed, ts[0])])
         motion = simulate(self.system, q0, qdot0, ts, params, **{**dict(self.numerics), "throw": False})
 
-        def seen(t, q, qdot, qddot, multipliers):
-            return call(e.observe, "`observe`", params, t=t, q=q, qdot=qdot, qddot=qddot, multipliers=multipliers)
+        def seen(t, q, qdot, qddot, multipliers, states):
+            state = dict(t=t, q=q, qdot=qdot, qddot=qddot, multipliers=multipliers)
+            return call(e.observe, "`observe`", params, **state, **states, states=states)
 
-        channels = jax.vmap(seen)(motion.ts, motion.q, motion.qdot, motion.qddot, motion.multipliers)
+        channels = jax.vmap(seen)(motion.ts, motion.q, motion.qdot, motion.qddot, motion.multipliers, motion.states)
         return (channels if e.delay is None else jax.tree.map(lambda x: x[1:], channels)), motion
 
 

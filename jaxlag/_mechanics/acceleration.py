@@ -29,7 +29,7 @@ class Acceleration(NamedTuple):
     multipliers: dict[str, PyTree]
 
 
-def acceleration(system: System, q: PyTree, qdot: PyTree, params: PyTree = None, *, t: Any = 0.0) -> Acceleration:
+def acceleration(system: System, q: PyTree, qdot: PyTree, params: PyTree = None, *, t: Any = 0.0, states: PyTree = None) -> Acceleration:
     r"""Acceleration and multipliers of the constrained motion.
 
     $$ M\ddot q = f + G^T\lambda, \qquad G\ddot q = -\gamma $$
@@ -37,7 +37,8 @@ def acceleration(system: System, q: PyTree, qdot: PyTree, params: PyTree = None,
     λ > 0 pushes along +∇g. With redundant constraints q̈ and Gᵀλ are still unique, and λ is the one of least norm;
     M may be singular where the constraints hold what it leaves free.
 
-    **Arguments:** the state `q`, `qdot` (one pytree structure, n numbers in all), `params`, the time `t`. Any consistent units.
+    **Arguments:** the state `q`, `qdot` (one pytree structure, n numbers in all), `params`, the time `t`; `states`: values by name of the
+    states beside q, where they are not those at the start. Any consistent units.
 
     **Returns:** `Acceleration(qddot, multipliers)`: q̈ structured like q; λ by the constraint's name, structured like what g or a returns.
 
@@ -57,8 +58,8 @@ def acceleration(system: System, q: PyTree, qdot: PyTree, params: PyTree = None,
     jl.acceleration(pendulum, *state, {"m": 3.0, "g": 9.81, "l": 2.0}).multipliers["rod"]  # −m l φ̇² − m g cos φ = −35.43
     ```
     """
-    result, sound = at_state(_acceleration, system, q, qdot, params, t)
-    _refuse(sound, system, q, qdot, params, t)
+    result, sound = at_state(_acceleration, system, q, qdot, params, t, states)
+    _refuse(sound, system, q, qdot, params, t, states)
     return result
 
 
@@ -83,7 +84,7 @@ def _acceleration(flat, t, q, v):
 
 
 def constraint_force(
-    system: System, q: PyTree, qdot: PyTree, params: PyTree = None, *, t: Any = 0.0, at: Callable | None = None
+    system: System, q: PyTree, qdot: PyTree, params: PyTree = None, *, t: Any = 0.0, states: PyTree = None, at: Callable | None = None
 ) -> dict[str, PyTree]:
     r"""Constraint forces by the constraint's name: generalized, λ ∂g/∂q (or λ ∂a/∂q̇), or as a force on a point.
 
@@ -110,8 +111,8 @@ def constraint_force(
     """
     if at is not None:
         check_function(at, "`at`")
-    force, sound = at_state(_ConstraintForce(at), system, q, qdot, params, t)
-    _refuse(sound, system, q, qdot, params, t)
+    force, sound = at_state(_ConstraintForce(at), system, q, qdot, params, t, states)
+    _refuse(sound, system, q, qdot, params, t, states)
     return force
 
 

@@ -8,10 +8,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import PyTree
 
-from .._model.flat import Flat, bind, rows_by_name
+from .._model.flat import Flat, rows_by_name
 from .._model.paths import entry_names, leaf_names
+from .._model.state_values import given_states
 from .._model.system import System
-from .._model.validation import at_state, coordinates
+from .._model.validation import at_state, checked, coordinates, state
 from .._program.scalarise import scalarised
 from .friction_elements import unread_friction
 from .lagrange import applied_force, constraint_rows, inertia, position_residual, velocity_residual
@@ -58,7 +59,7 @@ class Examination:
         return "\n".join(["Examination", *lines, *(f"  - {finding}" for finding in self.findings or ("no issues found",))])
 
 
-def examine(system: System, q: PyTree, qdot: PyTree, params: PyTree = None, *, t: Any = 0.0) -> Examination:
+def examine(system: System, q: PyTree, qdot: PyTree, params: PyTree = None, *, t: Any = 0.0, states: PyTree = None) -> Examination:
     r"""A pre-flight check of a system at one state: rank, redundancy, inertia, dissipation, stiffness, in numbers and in words.
 
     $$ \text{degrees of freedom} = n - \mathrm{rank}\,G, \qquad N^T M N > 0, \qquad \dot q\cdot\frac{\partial D}{\partial\dot q} \ge 0,
@@ -81,7 +82,7 @@ def examine(system: System, q: PyTree, qdot: PyTree, params: PyTree = None, *, t
     print(jl.examine(vehicle.system, vehicle.q0, vehicle.qdot0, vehicle.params))
     ```
     """
-    found = jax.tree.map(np.asarray, at_state(_measure, system, q, qdot, params, t))
+    found = jax.tree.map(np.asarray, at_state(_measure, system, q, qdot, params, t, states))
     if not is_defined(found):
         raise ValueError(UNDEFINED)
     q = coordinates(q, "q")
@@ -116,16 +117,16 @@ def examine(system: System, q: PyTree, qdot: PyTree, params: PyTree = None, *, t
         *_pushes(names, M, G, rows, system),
         *_findings(numbers, defect, found["M"].dtype),
         *_pulling(system, found["multipliers"]),
-        *_unread_friction(system, q, qdot, params, t),
+        *_unread_friction(system, q, qdot, params, t, states),
     ]
     return Examination(**numbers, findings=tuple(findings))
 
 
-def _unread_friction(system, q, qdot, params, t):
+def _unread_friction(system, q, qdot, params, t, states):
     """Dry friction that is written in a way that is not recognised."""
-    q = coordinates(q, "q")
-    v = jax.flatten_util.ravel_pytree(coordinates(qdot, "qdot"))[0]
-    return unread_friction(bind(system, q, params), jnp.asarray(t, v.dtype), jax.flatten_util.ravel_pytree(q)[0], v)
+    q, qdot = state(q, qdot)
+    t = jnp.asarray(t, jax.tree.leaves(q)[0].dtype)
+    return unread_friction(*checked(system, t, q, qdot, params, given_states(system, states, q)))
 
 
 def _pulling(system, multipliers):

@@ -51,10 +51,13 @@ def constraint_rows(flat: Flat, t, q, v) -> tuple[Float[Array, " m"], Float[Arra
     return psi, G.as_matrix(), gamma
 
 
-def mass_matrix(system: System, q: PyTree, qdot: PyTree, params: PyTree = None, *, t: Any = 0.0) -> Float[Array, "n n"]:
+def mass_matrix(
+    system: System, q: PyTree, qdot: PyTree, params: PyTree = None, *, t: Any = 0.0, states: PyTree = None
+) -> Float[Array, "n n"]:
     """Mass matrix M = ∂²L/∂q̇², in the flat order of `jax.flatten_util.ravel_pytree(q)`.
 
-    **Arguments:** the state `q`, `qdot` (one pytree structure, n numbers in all), `params`, the time `t`. Any consistent units.
+    **Arguments:** the state `q`, `qdot` (one pytree structure, n numbers in all), `params`, the time `t`; `states`: values by name of the
+    states beside q, where they are not those at the start. Any consistent units.
 
     **Returns:** an (n, n) array, symmetric.
 
@@ -68,14 +71,14 @@ def mass_matrix(system: System, q: PyTree, qdot: PyTree, params: PyTree = None, 
     jl.mass_matrix(system, {"x": 2.0, "phi": 0.0}, {"x": 0.0, "phi": 0.0}, {"m": 3.0})  # rows phi, x: [[12, 0], [0, 3]]
     ```
     """
-    return at_state(_mass_matrix, system, q, qdot, params, t)
+    return at_state(_mass_matrix, system, q, qdot, params, t, states)
 
 
 def _mass_matrix(flat, t, q, v):
     return inertia(flat, t, q, v)[0].as_matrix()
 
 
-def momentum(system: System, q: PyTree, qdot: PyTree, params: PyTree = None, *, t: Any = 0.0) -> PyTree:
+def momentum(system: System, q: PyTree, qdot: PyTree, params: PyTree = None, *, t: Any = 0.0, states: PyTree = None) -> PyTree:
     """Generalized momentum p = ∂L/∂q̇, structured like q.
 
     **Arguments, raises:** as `mass_matrix`. **Source:** Goldstein, 3rd ed., eq. 2.44.
@@ -85,14 +88,14 @@ def momentum(system: System, q: PyTree, qdot: PyTree, params: PyTree = None, *, 
     jl.momentum(jl.System(lambda qdot, m: 0.5 * m * qdot**2), 0.0, 2.0, {"m": 3.0})  # 6.0
     ```
     """
-    return at_state(_momentum, system, q, qdot, params, t)
+    return at_state(_momentum, system, q, qdot, params, t, states)
 
 
 def _momentum(flat, t, q, v):
     return flat.unravel(jax.grad(flat.lagrangian, argnums=2)(t, q, v))
 
 
-def energy(system: System, q: PyTree, qdot: PyTree, params: PyTree = None, *, t: Any = 0.0) -> Float[Array, ""]:
+def energy(system: System, q: PyTree, qdot: PyTree, params: PyTree = None, *, t: Any = 0.0, states: PyTree = None) -> Float[Array, ""]:
     """Energy h = q̇ · ∂L/∂q̇ − L, which is T + V where L = T − V with T quadratic in q̇.
 
     **Arguments, raises:** as `mass_matrix`. **Source:** Goldstein, 3rd ed., eq. 2.53 (energy function).
@@ -102,7 +105,7 @@ def energy(system: System, q: PyTree, qdot: PyTree, params: PyTree = None, *, t:
     jl.energy(jl.System(lambda q, qdot, m, c: 0.5 * m * qdot**2 - 0.5 * c * q**2), 1.0, 2.0, {"m": 3.0, "c": 4.0})  # 8.0
     ```
     """
-    return at_state(_energy, system, q, qdot, params, t)
+    return at_state(_energy, system, q, qdot, params, t, states)
 
 
 def _energy(flat, t, q, v):
@@ -110,7 +113,9 @@ def _energy(flat, t, q, v):
     return v @ p - L
 
 
-def constraint_jacobian(system: System, q: PyTree, qdot: PyTree, params: PyTree = None, *, t: Any = 0.0) -> Float[Array, "m n"]:
+def constraint_jacobian(
+    system: System, q: PyTree, qdot: PyTree, params: PyTree = None, *, t: Any = 0.0, states: PyTree = None
+) -> Float[Array, "m n"]:
     """Constraint Jacobian G: rows ∂g/∂q of the holonomic, then ∂a/∂q̇ of the nonholonomic constraints.
 
     **Arguments, raises:** as `mass_matrix`. **Returns:** an (m, n) array; rows in the order of `system.constraints`.
@@ -124,7 +129,7 @@ def constraint_jacobian(system: System, q: PyTree, qdot: PyTree, params: PyTree 
     jl.constraint_jacobian(rod, jnp.array([3.0, 4.0]), jnp.zeros(2), {"l": 5.0})  # [[6, 8]]
     ```
     """
-    return at_state(_constraint_jacobian, system, q, qdot, params, t)
+    return at_state(_constraint_jacobian, system, q, qdot, params, t, states)
 
 
 def _constraint_jacobian(flat, t, q, v):
@@ -138,7 +143,7 @@ class Residual(NamedTuple):
     velocity: dict[str, PyTree]
 
 
-def constraint_residual(system: System, q: PyTree, qdot: PyTree, params: PyTree = None, *, t: Any = 0.0) -> Residual:
+def constraint_residual(system: System, q: PyTree, qdot: PyTree, params: PyTree = None, *, t: Any = 0.0, states: PyTree = None) -> Residual:
     """Constraint residuals: `position` holds g, `velocity` holds dg/dt and a, each by the constraint's name.
 
     **Arguments, raises:** as `mass_matrix`. **Returns:** `Residual(position, velocity)`; values structured like what g and a return.
@@ -152,7 +157,7 @@ def constraint_residual(system: System, q: PyTree, qdot: PyTree, params: PyTree 
     jl.constraint_residual(rod, jnp.array([3.0, 4.0]), jnp.array([1.0, 0.0]), {"l": 5.0})  # rod: g = 0, dg/dt = 6
     ```
     """
-    return at_state(_constraint_residual, system, q, qdot, params, t)
+    return at_state(_constraint_residual, system, q, qdot, params, t, states)
 
 
 def _constraint_residual(flat, t, q, v):

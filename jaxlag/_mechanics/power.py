@@ -14,7 +14,9 @@ from .saddle_point import constrained_acceleration
 from .stick_slip import in_current_mode
 
 
-def powers(system: System, q: PyTree, qdot: PyTree, params: PyTree = None, *, t: Any = 0.0) -> dict[str, Float[Array, ""]]:
+def powers(
+    system: System, q: PyTree, qdot: PyTree, params: PyTree = None, *, t: Any = 0.0, states: PyTree = None
+) -> dict[str, Float[Array, ""]]:
     r"""Power of each term by its name; their sum is the rate of the energy.
 
     $$ \frac{dh}{dt} = -\sum_D \dot q\cdot\frac{\partial D}{\partial\dot q} + \sum_Q Q\cdot\dot q
@@ -35,7 +37,7 @@ def powers(system: System, q: PyTree, qdot: PyTree, params: PyTree = None, *, t:
     jl.powers(car, 0.0, 2.0, {"m": 1.0, "b": 3.0, "F": 5.0})  # oil: −12, pull: 10, time: 0
     ```
     """
-    return at_state(_powers, system, q, qdot, params, t)
+    return at_state(_powers, system, q, qdot, params, t, states)
 
 
 def _powers(flat, t, q, v):

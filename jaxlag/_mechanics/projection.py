@@ -226,15 +226,15 @@ def _off(residual, rows, x):
 
 
 def consistent_state(
-    system: System, q: PyTree, qdot: PyTree, params: PyTree = None, *, t: Any = 0.0, fixed: Sequence[Any] = ()
+    system: System, q: PyTree, qdot: PyTree, params: PyTree = None, *, t: Any = 0.0, states: PyTree = None, fixed: Sequence[Any] = ()
 ) -> tuple[PyTree, PyTree]:
     r"""The state on the constraints that is nearest to the given one, in the metric of M.
 
     $$ \min \tfrac12 (q - q_0)^T M (q - q_0) \text{ with } g(t, q) = 0, \qquad
        \min \tfrac12 (\dot q - \dot q_0)^T M (\dot q - \dot q_0) \text{ with } \dot g = 0,\ a = 0 $$
 
-    **Arguments:** the state `q`, `qdot` (one pytree structure), `params`, the time `t`; `fixed` lists coordinates whose position and
-    velocity stay as given: keys where q is a mapping, indices where it is an array or a sequence. Any consistent units.
+    **Arguments:** the state `q`, `qdot` (one pytree structure), `params`, the time `t`, `states` as for `acceleration`; `fixed` lists
+    coordinates whose position and velocity stay as given: keys where q is a mapping, indices where it is an array or a sequence. Any consistent units.
 
     **Returns:** (q, qdot), structured like q; differentiable in every argument.
 
@@ -251,11 +251,11 @@ def consistent_state(
     ```
     """
     core = _StateOn(_fixed_indices(coordinates(q, "q"), tuple(fixed)))
-    (new_q, new_qdot), (reached, determined, affine, defined) = at_state(core, system, q, qdot, params, t)
+    (new_q, new_qdot), (reached, determined, affine, defined) = at_state(core, system, q, qdot, params, t, states)
     if is_concrete(reached):
         for passed, reason in ((defined, UNDEFINED), (determined, NO_INERTIA), (affine, NOT_AFFINE), (reached, IMPOSSIBLE)):
             if not passed:
-                raise ValueError(explained(reason, system, q, qdot, params, t))
+                raise ValueError(explained(reason, system, q, qdot, params, t, states))
     return new_q, new_qdot
 
 

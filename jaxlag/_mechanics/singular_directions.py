@@ -26,12 +26,12 @@ NOT_AFFINE = (
 )
 
 
-def explained(reason: str, system: System, q: PyTree, qdot: PyTree, params: PyTree, t: Any) -> str:
+def explained(reason: str, system: System, q: PyTree, qdot: PyTree, params: PyTree, t: Any, states: PyTree = None) -> str:
     """The reason, and the coordinates concerned, where there are any and the numbers are known; or that numbers are undefined."""
     about = {NO_INERTIA: _without_inertia, NOT_AFFINE: _nonaffine}.get(reason)
     if about is None or not is_concrete(q, qdot, params, t):
         return reason
-    found = jax.tree.map(np.asarray, at_state(_matrices, system, q, qdot, params, t))
+    found = jax.tree.map(np.asarray, at_state(_matrices, system, q, qdot, params, t, states))
     if not is_defined(found):
         return UNDEFINED
     names = entry_names(coordinates(q, "q"), "q")

@@ -1,8 +1,8 @@
 """The system over flat vectors: what the mechanics works on."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -10,8 +10,10 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, PyTree
 
-from .injection import asks_for, call, described
+from .injection import asks_for, call, described, needs
 from .signal import at_time
+from .state_values import of_first_order, sampled, shaped_like
+from .states import flowing, values_at
 from .system import CONSTRAINT_SLOTS, System, role
 
 
@@ -26,6 +28,8 @@ class Flat(NamedTuple):
     position: Callable[..., PyTree]  # x(t, q) of a position map
     unravel: Callable[[Float[Array, " n"]], PyTree]
     unravel_multipliers: Callable[[Float[Array, " m"]], dict[str, PyTree]]
+    state_rates: Callable[..., dict[str, PyTree]]  # ż(t, q, v) of the states of first order
+    updates: Callable[..., dict[str, PyTree]]  # u(t, q, v) of the sampled ones
     needs_multipliers: bool
     holonomic_names: tuple[str, ...]
     terms: tuple[str, ...]
@@ -33,9 +37,20 @@ class Flat(NamedTuple):
     held: dict[str, np.ndarray] = {}  # noqa: RUF012 - rows of G beyond those, with which a dissipation term sticks
 
 
-def bind(system: System, like: PyTree, params: PyTree) -> Flat:
+class StatesAt(NamedTuple):
+    """The states beside q by name, and the time and the state at which they have these values."""
+
+    values: Mapping[str, PyTree]
+    t: Any
+    q: Float[Array, " n"]
+    v: Float[Array, " n"]
+
+
+def bind(system: System, like: PyTree, params: PyTree, states: StatesAt | None = None) -> Flat:
     """The system over flat vectors, for coordinates structured `like` these, which need be shapes only."""
-    bound = _Bound(system, like, params)
+    bound = _Bound(system, like, params, {} if states is None else states.values)
+    if states is not None and states.values:
+        bound.let_flow(*states[1:])
     return Flat(
         lagrangian=bound.lagrangian,
         dissipations={name: partial(bound.dissipation, (name, D)) for name, D in system.dissipation},
@@ -45,6 +60,8 @@ def bind(system: System, like: PyTree, params: PyTree) -> Flat:
         position=bound.position,
         unravel=bound.unravel,
         unravel_multipliers=bound.unravel_multipliers,
+        state_rates=bound.state_rates,
+        updates=bound.updates,
         needs_multipliers=any(asks_for(function, "multipliers") for _, function in (*system.dissipation, *system.force)),
         holonomic_names=tuple(name for name, _ in system.holonomic),
         terms=system.terms,
@@ -55,8 +72,8 @@ def bind(system: System, like: PyTree, params: PyTree) -> Flat:
 class _Bound:
     """The functions of a system with their parameters, over flat vectors."""
 
-    def __init__(self, system: System, like: PyTree, params: PyTree):
-        self.system, self.params = system, params
+    def __init__(self, system: System, like: PyTree, params: PyTree, states: Mapping[str, PyTree]):
+        self.system, self.params, self.states = system, params, states
         self.zeros = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), like)
         zero, self.unravel = ravel_pytree(self.zeros)
         t = jnp.zeros((), zero.dtype)
@@ -71,8 +88,12 @@ class _Bound:
     def value(self, slot, term, t, q, v, **more):
         """What one of the user's functions returns."""
         name, function = term
-        state = {"t": t, "q": self.unravel(q)} | ({} if v is None else {"qdot": self.unravel(v)}) | more
-        return call(function, role(slot, name), at_time(self.params, t), **state)
+        return self._called(function, role(slot, name), t, q, v, **more)
+
+    def _called(self, function, label, t, q, v, **more):
+        state = {"t": t, "q": self.unravel(q)} | ({} if v is None else {"qdot": self.unravel(v)})
+        states = values_at(self.states, t) | {"states": self.states}
+        return call(function, label, at_time(self.params, t), **state, **states, **more)
 
     def lagrangian(self, t, q, v):
         terms = (jnp.asarray(self.value("lagrangian", term, t, q, v), q.dtype) for term in self.system.lagrangian)
@@ -96,7 +117,31 @@ class _Bound:
         return jnp.concatenate([jnp.zeros(0, q.dtype), *parts])
 
     def position(self, at, t, q):
-        return jax.tree.map(lambda x: jnp.asarray(x, q.dtype), call(at, "a position map", at_time(self.params, t), t=t, q=self.unravel(q)))
+        return jax.tree.map(lambda x: jnp.asarray(x, q.dtype), self._called(at, "a position map", t, q, None))
+
+    def state_rates(self, t, q, v):
+        return self._of_states("rate", {name: state.rate for name, state in of_first_order(self.system).items()}, t, q, v)
+
+    def updates(self, t, q, v):
+        return self._of_states("update", {name: state.update for name, state in sampled(self.system).items()}, t, q, v)
+
+    def _of_states(self, what, functions, t, q, v):
+        values = values_at(self.states, t)
+        found = {}
+        for name, function in functions.items():
+            label = f"`{what}` of state {name!r}"
+            found[name] = shaped_like(label, values[name], self._called(function, label, t, q, v))
+        return found
+
+    def let_flow(self, t, q, v):
+        """From here on the states change with time, as they do at this state: what differentiates by t sees their rates."""
+        values, rates = self.states, self.state_rates(t, q, v)
+        derivatives = [values, rates]
+        if any(needs(g, name) for _, g in self.system.holonomic for name in rates):  # of g the second derivative by time is needed
+            of = lambda t, q, states: _Bound(self.system, self.zeros, self.params, values | states).state_rates(t, q, v)
+            flown = {name: values[name] for name in rates}
+            derivatives.append(jax.jvp(of, (t, q, flown), (jnp.ones_like(t), v, rates))[1])
+        self.states = values | {name: flowing(t, *(of_order[name] for of_order in derivatives)) for name in rates}
 
     def unravel_multipliers(self, multipliers):
         return dict(zip(self.system.constraints, self.unravel_residuals(multipliers[: self.rows]), strict=True))

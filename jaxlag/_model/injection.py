@@ -2,7 +2,7 @@
 
 import difflib
 import inspect
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from typing import Any
 
 import jax
@@ -11,7 +11,7 @@ import numpy as np
 
 from .user_errors import explain_tracing_errors
 
-STATE_NAMES = ("t", "q", "qdot", "qddot", "multipliers", "params")
+STATE_NAMES = ("t", "q", "qdot", "qddot", "multipliers", "params", "states")  # "states": as they flow, for composed functions
 
 
 def declared_parameters(function: Callable) -> tuple[inspect.Parameter, ...]:
@@ -49,6 +49,11 @@ def check_function(function: Any, label: str) -> None:
 def asks_for(function: Callable, name: str) -> bool:
     """Whether a user's function asks for the argument `name`."""
     return any(p.name == name for p in declared_parameters(function))
+
+
+def needs(function: Callable, name: str) -> bool:
+    """Whether a user's function, or one of those that it is composed of, asks for the argument `name`."""
+    return asks_for(function, name) or any(needs(part, name) for part in getattr(function, "composed_of", ()))
 
 
 def call(function: Callable, role: str, params: Any, /, **state: Any) -> Any:
@@ -100,10 +105,10 @@ def _is_floating(x: Any) -> bool:
     return isinstance(x, (jax.Array, np.ndarray, np.generic)) and jnp.issubdtype(x.dtype, jnp.floating)
 
 
-def check_entries(params: Any) -> None:
+def check_entries(params: Any, names: Collection[str] = STATE_NAMES) -> None:
     """Refuses entries of `params` that the name of a state variable would hide."""
     if isinstance(params, Mapping):
-        for hidden in set(params) & set(STATE_NAMES):
+        for hidden in set(params) & set(names):
             raise ValueError(
                 f"`params` must not have an entry named {hidden!r}, but has one; that name stands for the state. Rename the entry."
             )
@@ -120,7 +125,8 @@ def missing(role: str, key: Any, q: Any, params: Any) -> str:
 
 
 def _unknown(role: str, name: str, state: Mapping[str, Any], params: Any) -> str:
-    own = [known for known in STATE_NAMES if known in (*state, "params")]
+    own = [known for known in STATE_NAMES if known in (*state, "params") and known != "states"]
+    own += [known for known in state if known not in STATE_NAMES]
     if isinstance(params, Mapping):
         entries = sorted(map(str, params))
         where = f"the entries of params: {', '.join(entries)}" if entries else "params has no entries"

@@ -14,6 +14,7 @@ from .._program.jit import is_concrete
 from .flat import flat_like
 from .injection import asks_for, call, check_function
 from .numbers import numbers
+from .states import Sampled, State, values_at
 from .system import CONSTRAINT_SLOTS, System, Terms, role
 
 
@@ -117,7 +118,17 @@ def substitute(system: System, coordinates: Callable) -> System:
         force=pulled("force", _PulledForce),
         **{slot: pulled(slot, _PulledBack if has_velocity else _PulledPosition) for slot, has_velocity in CONSTRAINT_SLOTS.items()},
         one_sided=system.one_sided,
+        states={name: _pulled_state(state, coordinates) for name, state in system.states},
     )
+
+
+def _pulled_state(state: State | Sampled, coordinates: Callable) -> State | Sampled:
+    """A state that is driven by the old coordinates."""
+    pulled = lambda given, what: _PulledBack(given, coordinates, f"`{what}`") if callable(given) else given
+    start = pulled(state.start, "start")
+    if isinstance(state, State):
+        return State(pulled(state.rate, "rate"), start)
+    return Sampled(pulled(state.update, "update"), state.every, start)
 
 
 class _Composed:
@@ -125,21 +136,34 @@ class _Composed:
 
     @property
     def __signature__(self) -> inspect.Signature:
-        return inspect.Signature([inspect.Parameter(name, inspect.Parameter.POSITIONAL_OR_KEYWORD) for name in self._names()])
+        kind = inspect.Parameter.POSITIONAL_OR_KEYWORD
+        states = inspect.Parameter("states", kind, default=None)
+        return inspect.Signature([*(inspect.Parameter(name, kind) for name in self._names()), states])
 
     def _names(self) -> tuple[str, ...]:
         raise NotImplementedError
+
+    @property
+    def composed_of(self) -> tuple[Callable, ...]:
+        """The user's functions."""
+        parts = (getattr(self, field.name) for field in dataclasses.fields(self))  # type: ignore[arg-type]
+        return tuple(part for part in parts if callable(part))
 
 
 def _multipliers_of(function: Callable) -> tuple[str, ...]:
     return ("multipliers",) if asks_for(function, "multipliers") else ()
 
 
-def _with_velocity(coordinate: Callable, label: str, t: Any, q: Any, qdot: Any, params: Any) -> tuple[Any, Any]:
+def _at(t: Any, states: dict[str, Any] | None) -> dict[str, Any]:
+    """The states at the time t, by name, and as they flow for functions that are composed in their turn."""
+    return values_at(states or {}, t) | {"states": states}
+
+
+def _with_velocity(coordinate: Callable, label: str, t: Any, q: Any, qdot: Any, params: Any, states: Any) -> tuple[Any, Any]:
     """A position and its velocity, by one `jvp`."""
     t = jnp.asarray(t, jnp.result_type(*jax.tree.leaves(q), 1.0))
     q, qdot = (jax.tree.map(lambda leaf: jnp.asarray(leaf, t.dtype), tree) for tree in (q, qdot))
-    return jax.jvp(lambda t, q: call(coordinate, label, params, t=t, q=q), (t, q), (jnp.ones_like(t), qdot))
+    return jax.jvp(lambda t, q: call(coordinate, label, params, t=t, q=q, **_at(t, states)), (t, q), (jnp.ones_like(t), qdot))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -149,13 +173,13 @@ class _Rate(_Composed):
     def _names(self):
         return ("t", "q", "qdot", "params")
 
-    def __call__(self, t=None, q=None, qdot=None, params=None):
+    def __call__(self, t=None, q=None, qdot=None, params=None, states=None):
         if t is None and not asks_for(self.coordinate, "t"):
             t = 0.0
         for name, value in (("t", t), ("q", q), ("qdot", qdot)):
             if value is None:
                 raise TypeError(f"a rate must be given t, q and qdot, but `{name}` is missing. Call it `rate(x)(t, q, qdot, params)`.")
-        return _with_velocity(self.coordinate, "`coordinate`", t, q, qdot, params)[1]
+        return _with_velocity(self.coordinate, "`coordinate`", t, q, qdot, params, states)[1]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -180,9 +204,9 @@ class _VirtualWork(_Composed):
     def _names(self):
         return ("t", "q", "qdot", "params", *_multipliers_of(self.effort))
 
-    def __call__(self, t, q, qdot, params, **multipliers):
-        x, pull = jax.vjp(lambda q: _vectors(call(self.coordinate, "`coordinate`", params, t=t, q=q)), q)
-        effort = _vectors(call(self.effort, "`effort`", params, t=t, q=q, qdot=qdot, **multipliers))
+    def __call__(self, t, q, qdot, params, states=None, **multipliers):
+        x, pull = jax.vjp(lambda q: _vectors(call(self.coordinate, "`coordinate`", params, t=t, q=q, **_at(t, states))), q)
+        effort = _vectors(call(self.effort, "`effort`", params, t=t, q=q, qdot=qdot, **_at(t, states), **multipliers))
         need, have = (jax.tree.map(jnp.shape, tree) for tree in (x, effort))
         if need != have:
             raise ValueError(
@@ -202,9 +226,9 @@ class _PulledBack(_Composed):
     def _names(self):
         return ("t", "q", "qdot", "params", *_multipliers_of(self.function))
 
-    def __call__(self, t, q, qdot, params, **multipliers):
-        x, xdot = map(_vectors, _with_velocity(self.coordinates, "`coordinates`", t, q, qdot, params))
-        return call(self.function, self.label, params, t=t, q=x, qdot=xdot, **multipliers)
+    def __call__(self, t, q, qdot, params, states=None, **multipliers):
+        x, xdot = map(_vectors, _with_velocity(self.coordinates, "`coordinates`", t, q, qdot, params, states))
+        return call(self.function, self.label, params, t=t, q=x, qdot=xdot, **_at(t, states), **multipliers)
 
 
 class _PulledPosition(_PulledBack):
@@ -213,17 +237,17 @@ class _PulledPosition(_PulledBack):
     def _names(self):
         return ("t", "q", "params")
 
-    def __call__(self, t, q, params):
-        x = _vectors(call(self.coordinates, "`coordinates`", params, t=t, q=q))
-        return call(self.function, self.label, params, t=t, q=x)
+    def __call__(self, t, q, params, states=None):
+        x = _vectors(call(self.coordinates, "`coordinates`", params, t=t, q=q, **_at(t, states)))
+        return call(self.function, self.label, params, t=t, q=x, **_at(t, states))
 
 
 class _PulledForce(_PulledBack):
     """Q of the old coordinates, mapped to the new ones by equal virtual work."""
 
-    def __call__(self, t, q, qdot, params, **multipliers):
-        force = super().__call__(t, q, qdot, params, **multipliers)
-        x, pull = jax.vjp(lambda q: _vectors(call(self.coordinates, "`coordinates`", params, t=t, q=q)), q)
+    def __call__(self, t, q, qdot, params, states=None, **multipliers):
+        force = super().__call__(t, q, qdot, params, states, **multipliers)
+        x, pull = jax.vjp(lambda q: _vectors(call(self.coordinates, "`coordinates`", params, t=t, q=q, **_at(t, states))), q)
         return pull(ravel_pytree(x)[1](flat_like(x, self.label, force)))[0]
 
 

@@ -4,8 +4,9 @@ import dataclasses
 from collections.abc import Callable, Collection, Mapping
 from typing import Any
 
-from .injection import check_function
+from .injection import check_function, needs
 from .pickling import picklable, unpickled
+from .states import Named, Sampled, State, states_of
 
 Terms = tuple[tuple[str, Callable], ...]
 Slot = Any  # a function, a mapping from names to functions, or None: `_terms` checks it
@@ -23,7 +24,7 @@ class System:
 
     Each slot takes one function or a mapping of named functions. Terms add up, and results are reported under their names; a single
     function has the name of its slot. A function receives exactly the arguments it names: `t`, `q`, `qdot`, `params`, any entry of
-    `params` where that is a mapping, and, in `dissipation` and `force`, `multipliers`.
+    `params` where that is a mapping, the states by their names, and, in `dissipation` and `force`, `multipliers`.
 
     **Arguments:**
 
@@ -36,16 +37,18 @@ class System:
     - `one_sided`: a name or names of holonomic constraints that push and never pull, as a table does: g ≥ 0 and λ ≥ 0, where λ > 0 pushes
       along +∇g. The motion is computed with g = 0 all the same; where λ < 0 the contact would have opened, and `Trajectory.pulling()`, the
       printed trajectory, `examine` and `plot.forces` report it.
+    - `states`: by name, states beside q: `State(rate)`, of first order, ż = rate(…), or `Sampled(update, every)`, which changes at
+      sample times alone, as in a digital controller.
 
-    **Fields:** `lagrangian`, `dissipation`, `force`, `holonomic` and `nonholonomic`, each a tuple of (name, function), and `one_sided`, a
-    tuple of names.
+    **Fields:** `lagrangian`, `dissipation`, `force`, `holonomic` and `nonholonomic`, each a tuple of (name, function); `one_sided`, a
+    tuple of names; `states`, a tuple of (name, state).
 
     Any consistent set of units. Functions may return plain numbers, integers or lists, which become floating arrays. A system is
     immutable, hashable and compared by its functions. Create it once: one created again from new functions is compiled again. What was
     compiled for it, and what its functions close over, stays in memory until `jax.clear_caches()`.
 
-    **Raises:** `TypeError` where a slot holds no function; `ValueError` where two terms have the same name, or where `one_sided` names no
-    holonomic constraint.
+    **Raises:** `TypeError` where a slot holds no function or `states` no state; `ValueError` where two terms have the same name, where
+    `one_sided` names no holonomic constraint, or where a position constraint depends on a state that q̇ drives or that jumps.
 
     **Source:** Goldstein, Classical Mechanics, 3rd ed., sections 1.5 and 2.4; sign of λ: M q̈ = f + Gᵀλ.
 
@@ -66,6 +69,7 @@ class System:
     holonomic: Terms
     nonholonomic: Terms
     one_sided: tuple[str, ...]
+    states: Named
 
     def __init__(
         self,
@@ -76,6 +80,7 @@ class System:
         holonomic: Slot = None,
         nonholonomic: Slot = None,
         one_sided: Any = (),  # a name, or a collection of names
+        states: Mapping[str, State | Sampled] | None = None,
     ):
         for slot, given in zip(SLOTS, (lagrangian, dissipation, force, holonomic, nonholonomic), strict=True):
             object.__setattr__(self, slot, _terms(slot, given))
@@ -94,6 +99,9 @@ class System:
                 there = ", ".join(known) or "none"
                 raise ValueError(f"`one_sided` must name holonomic constraints, but holds {name!r}. There are {there}.")
         object.__setattr__(self, "one_sided", tuple(name for name in known if name in given))
+        object.__setattr__(self, "states", states_of(states))
+        for label, function in ((role("holonomic", name), g) for name, g in self.holonomic):
+            _check_position(label, function, dict(self.states))
 
     def __copy__(self) -> "System":
         return self
@@ -103,7 +111,7 @@ class System:
 
     def __reduce__(self) -> Any:
         references = {slot: {name: picklable(f, role(slot, name)) for name, f in getattr(self, slot)} for slot in SLOTS}
-        return _unpickled, (references, self.one_sided)
+        return _unpickled, (references, self.one_sided, dict(self.states))
 
     def __repr__(self) -> str:
         def listed(slot: str, terms: Terms) -> str:
@@ -111,6 +119,7 @@ class System:
 
         parts = [listed(slot, getattr(self, slot)) for slot in SLOTS if getattr(self, slot)]
         parts += [f"one-sided: {', '.join(self.one_sided)}"] * bool(self.one_sided)
+        parts += [f"states: {', '.join(dict(self.states))}"] * bool(self.states)
         return f"System({'; '.join(parts)})"
 
     @property
@@ -124,9 +133,20 @@ class System:
         return (*(name for name, _ in (*self.dissipation, *self.force)), *self.constraints, EXPLICIT_TIME)
 
 
-def _unpickled(references: dict[str, dict[str, Any]], one_sided: tuple[str, ...]) -> System:
+def _unpickled(references: dict[str, dict[str, Any]], one_sided: tuple[str, ...], states: dict[str, Any] | None = None) -> System:
     slots = {slot: {name: unpickled(f) for name, f in terms.items()} for slot, terms in references.items()}
-    return System(**slots, one_sided=one_sided)
+    return System(**slots, one_sided=one_sided, states=states)
+
+
+def _check_position(label: str, function: Callable, states: dict[str, State | Sampled]) -> None:
+    """Refuses a position constraint on a state that jumps, or whose second derivative needs the acceleration that it is to give."""
+    for name, state in states.items():
+        if needs(function, name) and (isinstance(state, Sampled) or needs(state.rate, "qdot")):
+            why = "jumps" if isinstance(state, Sampled) else "is driven by qdot"
+            raise ValueError(
+                f"{label} must depend on states that follow from t, q and states alone, but {name!r} {why}, which would need an infinite "
+                "or an unknown acceleration. Write the constraint for velocities, as `nonholonomic`."
+            )
 
 
 def _terms(slot: str, given: Any) -> Terms:

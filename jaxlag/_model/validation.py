@@ -11,9 +11,10 @@ import numpy as np
 from jaxtyping import Array, Float, PyTree
 
 from .._program.jit import compiled, is_concrete
-from .flat import Flat, bind, flat_like
+from .flat import Flat, StatesAt, bind, flat_like
 from .injection import call, check_entries, described, missing
 from .numbers import Label, in_dtype, number, numbers
+from .state_values import given_states, of_first_order, sampled, shaped_like, start_values
 from .system import CONSTRAINT_SLOTS, SLOTS, System, role
 from .user_errors import warn_of_recreated_functions
 
@@ -132,12 +133,14 @@ def _check_order(ts):
     )
 
 
-def check(system: System, t: Array, q: Arrays, qdot: Arrays, params: PyTree) -> None:
+def check(system: System, t: Array, q: Arrays, qdot: Arrays, params: PyTree, states: Mapping[str, PyTree]) -> None:
     """Refuses functions that return the wrong kind of thing. Evaluates shapes only: it runs while a program is traced, never with it."""
+    _check_state_names(system, q, params)
+    beside = dict(states) | {"states": states}
     for slot in ("lagrangian", "dissipation"):
         for name, function in getattr(system, slot):
-            more = {} if slot == "lagrangian" else {"multipliers": _multipliers(system, t, q, qdot, params)}
-            out = _shape_of(function, role(slot, name), params, t=t, q=q, qdot=qdot, **more)
+            more = {} if slot == "lagrangian" else {"multipliers": _multipliers(system, t, q, qdot, params, beside)}
+            out = _shape_of(function, role(slot, name), params, t=t, q=q, qdot=qdot, **beside, **more)
             if not (isinstance(out, jax.ShapeDtypeStruct) and out.shape == ()):
                 raise ValueError(
                     f"{role(slot, name)} must return a real scalar, but returned {described(out)}. "
@@ -146,45 +149,59 @@ def check(system: System, t: Array, q: Arrays, qdot: Arrays, params: PyTree) -> 
     for slot, has_velocity in CONSTRAINT_SLOTS.items():
         for name, function in getattr(system, slot):
             velocity = {"qdot": qdot} if has_velocity else {}
-            out = _shape_of(function, role(slot, name), params, t=t, q=q, **velocity)
+            out = _shape_of(function, role(slot, name), params, t=t, q=q, **velocity, **beside)
             if not jax.tree.leaves(out):
                 raise ValueError(
                     f"{role(slot, name)} must return residuals, but returned {described(out)}. "
                     "Return what has to be zero, e.g. `q @ q - l**2`."
                 )
     for name, function in system.force:
-        label, state = role("force", name), {"t": t, "q": q, "qdot": qdot, "multipliers": _multipliers(system, t, q, qdot, params)}
-        _shape_of(function, label, params, functools.partial(flat_like, q, label), **state)
+        label, state = role("force", name), {"t": t, "q": q, "qdot": qdot, "multipliers": _multipliers(system, t, q, qdot, params, beside)}
+        _shape_of(function, label, params, functools.partial(flat_like, q, label), **state, **beside)
+    rates = [("rate", name, of.rate) for name, of in of_first_order(system).items()]
+    for what, name, function in [*rates, *(("update", name, of.update) for name, of in sampled(system).items())]:
+        label = f"`{what}` of state {name!r}"
+        then = functools.partial(shaped_like, label, states[name])
+        _shape_of(function, label, params, then, t=t, q=q, qdot=qdot, **beside)
     shapes = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype), (q, eqx.filter(params, eqx.is_array)))
     warn_of_recreated_functions([(role(s, n), f) for s in SLOTS for n, f in getattr(system, s)], shapes)
 
 
-def at_state(core: Callable[..., Any], system: System, q: Any, qdot: Any, params: Any, t: Any) -> Any:
+def _check_state_names(system, q, params):
+    """A name stands for one thing."""
+    names = [name for name, _ in system.states]
+    check_entries(params, names)
+    for name in set(names) & set(q if isinstance(q, Mapping) else ()):
+        raise ValueError(f"`states` must not have a state named {name!r}, but has one, and so has q. Rename the state.")
+
+
+def at_state(core: Callable[..., Any], system: System, q: Any, qdot: Any, params: Any, t: Any, states: Any = None) -> Any:
     """`core(flat, t, q, v)` of the checked system at a state given by the user; compiled once for each `core` and `system`."""
     q, qdot = state(q, qdot)
     t = number(t, "`t`", jax.tree.leaves(q)[0].dtype, cure="Pass one time, and use `jax.vmap` for several.")
-    return _at_state(core, system, t, q, qdot, parameters(params, q))
+    return _at_state(core, system, t, q, qdot, parameters(params, q), given_states(system, states, q))
 
 
 @compiled
-def _at_state(core, system, t, q, qdot, params):
-    return core(*checked(system, t, q, qdot, params))
+def _at_state(core, system, t, q, qdot, params, states):
+    return core(*checked(system, t, q, qdot, params, states))
 
 
-def checked(system: System, t: Array, q: PyTree, qdot: PyTree, params: PyTree) -> tuple[Flat, Array, Array, Array]:
+def checked(system: System, t: Array, q: PyTree, qdot: PyTree, params: PyTree, states: Any) -> tuple[Flat, Array, Array, Array]:
     """The system over flat vectors and the state in them, after the check."""
-    check(system, t, q, qdot, params)
-    ravelled, _ = jax.flatten_util.ravel_pytree(q)
-    return bind(system, q, params), t, ravelled, jax.flatten_util.ravel_pytree(qdot)[0]
+    values = start_values(system, states, t, q, qdot, params)
+    check(system, t, q, qdot, params, values)
+    ravelled, rate = (jax.flatten_util.ravel_pytree(tree)[0] for tree in (q, qdot))
+    return bind(system, q, params, StatesAt(values, t, ravelled, rate)), t, ravelled, rate
 
 
-def _multipliers(system, t, q, qdot, params):
+def _multipliers(system, t, q, qdot, params, beside):
     slots = [
         (role(s, n), f, {"qdot": qdot} if has_velocity else {})
         for s, has_velocity in CONSTRAINT_SLOTS.items()
         for n, f in getattr(system, s)
     ]
-    shapes = [_shape_of(f, label, params, t=t, q=q, **velocity) for label, f, velocity in slots]
+    shapes = [_shape_of(f, label, params, t=t, q=q, **velocity, **beside) for label, f, velocity in slots]
     return dict(zip(system.constraints, jax.tree.map(lambda s: jnp.zeros(s.shape, s.dtype), shapes), strict=True))
 
 

@@ -20,6 +20,8 @@ def card(motion: Any) -> str:
     rows = [("coordinates", ", ".join(leaf_names(motion.q)))]
     if motion.multipliers:
         rows.append(("constraints", ", ".join(motion.multipliers)))
+    if motion.states:
+        rows.append(("states", ", ".join(leaf_names(motion.states))))
     steps, rejected = (np.asarray(motion.stats[key]) for key in ("num_steps", "num_rejected_steps"))
     rows.append(("steps", f"{steps.max()}, {rejected.max()} of them rejected{most}"))
     if motion.multipliers:

@@ -12,7 +12,7 @@ from .trajectory import Trajectory
 def raise_failure(trajectory: Trajectory, start: tuple | None = None) -> None:
     """Raises the reason of a failed motion, outside of compiled code; under `jit` the reason stays in the result.
 
-    Given the `start` (q0, qdot0), it names the coordinates concerned.
+    Given the `start` (q0, qdot0, states), it names the coordinates concerned.
     """
     if not has_failed(trajectory.result):
         return
@@ -20,8 +20,9 @@ def raise_failure(trajectory: Trajectory, start: tuple | None = None) -> None:
     if reason in map(reason_of, OF_THE_INPUT):
         if start is None:
             raise ValueError(reason)
-        q0, qdot0 = start
-        raise ValueError(explained(reason, trajectory.provenance.system, q0, qdot0, trajectory.provenance.params, trajectory.ts[0]))
+        q0, qdot0, states = start
+        of = trajectory.provenance
+        raise ValueError(explained(reason, of.system, q0, qdot0, of.params, trajectory.ts[0], states))
     samples, coordinate = trajectory.ts.shape[-1], np.asarray(jax.tree.leaves(trajectory.q)[0])
     reached = np.isfinite(coordinate.reshape(-1, samples, coordinate.size // trajectory.ts.size)[..., 0]).sum(1).min()
     numerics = (
@@ -38,5 +39,6 @@ def _unread_friction(trajectory: Trajectory) -> str:
     """Dry friction of the system that was not recognised as such; of a batch, in its first motion."""
     for _ in trajectory.ts.shape[1:]:
         trajectory = jax.tree.map(lambda x: x[0], trajectory)
-    flat, (q, v) = trajectory._flat(), trajectory._vectors()
-    return "".join(f" And {finding}." for finding in unread_friction(flat, trajectory.ts[0], q[0], v[0], trajectory.friction))
+    states, t, q, v = trajectory._first()
+    findings = unread_friction(trajectory._flat((states, t, q, v)), t, q, v, trajectory.friction)
+    return "".join(f" And {finding}." for finding in findings)

@@ -1,11 +1,8 @@
-"""The equations of motion as a first-order system, ready to be integrated.
-
-    y = (q, q̇, work of each term, σ of each slip, which elements others hold at their bound, number of transitions, time stuck)
-
-Works are present where they were asked for, the last four where D is nonsmooth.
-"""
+"""The equations of motion as a first-order system, ready to be integrated: ẏ = f(t, y), with y as in `state_vector`."""
 
 import dataclasses
+import functools
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import jax
@@ -30,13 +27,15 @@ from .._mechanics.stick_slip import (
     slip_of,
     sticking,
 )
-from .._model.flat import Flat, bind
+from .._model.flat import Flat, StatesAt, bind
 from .._model.signal import broken_signals
+from .._model.state_values import NOTHING, Layout, of_first_order, period, ravelled, sampled
 from .._model.system import System
 from .._program.jit import jitted
 from .._program.scalarise import scalarised
 from .interval_inputs import called_elsewhere, pieces_at, warn_of_delays
 from .protocol import Arguments
+from .state_vector import Evidence, Parts, Sample, Start, Violation
 
 PROJECTION = "projection"  # name of the work that projection does
 NEGLIGIBLE = 1e7  # times the tolerance, compared with which a slip of a thousand tolerances is negligible
@@ -50,88 +49,47 @@ class Formulation(NamedTuple):
     works: bool = False
 
 
-class Parts(NamedTuple):
-    """y, taken apart."""
-
-    q: Float[Array, " n"]
-    v: Float[Array, " n"]
-    works: Float[Array, " w"]
-    sigma: Float[Array, " r"]
-    held: Float[Array, " e"]  # 1 or 0
-    transitions: Float[Array, " 0|1"]
-    time_stuck: Float[Array, " e"]
-
-
-class Start(NamedTuple):
-    """y at the start; whether a friction mode is consistent with its forces; whether no bound is negative."""
-
-    y: Float[Array, " y"]
-    has_mode: Bool[Array, ""]
-    has_bounds: Bool[Array, ""]
-
-
-class Violation(NamedTuple):
-    """How far a sample lies beyond the end of its friction mode, and the scale on which that is small; two per element."""
-
-    excess: Float[Array, " m"]
-    scale: Float[Array, " m"]
-
-
-class Sample(NamedTuple):
-    """One sample of a motion: what a `Trajectory` holds of it."""
-
-    q: PyTree
-    qdot: PyTree
-    qddot: PyTree
-    multipliers: dict[str, PyTree]
-    works: dict[str, Array] | None
-    friction: dict[str, tuple[Array, Array]]
-    counts: dict[str, Array]
-
-
-class Evidence(NamedTuple):
-    """What tells whether a sample keeps the guarantees of a motion."""
-
-    sound: Sound
-    violation: Violation
-
-
 @dataclasses.dataclass(frozen=True)
 class EquationsOfMotion:
     """The `FirstOrderSystem` of one motion, and what locates the transitions of dry friction."""
 
     system: System
-    like: tuple  # structure, shapes and dtype of q
+    like: Layout  # of q
     formulation: Formulation
     rows: int = 0  # slip velocities with dry friction
     elements: int = 0  # elements of dry friction
     elsewhere: frozenset[int] = frozenset()  # signals that are asked for at other times than the present
+    states: Layout = NOTHING  # of first order, by name
+    sampled: Layout = NOTHING  # states that change at sample times
 
     @classmethod
-    def of(cls, system: System, q0: PyTree, formulation: Formulation, params: PyTree, t, q, v) -> "EquationsOfMotion":
+    def of(cls, system: System, q0: PyTree, formulation: Formulation, params: PyTree, at: StatesAt) -> "EquationsOfMotion":
         """Looks for dry friction at the start, in shapes alone."""
-        leaves, structure = jax.tree.flatten(q0)
-        like = structure, tuple((leaf.shape, leaf.dtype) for leaf in leaves)
-        elsewhere = (
-            called_elsewhere(lambda params: _values(bind(system, q0, params), t, q, v), params) if broken_signals(params) else frozenset()
-        )
-        warn_of_delays(params, elsewhere)
-        alone = cls(system, like, formulation, elsewhere=elsewhere)
-        elements = formulation.friction.elements(alone.flat_at(t, params), t, q, v)
+        z, u = (Layout.of({name: at.values[name] for name in of}) for of in (of_first_order(system), sampled(system)))
+        alone = cls(system, Layout.of(q0), formulation, states=z, sampled=u)
+        if broken_signals(params):
+            elsewhere = called_elsewhere(lambda params: _values(bind(system, q0, params, at), *at[1:]), params)
+            warn_of_delays(params, elsewhere)
+            alone = dataclasses.replace(alone, elsewhere=elsewhere)
+        elements = formulation.friction.elements(alone.flat_at(params, at), *at[1:])
         return alone if elements is None else dataclasses.replace(alone, rows=elements.element_of_row.size, elements=elements.size)
 
-    def flat(self, params: PyTree) -> Flat:
+    def flat(self, params: PyTree, at: StatesAt) -> Flat:
         """The system over flat vectors."""
-        structure, shapes = self.like
-        return bind(self.system, jax.tree.unflatten(structure, [jax.ShapeDtypeStruct(*shape) for shape in shapes]), params)
+        return bind(self.system, self.like.shapes, params, at)
 
-    def flat_at(self, t, params: PyTree) -> Flat:
-        """The system over flat vectors at the time t: its inputs are looked up once."""
-        return self.flat(pieces_at(params, self.elsewhere, t))
+    def flat_at(self, params: PyTree, at: StatesAt) -> Flat:
+        """The system over flat vectors at one time: its inputs are looked up once."""
+        return self.flat(pieces_at(params, self.elsewhere, at.t), at)
 
-    def mode(self, t, q, v, sigma, args: Arguments) -> tuple[Flat, Flat, FrictionElements | None]:
-        """The system, the system in the mode σ, and its elements of dry friction where there are any."""
-        flat, treatment = self.flat_at(t, args.params), self.formulation.friction
+    def states_of(self, t, parts: Parts) -> StatesAt:
+        """The states beside q, at the time t."""
+        return StatesAt(self.states.unravelled(parts.z) | self.sampled.unravelled(parts.u), t, parts.q, parts.v)
+
+    def mode(self, t, parts: Parts, args: Arguments) -> tuple[Flat, Flat, FrictionElements | None]:
+        """The system, the system in its mode σ, and its elements of dry friction where there are any."""
+        flat, treatment = self.flat_at(args.params, self.states_of(t, parts)), self.formulation.friction
+        q, v, sigma = parts.q, parts.v, parts.sigma
         if not self.rows:
             return flat, treatment.smoothed(flat, t, q, v), None
         elements = treatment.elements(flat, t, q, v)
@@ -149,11 +107,31 @@ class EquationsOfMotion:
     @property
     def size(self) -> int:
         """n, the number of coordinates."""
-        return sum(int(np.prod(shape)) for shape, _ in self.like[1])
+        return self.like.size
+
+    @property
+    def sampled_names(self) -> tuple[str, ...]:
+        """Names of the sampled states, in their order in y."""
+        return tuple(self.sampled.shapes)
+
+    @property
+    def varying_periods(self) -> tuple[bool, ...]:
+        """Of which sampled states the period depends on params."""
+        return tuple(callable(sampled(self.system)[name].every) for name in self.sampled_names)
+
+    def periods(self, params: PyTree) -> list[Float[Array, ""]]:
+        """Those of the sampled states."""
+        return [period(self.system, name, params) for name in self.sampled_names]
+
+    @property
+    def controlled(self) -> int:
+        """How many of the first entries of y set the steps by their error."""
+        return 2 * self.size + self.states.size
 
     def parts(self, y) -> Parts:
         """y, taken apart."""
-        sizes = [self.size, self.size, len(self.works), self.rows, self.elements, min(self.elements, 1)]
+        beside = self.states.size, self.sampled.size, len(self.works)
+        sizes = [self.size, self.size, *beside, self.rows, self.elements, min(self.elements, 1)]
         return Parts(*jnp.split(y, np.cumsum(sizes)))
 
     @property
@@ -164,15 +142,26 @@ class EquationsOfMotion:
             return chosen or Projection()
         return chosen if self.system.constraints else None
 
-    def start(self, t, q, v, params) -> Start:
-        """y at the start, on the constraints already."""
-        flat, _, elements = self.mode(t, q, v, jnp.zeros(self.rows, q.dtype), Arguments(params))
-        works = jnp.zeros(len(self.works), q.dtype)
+    def start(self, at: StatesAt, params) -> Start:
+        """y at the start, on the constraints already: the sampled states are updated there."""
+        _, t, q, v = at
+        args, zeros = Arguments(params), lambda size: jnp.zeros(size, q.dtype)
+        z, u = (ravelled({name: at.values[name] for name in of.shapes}, q.dtype) for of in (self.states, self.sampled))
+        of_friction = map(zeros, (self.elements, min(self.elements, 1), self.elements))
+        parts = Parts(q, v, z, u, zeros(len(self.works)), zeros(self.rows) + 1, *of_friction)  # with slip, for the time being
+        if self.sampled.size:
+            y = self.updated(t, parts.y, args, [True] * len(self.sampled_names))
+            parts = self.parts(self.projected(t, y, args) if self.projection else y)
+        flat, _, elements = self.mode(t, parts, args)
         if elements is None:
-            return Start(jnp.concatenate([q, v, works]), jnp.array(True), jnp.array(True))
-        mode = first_mode(flat, elements, t, q, v)
-        y = jnp.concatenate([q, v, works, mode.sigma, mode.held.astype(q.dtype), jnp.zeros(1 + self.elements, q.dtype)])
-        return Start(self.projected(t, y, Arguments(params)), mode.consistent, ~jnp.any(mode.bound < 0))
+            return Start(parts.y, jnp.array(True), jnp.array(True))
+        mode = first_mode(flat, elements, t, parts.q, parts.v)
+        parts = parts._replace(sigma=mode.sigma, held=mode.held.astype(q.dtype))
+        return Start(self.projected(t, parts.y, args), mode.consistent, ~jnp.any(mode.bound < 0))
+
+    def updated(self, t, y, args: Arguments, due: Sequence[Bool[Array, ""] | bool]) -> Float[Array, " y"]:
+        """y after an update of the sampled states that are `due`, each of which sees the values before."""
+        return _updated(self, t, y, args, tuple(due))
 
     def acceleration(self, mode: Flat, t, q, v) -> SaddlePoint:
         """q̈ and λ of the system in its mode."""
@@ -206,8 +195,10 @@ class EquationsOfMotion:
     def sample(self, t, y, params, tolerances) -> tuple[Sample, Evidence]:
         """One sample, from y on the constraints."""
         rtol, atol = tolerances
-        q, v, works, sigma, held, transitions, time_stuck = self.parts(y)
-        flat, mode, elements = self.mode(t, q, v, sigma, Arguments(params))
+        parts = self.parts(y)
+        q, v, _, _, works, sigma, held, transitions, time_stuck = parts
+        flat, mode, elements = self.mode(t, parts, Arguments(params))
+        states = self.states_of(t, parts).values
         friction_states, counts, violation = {}, {}, Violation(jnp.zeros(0), jnp.zeros(0))
         if elements is None:
             qddot, multipliers, sound = self.acceleration(mode, t, q, v)
@@ -222,30 +213,42 @@ class EquationsOfMotion:
             counts = {"transitions": transitions[0], "time_stuck": time_stuck}
         named = dict(zip(self.works, works, strict=True)) if self.works else None
         unraveled = flat.unravel(q), flat.unravel(v), flat.unravel(qddot), flat.unravel_multipliers(multipliers)
-        return Sample(*unraveled, named, friction_states, counts), Evidence(sound, jax.lax.stop_gradient(violation))
+        return Sample(*unraveled, dict(states), named, friction_states, counts), Evidence(sound, jax.lax.stop_gradient(violation))
 
 
 def _values(flat: Flat, t, q, v):
     """What all functions of a system return."""
     multipliers = jnp.zeros(flat.rows, v.dtype)
     given = [D(t, q, v, multipliers) for D in (*flat.dissipations.values(), *flat.forces.values())]
-    return flat.lagrangian(t, q, v), flat.holonomic(t, q), flat.nonholonomic(t, q, v), given
+    of_states = flat.state_rates(t, q, v), flat.updates(t, q, v)
+    return flat.lagrangian(t, q, v), flat.holonomic(t, q), flat.nonholonomic(t, q, v), given, of_states
 
 
 @jitted  # so that diffrax's many calls trace it once
 def _rates(equations: EquationsOfMotion, t, y, args):
-    q, v, works, sigma, held, transitions, time_stuck = equations.parts(y)
-    _, mode, elements = equations.mode(t, q, v, sigma, args)
-    qddot = equations.acceleration(mode, t, q, v).x
+    parts = equations.parts(y)
+    q, v, _, u, works, sigma, held, transitions, time_stuck = parts
+    flat, mode, elements = equations.mode(t, parts, args)
+    qddot, rates = equations.acceleration(mode, t, q, v).x, ravelled(flat.state_rates(t, q, v), y.dtype)
     powers = listed_powers(mode, t, q, v) if equations.works else works
     stuck = time_stuck if elements is None else jnp.maximum(sticking(elements, sigma).astype(y.dtype), held)
-    return jnp.concatenate([v, qddot, powers, 0 * sigma, 0 * held, 0 * transitions, stuck])
+    return Parts(v, qddot, rates, 0 * u, powers, 0 * sigma, 0 * held, 0 * transitions, stuck).y
+
+
+@jitted
+def _updated(equations: EquationsOfMotion, t, y, args, due):
+    parts = equations.parts(y)
+    flat = equations.flat_at(args.params, equations.states_of(t, parts))
+    new, old = flat.updates(t, parts.q, parts.v), equations.sampled.unravelled(parts.u)
+    changed = {name: jax.tree.map(functools.partial(jnp.where, on), new[name], old[name]) for name, on in zip(old, due, strict=True)}
+    return parts._replace(u=ravelled(changed, y.dtype)).y
 
 
 @jitted
 def _margins(equations: EquationsOfMotion, t, y, args):
-    q, v, _, sigma, held, *_ = equations.parts(y)
-    flat, _, elements = equations.mode(t, q, v, sigma, args)
+    parts = equations.parts(y)
+    q, v, sigma, held = parts.q, parts.v, parts.sigma, parts.held
+    flat, _, elements = equations.mode(t, parts, args)
     assert elements is not None  # asked of systems with dry friction alone
     found = friction(flat, elements, sigma, t, q, v)
     return jnp.concatenate([jnp.where(held > 0, 1, found.margin), found.bound])
@@ -253,29 +256,30 @@ def _margins(equations: EquationsOfMotion, t, y, args):
 
 @jitted
 def _changed(equations: EquationsOfMotion, t, y, args, ended):
-    q, v, _, sigma, held, *_ = equations.parts(y)
-    flat, _, elements = equations.mode(t, q, v, sigma, args)
+    parts = equations.parts(y)
+    q, v, sigma, held = parts.q, parts.v, parts.sigma, parts.held
+    flat, _, elements = equations.mode(t, parts, args)
     assert elements is not None
     stuck = sticking(elements, sigma) | (held > 0)
     slow = elements.norms(elements.slip(t, q, v)) <= slip_of(elements, t, q, v, args.scales.error(v))
     mode = select_mode(flat, elements, t, q, v, sigma, stuck | ended | slow, ended & stuck)
-    y = in_other_mode(equations, elements, y, mode)
+    y = in_other_mode(elements, parts, mode).y
     return equations.projected(t, y, args), mode.consistent, jnp.all(~ended | stuck | slow)
 
 
-def in_other_mode(equations: EquationsOfMotion, elements: FrictionElements, y, mode: Mode):
-    """y with another mode, and its transitions counted: what begins or ceases to slip, or slips another way, where there is friction."""
-    q, v, works, sigma, held, transitions, time_stuck = equations.parts(y)
-    of = elements.element_of_row
+def in_other_mode(elements: FrictionElements, parts: Parts, mode: Mode) -> Parts:
+    """y in another mode, and its transitions counted: what begins or ceases to slip, or slips another way, where there is friction."""
+    of, sigma, held = elements.element_of_row, parts.sigma, parts.held
     before, after = jnp.where((held > 0)[of], 0, sigma), jnp.where(mode.held[of], 0, mode.sigma)
     changes = jnp.sum((elements.norms(after - before) > 0.5) & (mode.bound != 0))
-    return jnp.concatenate([q, v, works, mode.sigma, mode.held.astype(y.dtype), transitions + changes, time_stuck])
+    return parts._replace(sigma=mode.sigma, held=mode.held.astype(held.dtype), transitions=parts.transitions + changes)
 
 
 @jitted
 def _projected(equations: EquationsOfMotion, t, y, args):
-    q, v, works, sigma, held, *counts = equations.parts(y)
-    _, mode, elements = equations.mode(t, q, v, sigma, args)
+    parts = equations.parts(y)
+    q, v, works, sigma = parts.q, parts.v, parts.works, parts.sigma
+    _, mode, elements = equations.mode(t, parts, args)
     assert equations.projection is not None  # asked where there is something to keep
     projection = equations.projection
     on_q, on_v = projection.project(mode, t, q, v)
@@ -283,8 +287,8 @@ def _projected(equations: EquationsOfMotion, t, y, args):
         lift = energy_exchange(mode, t, on_q, on_v)[0] - energy_exchange(mode, t, q, v)[0]
         works = works.at[equations.works.index(PROJECTION)].add(lift)
     if elements is not None:
-        sigma = jax.lax.stop_gradient(redirected(elements, sigma, held > 0, t, on_q, on_v))
-    return jnp.concatenate([on_q, on_v, works, sigma, held, *counts])
+        sigma = jax.lax.stop_gradient(redirected(elements, sigma, parts.held > 0, t, on_q, on_v))
+    return parts._replace(q=on_q, v=on_v, works=works, sigma=sigma).y
 
 
 def root_mean_square(x) -> Array:

@@ -7,9 +7,10 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, PyTree
 
 from .._mechanics.projection import off_constraints
-from .first_order import EquationsOfMotion, Evidence, Sample
+from .first_order import EquationsOfMotion
 from .protocol import Arguments
 from .results import RESULTS
+from .state_vector import Evidence, Sample
 
 
 def verified(
@@ -62,9 +63,9 @@ def _guarantees(
 
 
 def _off(equations, t, y, params):
-    q, v, _, sigma, *_ = equations.parts(y)
-    _, mode, _ = equations.mode(t, q, v, sigma, Arguments(params))
-    return off_constraints(mode, t, q, v)
+    parts = equations.parts(y)
+    _, mode, _ = equations.mode(t, parts, Arguments(params))
+    return off_constraints(mode, t, parts.q, parts.v)
 
 
 def _residual_bound(tolerances):

@@ -15,6 +15,7 @@ from jaxtyping import Array, Bool, PyTree
 
 from .._mechanics.projection import Baumgarte, NoStabilisation, Projection, nearest_state
 from .._mechanics.stick_slip import Regularised, StickSlip
+from .._model.flat import StatesAt
 from .._model.numbers import count, number
 from .._model.signal import broken_signals, moves_smoothly
 from .._program.single_kernel import in_one_kernel
@@ -95,12 +96,14 @@ class Initial(NamedTuple):
     conditions: tuple[tuple[Bool[Array, ""], Any], ...]
 
 
-def initialised(equations: EquationsOfMotion, t0, q, v, params) -> Initial:
+def initialised(equations: EquationsOfMotion, at: StatesAt, params) -> Initial:
     """The start, put on the constraints."""
-    nearest = nearest_state(equations.flat_at(t0, params), t0, q, v)
-    start = equations.start(t0, nearest.q, nearest.v, params)
+    _, t0, q, v = at
+    nearest = nearest_state(equations.flat_at(params, at), t0, q, v)
+    start = equations.start(at._replace(q=nearest.q, v=nearest.v), params)
     moved = jax.lax.stop_gradient(jnp.max(jnp.abs(jnp.concatenate([nearest.q - q, nearest.v - v]))))
     conditions = (
+        *((period > 0, RESULTS.no_period) for period in equations.periods(params)),
         (start.has_mode, RESULTS.no_friction),
         (start.has_bounds, RESULTS.negative_bound),
         (nearest.reached, RESULTS.impossible_start),
@@ -128,7 +131,7 @@ def states_at(
     """States at the samples, by diffrax, the reason it stopped, and, among the counts, the `last` time and state that it reached."""
     if has_nodes(equations, args.params):
         reverse = not isinstance(adjoint, dfx.ForwardMode)
-        return on_nodes(equations, options, y0, args.params, args.scales, ts, tolerances, reverse=reverse)
+        return on_nodes(equations, options, y0, (args.params, t0), args.scales, ts, tolerances, reverse=reverse)
     rtol, atol = tolerances
     rounding = jnp.finfo(y0.dtype).eps * jnp.maximum(jnp.abs(ts[0]), jnp.abs(ts[-1]))
     alone = in_one_kernel if isinstance(adjoint, dfx.ForwardMode) else lambda function: function
@@ -160,25 +163,27 @@ def _wrapped(options, equations, projected, adjoint):
     if isinstance(solver, ExplicitRungeKutta) and isinstance(adjoint, dfx.ForwardMode):
         solver = dataclasses.replace(solver, reverse=False)
     if isinstance(equations, EquationsOfMotion) and equations.rows:
-        return StickSlipSolver(solver, projected, 2 * equations.size, equations)
+        return StickSlipSolver(solver, projected, equations.controlled, equations)
     if projected is not None or options.formulation.works:
-        return ProjectedSolver(solver, projected, 2 * equations.size)
+        return ProjectedSolver(solver, projected, equations.controlled)
     return solver
 
 
 def has_nodes(equations: FirstOrderSystem, params: PyTree) -> bool:
-    """Whether steps end where an input jumps or bends."""
-    return isinstance(equations, EquationsOfMotion) and bool(broken_signals(params))
+    """Whether steps end where an input jumps or bends, or a state is updated."""
+    return isinstance(equations, EquationsOfMotion) and bool(equations.sampled.size or broken_signals(params))
 
 
 def on_nodes(
-    equations: FirstOrderSystem, options: SolverOptions, y0, params, scales, ts, tolerances, *, directions=(), reverse=False
+    equations: FirstOrderSystem, options: SolverOptions, y0, varied, scales, ts, tolerances, *, directions=(), reverse=False
 ) -> tuple[Array, RESULTS, dict]:
-    """States at the samples, from node to node, as `states_at`; with the variations along directions of params, for each order."""
+    """States at the samples, from node to node, as `states_at`; `varied` are params and t0, along whose directions of each order there
+    are variations.
+    """
     adjoint = dfx.RecursiveCheckpointAdjoint() if reverse else dfx.ForwardMode()
     solver = _wrapped(options, equations, equations.projected if equations.projection else None, adjoint)
     meter = Meter() if options.progress else dfx.NoProgressMeter()
-    numbers = y0, params, scales, ts, tolerances
+    numbers = y0, varied, scales, ts, tolerances
     ys, (result, stats) = integrated(equations, solver, options.max_steps, meter, *numbers, directions, reverse=reverse)
     return ys, from_diffrax(result), stats
 

@@ -88,12 +88,12 @@ class Inputs:
         return [record.interpolation.jumps for record in self.records]
 
     def times(self, following: tuple[Int[Array, ""], ...], t) -> list[Float[Array, ""]]:
-        """When the next sample of each comes."""
-        return [record.time(i, t) for record, i in zip(self.records, following, strict=True)]
+        """When the next sample of each comes; what follows in `following` are no signals."""
+        return [record.time(i, t) for record, i in zip(self.records, following, strict=False)]
 
     def pieces(self, following: tuple[Int[Array, ""], ...]) -> PyTree:
         """Params with the inputs as they are up to the next sample of each."""
-        between = iter([record.piece(k, i) for k, (record, i) in enumerate(zip(self.records, following, strict=True))])
+        between = iter([record.piece(k, i) for k, (record, i) in enumerate(zip(self.records, following, strict=False))])
         return _replaced(self.params, self.elsewhere, lambda k, node: next(between), lambda: next(between))
 
 

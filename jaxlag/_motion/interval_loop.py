@@ -1,4 +1,4 @@
-"""Integration from node to node: a node is a sample of the motion, or a time at which a measured input jumps or bends.
+"""Integration from node to node: a node is a sample of the motion, or a time at which an input jumps or bends or a state is updated.
 
 A step ends at each node, so that between two of them an input is a constant or a line, which need not be looked up. The steps, their
 control and their stages are diffrax's and the solver's; the loop around them, short as it is, runs in one kernel on a CPU. Variations
@@ -18,6 +18,7 @@ from equinox.internal import while_loop
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from .._model.signal import broken_signals
+from .._model.states import flow
 from .._program.whole_kernel import in_whole_kernel
 from .interval_inputs import Inputs, Recorded, Rows, packed
 from .jumps import after_jump
@@ -43,7 +44,7 @@ class Steps(NamedTuple):
     solver_state: PyTree
     controller_state: PyTree
     has_jumped: Bool[Array, ""]
-    following: tuple[Int[Array, ""], ...]  # of each signal, its first sample after t
+    following: tuple[Int[Array, ""], ...]  # of each signal its first sample after t, of each sampled state its next update
     sample: Int[Array, ""]  # the next one
     result: dfx.RESULTS
     accepted: Int[Array, ""]
@@ -53,10 +54,10 @@ class Steps(NamedTuple):
 class Numbers(NamedTuple):
     """The numbers that the loop reads at each turn."""
 
-    params: PyTree
+    varied: tuple[PyTree, Array]  # params, and the time at which the motion begins
     scales: Any
     tolerances: tuple[Array, Array]
-    directions: tuple
+    directions: tuple  # of these two, for each order
 
 
 class IntervalLoop(NamedTuple):
@@ -68,6 +69,7 @@ class IntervalLoop(NamedTuple):
     meter: dfx.AbstractProgressMeter
     ts: Rows
     inputs: Callable[[PyTree], Inputs]
+    moving: tuple[bool, ...]  # which jumps move with what is varied
 
     def sample_time(self, sample: Int[Array, ""]) -> Float[Array, ""]:
         """Of a sample of the motion, or of the last."""
@@ -85,9 +87,9 @@ class IntervalLoop(NamedTuple):
         def turn(carry):
             moving, steps, saved, meter = carry
             sample = steps.sample
-            moving, (steps, is_sample) = stepping._varied(controller, rounding, steps, numbers)(moving)
+            (moving, shown), (steps, is_sample) = stepping._varied(controller, rounding, steps, numbers)(moving)
             meter = self.meter.step(meter, (now(moving) - first) / (last - first))
-            return moving, steps, write(saved, sample, moving.y, is_sample), meter
+            return moving, steps, write(saved, sample, shown, is_sample), meter
 
         def going_on(carry):
             moving, steps, *_ = carry
@@ -103,52 +105,73 @@ class IntervalLoop(NamedTuple):
     def _start(self, controller, first, last, y0, following, numbers: Numbers) -> tuple[Moving, Steps]:
         """The first step is planned as diffrax plans it."""
         term, y = dfx.ODETerm(self.equations.rates), _alone(y0, numbers)
-        args = Arguments(self.inputs(numbers.params).pieces(following), numbers.scales)
+        params, origin = numbers.varied
+        args = Arguments(self.inputs(params).pieces(following), numbers.scales)
         t1, controller_state = controller.init(term, first, last, y, None, args, self.solver.func, self.solver.error_order(term))
         state, is_new = _initial_state(self.solver, term, first, t1, y, args)
         changing, rest = eqx.partition(state, eqx.is_inexact_array)
         unvaried = lambda x: functools.reduce(_with_zeros, y0.shape[y.ndim :], x)
-        moving = Moving(unvaried(first), y0, jax.tree.map(unvaried, changing))
+        moving = Moving(unvaried(origin), y0, jax.tree.map(unvaried, changing))  # y0 is that at a fixed time, where there are directions
         zero = jnp.array(0)
         return moving, Steps(t1 - first, rest, controller_state, is_new, following, zero + 1, dfx.RESULTS.successful, zero, zero)
 
     def _varied(self, controller, rounding, steps: Steps, numbers: Numbers) -> Callable:
-        """A step of what moves, with its variations along the directions of params, for each order."""
+        """A step of what moves and its value at a sample, with their variations along the directions of what is varied, for each order."""
 
         def of_order(function, directions):
-            def varied(moving, params):
+            def varied(moving, given):
                 alone, change = (jax.tree.map(lambda x, part=part: x[part], moving) for part in ((..., 0), (..., slice(1, None))))
-                (value, change), aux = derived(lambda both: function(*both), (change, directions))((alone, params))
+                (value, change), aux = derived(lambda both: function(*both), (change, directions))((alone, given))
                 return jax.tree.map(with_variations, value, change), aux
 
             return varied
 
-        function = lambda moving, params: self._step(controller, rounding, moving, params, steps, numbers.scales)
+        function = lambda moving, given: self._step(controller, rounding, moving, given, steps, numbers.scales)
         for directions in numbers.directions:
             function = of_order(function, directions)
-        return lambda moving: function(moving, numbers.params)
+        return lambda moving: function(moving, numbers.varied)
 
-    def _step(self, controller, rounding, moving: Moving, params, steps: Steps, scales) -> tuple[Moving, tuple[Steps, Any]]:
-        """One step, tried: up to the next node at most, and behind the jump there where it is one."""
-        inputs, sample, t = self.inputs(params), self.sample_time(steps.sample), moving.t
-        coming = inputs.times(steps.following, t)
-        node, end = functools.reduce(jnp.minimum, coming, sample), t + steps.length
+    def _step(self, controller, rounding, moving: Moving, given, steps: Steps, scales) -> tuple[tuple[Moving, Array], tuple[Steps, Any]]:
+        """One step, tried: up to the next node at most, and behind the jumps there; with y at a sample that it may end at."""
+        (params, origin), sample, t = given, self.sample_time(steps.sample), moving.t
+        inputs, periods = self.inputs(params), self.equations.periods(params)
+        signals = len(inputs.records)
+        ticks = [(origin + i * period).astype(t.dtype) for i, period in zip(steps.following[signals:], periods, strict=True)]
+        ticks = [jnp.where(tick > t, tick, jnp.inf) for tick in ticks]  # a period that is not positive has none
+        coming = [*inputs.times(steps.following, t), *ticks]
+        node, end = functools.reduce(lambda first, time: jnp.where(time + rounding < first, time, first), coming, sample), t + steps.length
         t1 = jnp.where(end + rounding >= node, node, end)
         args = Arguments(inputs.pieces(steps.following), scales)
         state = eqx.combine(moving.solver_state, steps.solver_state)
         keep, y, state, planned, control, result = self._tried(controller, t, t1, moving.y, args, state, steps)
 
-        passed = [keep & (t1 == node) & (time == node) for time in coming]
+        t = jnp.where(keep, t1, t)
+        passed = [keep & (t1 == node) & (time <= node + rounding) for time in coming]
         following = tuple(i + by for i, by in zip(steps.following, passed, strict=True))
-        jumps = functools.reduce(jnp.logical_or, (by for by, jumps in zip(passed, inputs.jump, strict=True) if jumps), jnp.array(False))
-        behind = lambda y: after_jump(self.equations, t1, y, args, Arguments(inputs.pieces(following), scales))
+        is_sample = keep & (t1 == node) & (sample <= node + rounding)
+        for time, by, moves in zip(coming, passed, self.moving, strict=True):
+            if moves:  # two nodes at one time are so for these numbers alone
+                y = jnp.where(by, self._moved(time, t, y, args), y)
+                t = jnp.where(by, time, t)
+        jump = [*inputs.jump, *[True] * len(ticks)]
+        jumps = functools.reduce(jnp.logical_or, (by for by, jumps in zip(passed, jump, strict=True) if jumps), jnp.array(False))
+        after = Arguments(inputs.pieces(following), scales)
+
+        def behind(y):
+            updated = self.equations.updated(t, y, after, passed[signals:]) if ticks else y
+            return after_jump(self.equations, t, y, updated, args, after)
+
         y, consistent = jax.lax.cond(jumps, behind, lambda y: (y, jnp.array(True)), y)
         result = dfx.RESULTS.where(consistent, result, under_diffrax(RESULTS.no_friction))
-        is_sample = keep & (t1 == node) & (sample == node)
+        shown = self._moved(sample, t, y, after) if any(self.moving) else y
         changing, rest = eqx.partition(state, eqx.is_inexact_array)
         counts = steps.sample + is_sample, result, steps.accepted + keep, steps.rejected + ~keep
-        after = Steps(planned, rest, control, jumps | (steps.has_jumped & ~keep), following, *counts)
-        return Moving(jnp.where(keep, t1, t), y, changing), jax.lax.stop_gradient((after, is_sample))
+        steps = Steps(planned, rest, control, jumps | (steps.has_jumped & ~keep), following, *counts)
+        return (Moving(t, y, changing), shown), jax.lax.stop_gradient((steps, is_sample))
+
+    def _moved(self, time, t, y, args):
+        """y at a time that equals t, but moves otherwise with what is varied."""
+        return flow(time, t, (y, self.equations.rates(t, y, args)))
 
     def _tried(self, controller, t0, t1, y0, args, state, steps: Steps):
         """A step of the solver, and whether it is kept."""
@@ -194,22 +217,27 @@ def _initial_state(solver, term, t0, t1, y0, args):
     return jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), jax.eval_shape(make)), jnp.array(True)
 
 
-def integrated(equations, solver, max_steps, meter, y0, params, scales, ts, tolerances, directions=(), *, reverse=False):
+def integrated(equations, solver, max_steps, meter, y0, varied, scales, ts, tolerances, directions=(), *, reverse=False):
     """States at the samples; and, not differentiated, the reason it ended, counts, and the `last` time and state.
 
-    With `directions` of params, one tree for each order, the states and y0 have their variations as last axes. `reverse`: whether reverse
-    mode goes through the loop.
+    `varied` are params and the time of the start. With `directions` of these, for each order, the states and y0 have their variations as
+    last axes. `reverse`: whether reverse mode goes through the loop.
     """
+    params, origin = varied
     start = jax.lax.stop_gradient(ts[0])
     following = tuple(jnp.searchsorted(s.times.astype(ts.dtype), start, side="right").astype(int) for s in broken_signals(params))
-    recorded = Recorded.of(equations.elsewhere, params, directions)
+    following = (*following, *[jnp.array(1)] * len(equations.periods(params)))  # the first updates are in y0
+    moving = _moving(equations, params, directions, reverse)
+    recorded = Recorded.of(equations.elsewhere, params, tuple(of_params for of_params, _ in directions))
+    along = tuple(zip(recorded.directions, (of_origin for _, of_origin in directions), strict=True))
     large = [ts, *(array for signal in recorded.signals.values() for array in (signal.ts, signal.values))]
-    given, unpack, rows = packed((y0, following, Numbers(recorded.params, scales, tolerances, recorded.directions)), large)
+    numbers = Numbers((recorded.params, origin), scales, tolerances, along)
+    given, unpack, rows = packed((y0, following, numbers), large)
 
     def started(given):
         ts, *columns = rows(given)
         of = {k: (*columns[2 * i : 2 * i + 2], s.interpolation) for i, (k, s) in enumerate(recorded.signals.items())}
-        loop = IntervalLoop(equations, solver, max_steps, meter, ts, lambda params: Inputs(of, equations.elsewhere, params))
+        loop = IntervalLoop(equations, solver, max_steps, meter, ts, lambda params: Inputs(of, equations.elsewhere, params), moving)
         return functools.partial(loop.run, *unpack(given))
 
     unknown = jnp.full((ts.size - 1, *y0.shape), jnp.inf, y0.dtype)
@@ -231,6 +259,15 @@ def integrated(equations, solver, max_steps, meter, y0, params, scales, ts, tole
 
     found = in_whole_kernel(run)(given, jnp.concatenate([saved.ravel(), 0 * space]))
     return _results(found[: saved.size].reshape(saved.shape), unpack_end(found[saved.size :]), ts, max_steps)
+
+
+def _moving(equations, params, directions, reverse) -> tuple[bool, ...]:
+    """Which jumps, of signals and then of sampled states, move with what is varied."""
+    varied = [[jax.tree.leaves((s.ts, s.delay)) for s in broken_signals(of_params)] for of_params, _ in directions]
+    jumps = [signal.interpolation.jumps for signal in broken_signals(params)]
+    of_signals = [jumps[k] and (reverse or any(of_order[k] for of_order in varied)) for k in range(len(jumps))]
+    shifted = any(of_origin is not None for _, of_origin in directions)
+    return (*of_signals, *((reverse or shifted or (varies and bool(directions))) for varies in equations.varying_periods))
 
 
 def _end(moving: Moving, steps: Steps):

@@ -1,4 +1,4 @@
-"""The state behind a jump of an input."""
+"""The state behind a jump of an input or of a sampled state."""
 
 import jax.numpy as jnp
 
@@ -11,27 +11,30 @@ from .protocol import Arguments
 
 
 @jitted
-def after_jump(equations: EquationsOfMotion, t, y, before: Arguments, args: Arguments):
-    """y behind a jump of an input at t, from the arguments `before` it, and whether a friction mode is consistent with the forces there.
+def after_jump(equations: EquationsOfMotion, t, y0, y, before: Arguments, args: Arguments):
+    """y behind a jump of inputs or sampled states at t, and whether a friction mode is consistent with the forces there.
+
+    `y0` and `before` are y and the arguments before the jump; y differs from y0 in sampled states alone.
 
     A velocity constraint that jumps takes q̇ along by an impulse, which is the projection in the metric of M. Friction is bounded and
     has no part in it: where there is slip afterwards, it goes on; where there is none, it sticks or breaks away.
     """
-    q, v, works, sigma, *counts = equations.parts(y)
-    flat, _, elements = equations.mode(t, q, v, sigma, args)
+    parts = equations.parts(y)
+    flat, _, elements = equations.mode(t, parts, args)
     if equations.works:
-        lift = energy_exchange(flat, t, q, v)[0] - energy_exchange(equations.flat(before.params), t, q, v)[0]
-        works = works.at[equations.works.index(EXPLICIT_TIME)].add(lift)
-    slipping = jnp.concatenate([q, v, works, jnp.ones_like(sigma), *counts])
-    y = slipping if equations.projection is None else equations.projected(t, slipping, args)
+        earlier = equations.flat(before.params, equations.states_of(t, equations.parts(y0)))
+        lift = energy_exchange(flat, t, parts.q, parts.v)[0] - energy_exchange(earlier, t, parts.q, parts.v)[0]
+        parts = parts._replace(works=parts.works.at[equations.works.index(EXPLICIT_TIME)].add(lift))
+    slipping = parts._replace(sigma=jnp.ones_like(parts.sigma))
+    moved = slipping if equations.projection is None else equations.parts(equations.projected(t, slipping.y, args))
     if elements is None:
-        return y, jnp.array(True)
+        return moved.y, jnp.array(True)
     assert args.scales is not None  # friction is located
-    q, v, works, *_ = equations.parts(y)
+    q, v = moved.q, moved.v
     slip = elements.slip(t, q, v)
     size = elements.norms(slip)
     direction = slip / jnp.where(size > 0, size, 1)[elements.element_of_row]
     at_rest = size <= slip_of(elements, t, q, v, args.scales.error(v))
     mode = select_mode(flat, elements, t, q, v, direction, at_rest, jnp.zeros_like(at_rest))
-    y = in_other_mode(equations, elements, jnp.concatenate([q, v, works, sigma, *counts]), mode)
+    y = in_other_mode(elements, moved._replace(sigma=parts.sigma), mode).y
     return equations.projected(t, y, args), mode.consistent

@@ -82,6 +82,7 @@ def _motion(about, arrays):
         qdot=rate("qdot"),
         qddot=rate("qddot"),
         multipliers=tree("multipliers"),
+        states=tree("states") if "states" in about["outlines"] else {},
         result=result_of(arrays["result"]),
         stats=part("stats"),
         works=part("works") if about["audit"] else None,

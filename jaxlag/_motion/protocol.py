@@ -62,8 +62,8 @@ class FirstOrderSystem(Protocol):
         """How many slip velocities stick and slip; 0 where the right-hand side is smooth."""
 
     @property
-    def size(self) -> int:
-        """n, the number of coordinates. The first 2n entries of y are positions and velocities: their error sets the steps."""
+    def controlled(self) -> int:
+        """How many of the first entries of y set the steps by their error: positions, velocities, states of first order."""
 
     @property
     def projection(self) -> Projection | None:
@@ -87,9 +87,9 @@ class AugmentedSystem(abc.ABC):
     rows = 0
 
     @property
-    def size(self) -> int:
-        """n, the number of coordinates."""
-        return self.equations.size
+    def controlled(self) -> int:
+        """As many of the first entries as of the equations alone."""
+        return self.equations.controlled
 
     @property
     def projection(self) -> Projection | None:

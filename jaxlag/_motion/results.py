@@ -18,6 +18,7 @@ class RESULTS(dfx.RESULTS):  # pyright: ignore
 
     not_finite = "`q0`, `qdot0`, `ts` and `params` must be finite, but there is a NaN or an infinity among them. Look for missing values."
     unordered = "`ts` must increase, but a time is smaller than the one before it. Sort the times, and what was measured along with them."
+    no_period = "`every` must be positive, but the period of a sampled state is not. Look at what it is computed from."
     no_inertia = NO_INERTIA
     impossible_start = IMPOSSIBLE
     not_affine = NOT_AFFINE
@@ -71,6 +72,7 @@ def numbered(number: Any) -> dfx.RESULTS:
 OF_THE_INPUT = (
     RESULTS.not_finite,
     RESULTS.unordered,
+    RESULTS.no_period,
     RESULTS.no_inertia,
     RESULTS.impossible_start,
     RESULTS.not_affine,

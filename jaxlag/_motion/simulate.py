@@ -10,6 +10,7 @@ from jaxtyping import Array, PyTree
 from .._mechanics.projection import Baumgarte, NoStabilisation, Projection
 from .._mechanics.stick_slip import Regularised, StickSlip
 from .._model.deprecation import renamed
+from .._model.state_values import given_states
 from .._model.system import System
 from .._model.validation import parameters, sample_times, state
 from .._program.jit import compiled, is_concrete
@@ -30,6 +31,7 @@ def simulate(
     ts: Any,
     params: PyTree = None,
     *,
+    states: PyTree = None,
     solver: dfx.AbstractSolver | None = None,
     rtol: float | Array | None = None,
     atol: float | Array | None = None,
@@ -55,6 +57,7 @@ def simulate(
     - `q0`, `qdot0`: the state at ts[0]; pytrees of one structure, of numbers or arrays of any shape. Any consistent units.
     - `ts`: sample times, shape (T,), increasing, at least two.
     - `params`: what the functions of the system name, any pytree; measured inputs among them are `Signal`s.
+    - `states`: values at the start of states of the system, by name, in place of those that `State` and `Sampled` give.
     - `solver`: any explicit or diagonally implicit Runge–Kutta solver of diffrax. Default `jaxlag.Dop853()`; for forces
       that are not smooth `jaxlag.Dopri5()`, for stiff systems `diffrax.Kvaerno5()`.
     - `rtol`, `atol`: tolerances of the step size control. Defaults 1e-8 and 1e-10 in double, 1e-4 and 1e-6 in single precision.
@@ -89,7 +92,8 @@ def simulate(
     ts, tolerances = sample_times(ts, dtype), tolerances_of(rtol, atol, dtype)
     given, length = parameters(params, q0), ts.size
     ts, params = padded_times(ts), padded_signals(given)
-    inputs, solution_map = Inputs(None, q0, qdot0, params, tolerances), SolutionMap(system, options)
+    inputs = Inputs(None, q0, qdot0, params, tolerances, given_states(system, states, q0))
+    solution_map = SolutionMap(system, options)
     with compiling("the motion", progress):
         if adjoint is not None or is_concrete(inputs, ts):
             trajectory = _trajectory(solution_map, inputs, ts)
@@ -101,7 +105,7 @@ def simulate(
     if params is not given:
         trajectory = with_params(trajectory, given)
     if throw:
-        raise_failure(trajectory, (q0, qdot0))
+        raise_failure(trajectory, (q0, qdot0, inputs.states))
     return trajectory
 
 

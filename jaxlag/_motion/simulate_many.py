@@ -16,10 +16,12 @@ from jaxtyping import Array, PyTree
 from .._mechanics.projection import Baumgarte, NoStabilisation, Projection
 from .._mechanics.stick_slip import Regularised, StickSlip
 from .._model.deprecation import renamed
+from .._model.flat import StatesAt
 from .._model.paths import is_within, leaf_names
 from .._model.signal import is_signal, jump_times, with_second_derivatives
+from .._model.state_values import start_values
 from .._model.system import System
-from .._model.validation import checked, coordinates, parameters, sample_times, state
+from .._model.validation import check, coordinates, parameters, sample_times, state
 from .._program.jit import jitted
 from .batch import BatchedEquations
 from .derivative_rule import differentiable_batch
@@ -133,8 +135,9 @@ def _differing(everything, over):
 def _simulate_many(system, options, common_steps, own, shared, ts, tolerances):
     first = eqx.combine(jax.tree.map(lambda leaf: leaf[0], own), shared)
     q0, qdot0 = state(first["q0"], first["qdot0"], ("q0", "qdot0"))
-    _, t0, q, v = checked(system, ts[0], q0, qdot0, first["params"])
-    equations = EquationsOfMotion.of(system, q0, options.formulation, first["params"], t0, q, v)
+    at = _at(system, ts[0], q0, qdot0, first["params"])
+    check(system, ts[0], q0, qdot0, first["params"], at.values)
+    equations = EquationsOfMotion.of(system, q0, options.formulation, first["params"], at)
     members, (numbers, rest) = jax.tree.leaves(own)[0].shape[0], eqx.partition(shared, eqx.is_array)
     if _share_steps(common_steps, equations, first["params"], own):
         batch = lambda own, *given: _in_batches(system, equations, options, own, eqx.combine(given[0], rest), *given[1:])
@@ -149,12 +152,18 @@ def _simulate_many(system, options, common_steps, own, shared, ts, tolerances):
     return jax.tree.map(lambda leaf: leaf[:members], batch(own, numbers, ts, tolerances))
 
 
+def _at(system, t, q0, qdot0, params):
+    """The start of one member."""
+    q, v = (ravel_pytree(tree)[0] for tree in (q0, qdot0))
+    return StatesAt(start_values(system, {}, t, q0, qdot0, params), t, q, v)
+
+
 def _share_steps(common_steps, equations, params, own):
     signals = [leaf for leaf in jax.tree.leaves(own, is_leaf=is_signal) if is_signal(leaf) and jax.tree.leaves(leaf)]
-    obstacle = equations.rows or signals or jump_times(params, float) is not None
+    obstacle = equations.rows or equations.sampled.size or signals or jump_times(params, float) is not None
     if common_steps and obstacle:
         raise ValueError(
-            "`common_steps` must be False where dry friction or a jumping input ends steps at times of its own, or where signals differ, "
+            "`common_steps` must be False where dry friction, a jumping input or an update ends steps at its own time, or signals differ, "
             "but is True. Leave it out."
         )
     return common_steps is not False and not obstacle
@@ -243,8 +252,7 @@ def _initialised(equations, inputs, ts):
 
     def start(own):
         member = eqx.combine(own, shared)
-        q, v = (ravel_pytree(member[name])[0] for name in ("q0", "qdot0"))
-        found = initialised(equations, t0, q, v, member["params"])
+        found = initialised(equations, _at(equations.system, t0, *(member[name] for name in ("q0", "qdot0", "params"))), member["params"])
         return found.y, (found.moved, with_status(found.y, RESULTS.successful, found.conditions, (member, ts))[1])
 
     y0, start = jax.vmap(start, in_axes=-1, out_axes=(-1, 0))(own)

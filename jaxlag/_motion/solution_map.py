@@ -11,14 +11,17 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, PyTree
 
+from .._model.flat import StatesAt
 from .._model.signal import with_second_derivatives
+from .._model.state_values import start_values
 from .._model.system import System
-from .._model.validation import checked
-from .first_order import EquationsOfMotion, Sample
+from .._model.validation import check
+from .first_order import EquationsOfMotion
 from .guarantees import verified
 from .integrate import SolverOptions, Variations, has_nodes, initialised, is_variational, on_nodes, states_at, with_status
 from .protocol import Arguments, Scales
 from .provenance import Provenance
+from .state_vector import Sample
 from .trajectory import FrictionState, Trajectory
 from .variational import derived, pushforward, split_varying
 
@@ -31,6 +34,7 @@ class Inputs(NamedTuple):
     qdot0: PyTree
     params: PyTree
     tolerances: tuple[Array, Array]
+    states: dict[str, PyTree]  # values at the start that differ from those of the system
 
 
 class Samples(NamedTuple):
@@ -65,24 +69,24 @@ class SolutionMap:
         return self._solve(inputs, ts, dfx.RecursiveCheckpointAdjoint())
 
     def _solve(self, inputs: Inputs, ts: Array, adjoint: dfx.AbstractAdjoint) -> tuple[Samples, Unchanging]:
-        equations, (t0, q, v) = self._equations(inputs, ts)
+        equations, at = self._equations(inputs, ts)
         params, tolerances = inputs.params, inputs.tolerances
         smooth = with_second_derivatives(params)
-        start, args = initialised(equations, t0, q, v, smooth), Arguments(smooth, Scales.of(tolerances, ts, smooth))
-        ys, result, stats = states_at(equations, self.options, adjoint, t0, start.y, ts, args, tolerances)
+        start, args = initialised(equations, at, smooth), Arguments(smooth, Scales.of(tolerances, ts, smooth))
+        ys, result, stats = states_at(equations, self.options, adjoint, at.t, start.y, ts, args, tolerances)
         ys, result = with_status(ys, result, start.conditions, (inputs, ts))
         return samples_at(equations, ts, ys, params, result, stats | {"start_moved": start.moved}, tolerances)
 
     def push(self, inputs: Inputs, directions: tuple[Inputs, ...], ts: Array) -> tuple[Any, Unchanging]:
         """The samples and their derivatives along directions, for each order; by the variational equations where they hold."""
-        equations, (t0, q, v) = self._equations(inputs, ts)
+        equations, at = self._equations(inputs, ts)
         varying = [split_varying(inputs, of_order)[0].params for of_order in directions]
         by_steps = has_nodes(equations, inputs.params) and self.options.adjoint is None
         if not by_steps and not is_variational(equations, self.options, varying, inputs.params):
             return pushforward(self.solve)(inputs, directions, ts)
 
         def initial(inputs):
-            start = initialised(equations, _first_time(inputs, ts), *_vectors(inputs), with_second_derivatives(inputs.params))
+            start = initialised(equations, self._at(inputs, ts), with_second_derivatives(inputs.params))
             return start.y, start
 
         arguments = lambda inputs: (_first_time(inputs, ts), Arguments(with_second_derivatives(inputs.params)))
@@ -92,11 +96,12 @@ class SolutionMap:
         y0, start = variations.initial(inputs)
         smooth, tolerances = with_second_derivatives(inputs.params), inputs.tolerances
         if by_steps:
-            numbers = smooth, Scales.of(tolerances, ts, smooth), ts, tolerances
-            found = on_nodes(equations, self.options, y0, *numbers, directions=tuple(of_order.params for of_order in directions))
+            numbers = (smooth, at.t), Scales.of(tolerances, ts, smooth), ts, tolerances
+            along = tuple((of_order.params, of_order.t0) for of_order in directions)
+            found = on_nodes(equations, self.options, y0, *numbers, directions=along)
             return self._samples_and_variations(equations, inputs, directions, ts, *found, start)
         args = Arguments(smooth, directions=variations.directions)
-        ys, result, stats = states_at(variations.equations, self.options, dfx.ForwardMode(), t0, y0, ts, args, tolerances)
+        ys, result, stats = states_at(variations.equations, self.options, dfx.ForwardMode(), at.t, y0, ts, args, tolerances)
         last_t, last_y = stats["last"]
         stats = stats | {"last": (last_t, last_y[(..., *[0] * len(directions))])}
         return self._samples_and_variations(equations, inputs, directions, ts, ys, result, stats, start)
@@ -142,17 +147,20 @@ class SolutionMap:
 
         return jax.vmap(of_one)(ts, samples.ys)
 
-    def _equations(self, inputs: Inputs, ts: Array) -> tuple[EquationsOfMotion, tuple[Array, Array, Array]]:
-        _, t0, q, v = checked(self.system, _first_time(inputs, ts), inputs.q0, inputs.qdot0, inputs.params)
-        return EquationsOfMotion.of(self.system, inputs.q0, self.options.formulation, inputs.params, t0, q, v), (t0, q, v)
+    def _equations(self, inputs: Inputs, ts: Array) -> tuple[EquationsOfMotion, StatesAt]:
+        at = self._at(inputs, ts)
+        check(self.system, at.t, inputs.q0, inputs.qdot0, inputs.params, at.values)
+        return EquationsOfMotion.of(self.system, inputs.q0, self.options.formulation, inputs.params, at), at
+
+    def _at(self, inputs: Inputs, ts: Array) -> StatesAt:
+        """The start as it is given."""
+        q, v = (ravel_pytree(tree)[0] for tree in (inputs.q0, inputs.qdot0))
+        t0, given = _first_time(inputs, ts), (inputs.q0, inputs.qdot0, inputs.params)
+        return StatesAt(start_values(self.system, inputs.states, t0, *given), t0, q, v)
 
 
 def _first_time(inputs: Inputs, ts: Array) -> Array:
     return ts[0] if inputs.t0 is None else inputs.t0
-
-
-def _vectors(inputs: Inputs) -> tuple[Array, Array]:
-    return ravel_pytree(inputs.q0)[0], ravel_pytree(inputs.qdot0)[0]
 
 
 def samples_at(equations: EquationsOfMotion, ts, ys, params, result, stats, tolerances) -> tuple[Samples, Unchanging]:
@@ -171,5 +179,5 @@ def trajectory_of(system: System, options: SolverOptions, params: PyTree, ts, sa
     shown: Sample = eqx.combine(samples.shown, unchanging.shown)
     friction = {name: FrictionState(*of_term) for name, of_term in shown.friction.items()}
     provenance = Provenance.of(system, params, options.formulation.friction)
-    state = shown.q, shown.qdot, shown.qddot, shown.multipliers
-    return Trajectory(ts, *state, unchanging.result, unchanging.stats | shown.counts, shown.works, friction, provenance)
+    state, counts = (shown.q, shown.qdot, shown.qddot, shown.multipliers), unchanging.stats | shown.counts
+    return Trajectory(ts, *state, unchanging.result, counts, shown.works, friction, provenance, shown.states)

@@ -21,7 +21,7 @@ from .wrapped_solver import ProjectedSolver
 # step up to there (the first makes the time right and its derivative, the others its higher derivatives), after the last of which the
 # mode changes; and the rest of the step, watched for a second end.
 WHOLE, NEWTON, CHANGE, REST = range(4)
-PHASES = np.array([WHOLE, NEWTON, NEWTON, CHANGE, REST])
+PHASES = np.array([WHOLE, NEWTON, NEWTON, CHANGE, REST], np.int32)
 SIMULTANEOUS = 1e3  # modes that end within this many roundings of time end together
 BARELY = 1e-6  # of the motion, the step that ends where a bound turns negative
 

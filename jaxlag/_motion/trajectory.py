@@ -16,7 +16,7 @@ from jaxtyping import Array, Bool, Float, PyTree
 from .._mechanics.friction_elements import find_elements
 from .._mechanics.power import energy_exchange
 from .._model.deprecation import warn_renamed
-from .._model.flat import bind
+from .._model.flat import StatesAt, bind
 from .._program.jit import compiled, is_concrete
 from .card import card
 from .export import arrays_of, frame_of, outline, write_arrays
@@ -33,13 +33,14 @@ class FrictionState(eqx.Module):
 
 
 class Instant(eqx.Module):
-    """A motion at one of its samples: the time `t`, and `q`, `qdot`, `qddot` and `multipliers` there, e.g. to continue from."""
+    """A motion at one of its samples: the time `t`, and `q`, `qdot`, `qddot`, `multipliers` and `states` there, e.g. to continue from."""
 
     t: Float[Array, ""]
     q: PyTree
     qdot: PyTree
     qddot: PyTree
     multipliers: dict[str, PyTree]
+    states: dict[str, PyTree]
 
 
 class Interpolated(eqx.Module):
@@ -68,7 +69,7 @@ class Trajectory(eqx.Module):
     motions again, which start at the first sample they keep: works count from there. Of many motions (`simulate_many`, `vmap`),
     `motions[3]` is one of them. `motion.at(ts)` is the motion between the samples.
 
-    - `ts`: the times; `q`, `qdot`, `qddot`: structured like q0; `multipliers`: λ by the constraint's name.
+    - `ts`: the times; `q`, `qdot`, `qddot`: structured like q0; `multipliers`: λ by the constraint's name; `states`: by name.
     - `result`: `RESULTS.successful`, or the reason of failure; samples that were not reached are NaN.
     - `friction`: by the name of the dissipation term, the `force` on its slip velocities and whether they are `sticking`.
     - `works`: what `work()` returns, where the motion was computed with `works=True`.
@@ -88,6 +89,7 @@ class Trajectory(eqx.Module):
     works: dict[str, Float[Array, "*members T"]] | None
     friction: dict[str, FrictionState]
     provenance: Provenance | Recorded
+    states: dict[str, PyTree] = dataclasses.field(default_factory=dict)
 
     @property
     def succeeded(self) -> Any:
@@ -143,7 +145,7 @@ class Trajectory(eqx.Module):
         if self.ts.ndim > 1:
             return chosen(self)
         if is_one:
-            return Instant(*chosen((self.ts, self.q, self.qdot, self.qddot, self.multipliers)))
+            return Instant(*chosen((self.ts, self.q, self.qdot, self.qddot, self.multipliers, self.states)))
         is_forward = isinstance(which, slice) and (which.step is None or which.step > 0)
         if not (is_forward or (holds(jnp.bool_) and np.shape(which) == self.ts.shape)):
             raise TypeError(
@@ -158,8 +160,8 @@ class Trajectory(eqx.Module):
         provenance = self.provenance
         if isinstance(provenance, Recorded):
             provenance = dataclasses.replace(provenance, energies=chosen(provenance.energies), slip=chosen(provenance.slip))
-        states = chosen((self.ts, self.q, self.qdot, self.qddot, self.multipliers))
-        return Trajectory(*states, self.result, counts, works, chosen(self.friction), provenance)
+        *motion, states = chosen((self.ts, self.q, self.qdot, self.qddot, self.multipliers, self.states))
+        return Trajectory(*motion, self.result, counts, works, chosen(self.friction), provenance, states)
 
     def at(self, ts: Any) -> Interpolated:
         r"""The motion at other times, one or an array of them, interpolated between the samples by their q, q̇ and q̈.
@@ -193,10 +195,10 @@ class Trajectory(eqx.Module):
         return Interpolated(ts, *map(shaped, _between(self, jnp.ravel(ts))))
 
     def to_dict(self) -> dict[str, np.ndarray]:
-        """All samples as NumPy arrays by flat names: "t", "q.x", "qdot.x", "qddot.x", "multipliers.rod", "friction.brake.force",
-        "friction.brake.sticking", "works.brake"; "q" where q is one array.
+        """All samples as NumPy arrays by flat names: "t", "q.x", "qdot.x", "qddot.x", "multipliers.rod", "states.z",
+        "friction.brake.force", "friction.brake.sticking", "works.brake"; "q" where q is one array.
         """
-        states = dict(q=self.q, qdot=self.qdot, qddot=self.qddot, multipliers=self.multipliers)
+        states = dict(q=self.q, qdot=self.qdot, qddot=self.qddot, multipliers=self.multipliers, states=self.states)
         return arrays_of(t=self.ts, **states, friction=self.friction, works=self.works)
 
     def to_dataframe(self, frame: Callable | None = None) -> Any:
@@ -227,7 +229,7 @@ class Trajectory(eqx.Module):
         numbers = jax.tree.map(lambda leaf: leaf if eqx.is_array(leaf) else None, recorded.params)
         energy = dict(zip(("h", "turned"), recorded.energies, strict=True))
         more = arrays_of(stats=self.stats, energy=energy, slip=recorded.slip, params=numbers)
-        trees = dict(q=self.q, multipliers=self.multipliers, params=numbers)
+        trees = dict(q=self.q, multipliers=self.multipliers, states=self.states, params=numbers)
         write_arrays(
             file,
             "Trajectory",
@@ -241,8 +243,13 @@ class Trajectory(eqx.Module):
     def _vectors(self):
         return [_ravelled(tree) for tree in (self.q, self.qdot)]
 
-    def _flat(self):
-        return bind(self.provenance.system, jax.tree.map(lambda leaf: leaf[0], self.q), self.provenance.params)
+    def _flat(self, at):
+        """The system over flat vectors, at (states, t, q, v)."""
+        return bind(self.provenance.system, jax.tree.map(lambda leaf: leaf[0], self.q), self.provenance.params, StatesAt(*at))
+
+    def _first(self):
+        """The states, t, q and v at the first sample."""
+        return jax.tree.map(lambda x: x[0], (self.states, self.ts, *self._vectors()))
 
     def __repr__(self) -> str:
         return card(self)
@@ -256,11 +263,13 @@ class Trajectory(eqx.Module):
 
 @compiled  # so that parameters are unknown, as they were in the motion: a friction of 0 is one, too
 def _slips(motion: Trajectory) -> dict[str, Float[Array, "..."]]:
-    flat, (q, v) = motion._flat(), motion._vectors()
-    elements = find_elements(flat, motion.ts[0], q[0], v[0]) if motion.friction else None
+    def elements_at(states, *state):
+        return find_elements(motion._flat((states, *state)), *state)
+
+    elements = elements_at(*motion._first()) if motion.friction else None
     if elements is None:
         return {}
-    slip = jax.vmap(elements.slip)(motion.ts, q, v)
+    slip = jax.vmap(lambda *at: elements_at(*at).slip(*at[1:]))(motion.states, motion.ts, *motion._vectors())
     return {name: slip[:, rows].reshape(motion.friction[name].force.shape) for name, rows in elements.rows_of_term.items()}
 
 
@@ -275,7 +284,7 @@ def _ravelled(tree):
 
 @compiled
 def _energies(motion):
-    return jax.vmap(functools.partial(energy_exchange, motion._flat()))(motion.ts, *motion._vectors())
+    return jax.vmap(lambda *at: energy_exchange(motion._flat(at), *at[1:]))(motion.states, motion.ts, *motion._vectors())
 
 
 @compiled

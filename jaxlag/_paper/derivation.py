@@ -21,6 +21,11 @@ class SymbolicSystem(NamedTuple):
     Q: Matrix
     g: Matrix
     a: Matrix
+    z: tuple[Symbol, ...] = ()  # states of first order
+    zdot: tuple[Symbol, ...] = ()
+    rates: tuple[Expr, ...] = ()  # of these
+    u: tuple[Symbol, ...] = ()  # sampled states
+    updates: tuple[Expr, ...] = ()  # of these, where they have a formula
 
 
 class Steps(NamedTuple):
@@ -76,5 +81,7 @@ def residuals(s: SymbolicSystem, steps: Steps) -> list[Expr]:
 
 
 def total_derivative(s: SymbolicSystem, formula: Expr) -> Expr:
-    """The total derivative (∂/∂q) q̇ + ∂/∂t of a formula, with q̇ constant."""
-    return sum((derivative(formula, x) * v for x, v in zip(s.q, s.qdot, strict=True)), start=derivative(formula, s.t))
+    """The total derivative (∂/∂q) q̇ + (∂/∂z) ż + (∂/∂ż) z̈ + ∂/∂t of a formula, with q̇ constant."""
+    flow = [(x, v) for x, v in zip((*s.q, *s.z), (*s.qdot, *s.zdot), strict=True)]
+    flow += [(v, total_derivative(s, rate)) for v, rate in zip(s.zdot, s.rates, strict=True) if formula.has(v)]
+    return sum((derivative(formula, x) * v for x, v in flow), start=derivative(formula, s.t))

@@ -39,6 +39,8 @@ def equations(
     - `positive`: names of parameters, coordinates or multipliers to be taken as positive, so that √(l²) is l.
     - `style`: the old spelling of `multipliers`: `"first kind"` is `True`, `"second kind"` is `False`.
 
+    States beside q follow the equations of motion: ż = rate, and u⁺ = update of a sampled one where that has a formula.
+
     **Returns:** `Equations`. The multipliers have the sign of M q̈ = f + Gᵀλ. Any consistent set of units.
 
     **Raises:** `ValueError` or `TypeError` where an argument or a function of the system is of the wrong kind, where two symbols would have
@@ -70,11 +72,12 @@ def equations(
         multipliers = _from_style(style)
     positive = (positive,) if isinstance(positive, str) else tuple(positive)
     coordinates, constants = symbol_tree(q, "q", positive), symbol_tree(params, "params", positive)
-    full, multiplier_rows = symbolic_system.trace_system(system, coordinates, constants, positive)
+    states = symbolic_system.States.of(system, coordinates, constants)
+    full, multiplier_rows = symbolic_system.trace_system(system, coordinates, constants, states, positive)
     parameters = parameters_in_order(system, params, constants)
     simplify = Simplifier(full.qdot, parameters)
     steps = derivation.derive(full, simplify)
-    symbolic_system.check_against_simulation(system, full, steps, coordinates, constants)
+    symbolic_system.check_against_simulation(system, full, steps, coordinates, constants, states)
     eliminated = {} if multipliers else eliminate_coordinates(full, simplify)
     reduced, reduced_steps, qddot, reactions = reduce_system(full, steps, eliminated, simplify)
     details = Details(
@@ -95,6 +98,8 @@ def equations(
         **{name: getattr(reduced_steps, name) for name in ("M", "f", "G", "gamma")},
         params=jax.tree.map(lambda symbols: arranged(symbols.shape, iter(symbols.flat)), constants.symbols),
         motion=derivation.equations_of_motion(reduced, reduced_steps, simplify),
+        rates=dict(zip(reduced.zdot, map(simplify, reduced.rates), strict=True)),
+        updates=dict(zip(reduced.u, map(simplify, reduced.updates), strict=False)),
         eliminated=eliminated,
         _details=details,
     )

@@ -57,6 +57,10 @@ class Latex(Textbook, LatexPrinter):
             return LatexPrinter._print_Pow(self, formula)
         return Textbook._print_Pow(self, formula)
 
+    def after(self, symbol: Symbol) -> str:
+        """u^{+}."""
+        return f"{self._print(symbol)}^{{+}}"
+
     def partial(self, name: str, symbol: Symbol) -> str:
         r"""\partial L / \partial \dot\varphi."""
         return rf"\frac{{\partial {name}}}{{\partial {self._print(symbol)}}}"

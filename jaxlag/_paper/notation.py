@@ -15,10 +15,11 @@ class Notation:
     """The kind of each symbol, its place among the others, and the dots on its letter."""
 
     def __init__(self, s: SymbolicSystem, parameters: Iterable[Symbol]):
-        kinds = tuple(parameters), s.multipliers, (s.t, *s.q), s.qdot, s.qddot
+        kinds = tuple(parameters), s.multipliers, (s.t, *s.q, *s.z, *s.u), (*s.qdot, *s.zdot), s.qddot
         self.kind = {symbol: kind for kind, symbols in enumerate(kinds) for symbol in symbols}
         self.place = {symbol: i for i, symbol in enumerate(self.kind)}
-        self.dotted = {y: (x.name, dots) for dots, ys in ((1, s.qdot), (2, s.qddot)) for x, y in zip(s.q, ys, strict=True)}
+        derived = (1, s.q, s.qdot), (2, s.q, s.qddot), (1, s.z, s.zdot)
+        self.dotted = {y: (x.name, dots) for dots, xs, ys in derived for x, y in zip(xs, ys, strict=True)}
 
     def highest(self, formula: Expr) -> int:
         """The highest kind among the symbols of a formula; −1 for a number."""

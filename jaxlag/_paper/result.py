@@ -34,6 +34,7 @@ class Equations:
       nonholonomic constraints that remain, zero for each row.
     - `M` (n, n), `f` (n), `G` (m, n), `gamma` (m): the matrices and vectors of the equations above.
     - `motion`: the equations of motion, one `sympy.Eq` for each coordinate.
+    - `rates`: the rates of the states of first order, by the symbol of ż; `updates`: those of the sampled states, by the symbol of u.
     - `eliminated`: the coordinates that constraints express by the remaining ones, and their formulas.
 
     ```python
@@ -61,6 +62,8 @@ class Equations:
     G: Any
     gamma: Any
     motion: tuple
+    rates: dict
+    updates: dict
     eliminated: dict
     _details: "Details"
 
@@ -125,6 +128,8 @@ class Equations:
     def _program(self) -> Any:
         from .codegen import Program
 
+        if self.rates or self.updates:
+            raise ValueError("a program must be of a system without states beside q, but there are some. Write them as parameters.")
         details = self._details
         return Program(self.t, self.q, self.qdot, self.qddot, details.paths, details.multipliers, details.residuals, details.solution)
 
@@ -134,6 +139,8 @@ class Equations:
         equal = lambda left, right: (printer.doprint(left), printer.doprint(right))
         yield [equal(x, formula) for x, formula in self.eliminated.items()]
         yield [*(equal(e.lhs, e.rhs) for e in self.motion), *((printer.doprint(residual), "0") for residual in (*self.g, *self.a))]
+        updated = [(printer.after(u), printer.doprint(formula)) for u, formula in self.updates.items()]
+        yield [*(equal(v, formula) for v, formula in self.rates.items()), *updated]
         if details.multipliers:
             solution = [(x, details.solution[x]) for x in (*self.qddot, *details.multipliers) if x in details.solution]
             yield [equal(x, formula) for x, formula in solution if formula.count_ops() < MOST_OPERATIONS]

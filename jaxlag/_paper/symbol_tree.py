@@ -11,6 +11,7 @@ from jaxtyping import PyTree
 from sympy import Symbol
 
 from .._model.injection import declared_parameters
+from .._model.states import State
 from .._model.system import SLOTS, System
 from .._model.validation import is_vector
 from .._program.expressions import filled
@@ -73,7 +74,9 @@ def _numbered(name: str, shape: tuple) -> list[str]:
 
 def parameters_in_order(system: System, given: PyTree, params: SymbolTree) -> list[Symbol]:
     """The parameters in the order in which the system's functions name them, then in that of the given mapping."""
-    names = [name for slot in SLOTS for _, function in getattr(system, slot) for name in _argument_names(function)]
+    functions = [function for slot in SLOTS for _, function in getattr(system, slot)]
+    functions += [state.rate if isinstance(state, State) else state.update for _, state in system.states]
+    names = [name for function in functions for name in _argument_names(function)]
     keys = [f"[{key!r}]" for key in (*names, *(given if isinstance(given, Mapping) else ()))]
     place = lambda path: next((i for i, key in enumerate(keys) if path.startswith(key)), len(keys))
     return [symbol for symbol, path in sorted(params.paths, key=lambda pair: place(pair[1]))]

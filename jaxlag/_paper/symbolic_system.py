@@ -2,7 +2,7 @@
 
 import re
 from collections.abc import Collection
-from typing import Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -13,14 +13,15 @@ from jaxtyping import PyTree
 from sympy import Matrix, Symbol
 
 from .._mechanics.lagrange import applied_force, constraint_rows, inertia
-from .._model.flat import Flat, bind, rows_by_name
+from .._model.flat import Flat, StatesAt, bind, rows_by_name
+from .._model.state_values import of_first_order, ravelled, sampled, start_values
 from .._model.system import System
 from .._model.validation import check, coordinates, parameters
 from .._program.expressions import Algebra, filled
 from .._program.interpreter import evaluate
 from .derivation import Steps, SymbolicSystem
 from .formulas import formulas
-from .symbol_tree import SymbolTree
+from .symbol_tree import SymbolTree, symbol_tree
 
 
 def dotted(symbol: Symbol, dot: str) -> Symbol:
@@ -28,33 +29,73 @@ def dotted(symbol: Symbol, dot: str) -> Symbol:
     return Symbol(re.sub(r"^([^\W\d_]*)", rf"\1{dot}", symbol.name), real=True)
 
 
-def trace_system(system: System, q: SymbolTree, params: SymbolTree, positive: Collection[str]) -> tuple[SymbolicSystem, dict[str, PyTree]]:
-    """L, D, Q, g and a of a system as formulas, and the indices of each constraint's multipliers."""
+class States(NamedTuple):
+    """The states beside q: symbols of those of first order, of their rates, and of the sampled ones; and all of them by name."""
+
+    z: tuple[Symbol, ...]
+    zdot: tuple[Symbol, ...]
+    u: tuple[Symbol, ...]
+    tree: SymbolTree
+
+    @classmethod
+    def of(cls, system: System, q: SymbolTree, params: SymbolTree) -> "States":
+        """Those of a system."""
+        like = coordinates(q.example, "q")
+        t = jnp.zeros((), jax.tree.leaves(like)[0].dtype)
+        values = jax.tree.map(np.asarray, start_values(system, {}, t, like, like, parameters(params.example, like)))
+        tree = symbol_tree(values, "states")
+        z, u = (tuple(_flat([tree.symbols[name] for name in names])) for names in (of_first_order(system), sampled(system)))
+        return cls(z, tuple(dotted(symbol, "dot") for symbol in z), u, tree)
+
+
+def _flat(symbols: PyTree[np.ndarray]) -> list[Symbol]:
+    return [symbol for array in jax.tree.leaves(symbols) for symbol in array.flat]
+
+
+def trace_system(
+    system: System, q: SymbolTree, params: SymbolTree, states: States, positive: Collection[str]
+) -> tuple[SymbolicSystem, dict[str, PyTree]]:
+    """L, D, Q, g, a and what drives the states of a system as formulas, and the indices of each constraint's multipliers."""
     like = coordinates(q.example, "q")
     values = parameters(params.example, like)
-    check(system, jnp.zeros((), jax.tree.leaves(like)[0].dtype), like, like, values)
-    flat = bind(system, like, values)
+    check(system, jnp.zeros((), jax.tree.leaves(like)[0].dtype), like, like, values, states.tree.numbers)
+    zeros = jnp.zeros(sum(leaf.size for leaf in jax.tree.leaves(like)))
+    flat = bind(system, like, values, StatesAt(states.tree.numbers, jnp.zeros(()), zeros, zeros))
     multiplier_rows = jax.tree.map(lambda row: np.asarray(row, int), flat.unravel_multipliers(jnp.arange(flat.rows, dtype=float)))
     t = Symbol("t", real=True)
-    x = [symbol for array in jax.tree.leaves(q.symbols) for symbol in array.flat]
+    x = _flat(q.symbols)
     v, a = ([dotted(symbol, dot) for symbol in x] for dot in ("dot", "ddot"))
     multipliers = [Symbol(name, real=True, positive=True if name in positive else None) for name in _multiplier_names(rows_by_name(flat))]
-    _check_names([t, *x, *v, *a, *multipliers, *(symbol for symbol, _ in params.paths)], positive)
+    beside = (*states.z, *states.zdot, *states.u)
+    _check_names([t, *x, *v, *a, *multipliers, *(symbol for symbol, _ in params.paths), *beside], positive)
 
-    def functions(t, q, v, multipliers, params_):
-        flat = _bound(system, like, params_, params)
+    def functions(t, q, v, multipliers, params_, states):
+        flat = _bound(system, like, params_, params, StatesAt(states, t, q, v))
         D = sum((D(t, q, v, multipliers) for D in flat.dissipations.values()), start=jnp.zeros(()))
         Q = sum((Q(t, q, v, multipliers) for Q in flat.forces.values()), start=jnp.zeros_like(q))
-        return flat.lagrangian(t, q, v), D, Q, flat.holonomic(t, q), flat.nonholonomic(t, q, v)
+        rates = flat.state_rates(t, q, v)
+        rates = ravelled([rates[name] for name in of_first_order(system)], q.dtype)
+        return flat.lagrangian(t, q, v), D, Q, flat.holonomic(t, q), flat.nonholonomic(t, q, v), rates
+
+    def updates(t, q, v, params_, states):
+        found = _bound(system, like, params_, params, StatesAt(states, t, q, v)).updates(t, q, v)
+        return ravelled([found[name] for name in sampled(system)], q.dtype)
 
     vector = lambda symbols: filled((len(symbols),), symbols)
-    L, D, *columns = formulas(functions, filled((), [t]), vector(x), vector(v), vector(multipliers), params.symbols)
-    Q, g, nonholonomic = (Matrix(len(column), 1, list(column)) for column in columns)
-    return SymbolicSystem(t, tuple(x), tuple(v), tuple(a), tuple(multipliers), L[()], D[()], Q, g, nonholonomic), multiplier_rows
+    state = filled((), [t]), vector(x), vector(v)
+    L, D, *columns = formulas(functions, *state, vector(multipliers), params.symbols, states.tree.symbols)
+    Q, g, nonholonomic, rates = (Matrix(len(column), 1, list(column)) for column in columns)
+    try:
+        updated = tuple(formulas(updates, *state, params.symbols, states.tree.symbols))
+    except NotImplementedError:  # measured inputs and other programs of controllers, on which the mechanics does not depend
+        updated = ()
+    drawn = dict(z=states.z, zdot=states.zdot, rates=tuple(rates), u=states.u, updates=updated)
+    symbols = t, tuple(x), tuple(v), tuple(a), tuple(multipliers)
+    return SymbolicSystem(*symbols, L[()], D[()], Q, g, nonholonomic, **drawn), multiplier_rows
 
 
-def _bound(system: System, like: PyTree, numbers: PyTree, params: SymbolTree) -> Flat:
-    return bind(system, jax.tree.map(lambda leaf: jnp.zeros(leaf.shape), like), eqx.combine(numbers, params.rest))
+def _bound(system: System, like: PyTree, numbers: PyTree, params: SymbolTree, at: StatesAt) -> Flat:
+    return bind(system, jax.tree.map(lambda leaf: jnp.zeros(leaf.shape), like), eqx.combine(numbers, params.rest), at)
 
 
 def _multiplier_names(rows: dict[str, np.ndarray]) -> list[str]:
@@ -78,12 +119,12 @@ def _check_names(symbols: list[Symbol], positive: Collection[str]) -> None:
             raise ValueError(f"`positive` must name entries of q or params, or multipliers, but holds {name!r}. There are {there}.")
 
 
-def check_against_simulation(system: System, s: SymbolicSystem, steps: Steps, q: SymbolTree, params: SymbolTree) -> None:
+def check_against_simulation(system: System, s: SymbolicSystem, steps: Steps, q: SymbolTree, params: SymbolTree, states: States) -> None:
     """Raises where the equations differ from what is simulated, at one random state."""
     like = coordinates(q.example, "q")
 
-    def simulated(t, q_, v, multipliers, params_):
-        flat = _bound(system, like, params_, params)
+    def simulated(t, q_, v, multipliers, params_, states_):
+        flat = _bound(system, like, params_, params, StatesAt(states_, t, q_, v))
         M, force = inertia(flat, t, q_, v)
         _, G, gamma = constraint_rows(flat, t, q_, v)
         return M.as_matrix(), force + applied_force(flat, t, q_, v, multipliers), G, gamma
@@ -91,12 +132,14 @@ def check_against_simulation(system: System, s: SymbolicSystem, steps: Steps, q:
     draw = np.random.default_rng(0).uniform
     state = [draw(0.2, 0.8, shape) for shape in ((), len(s.q), len(s.q), len(s.multipliers))]
     # A zero would hide its factors, and dividing by it gives infinity.
-    numbers = jax.tree.map(lambda number: np.where(number == 0, draw(0.2, 0.8, number.shape), number), params.numbers)
+    drawn = lambda number: np.where(number == 0, draw(0.2, 0.8, number.shape), number).astype(float)
+    numbers = jax.tree.map(drawn, (params.numbers, states.tree.numbers))
     with jax.enable_x64(True):
-        simulation = evaluate(jax.make_jaxpr(simulated)(*state, numbers), Algebra(), *state, *jax.tree.leaves(numbers))
-    symbols = [s.t, *s.q, *s.qdot, *s.multipliers, *(symbol for symbol, _ in params.paths)]
+        simulation = evaluate(jax.make_jaxpr(simulated)(*state, *numbers), Algebra(), *state, *jax.tree.leaves(numbers))
+    symbols = [s.t, *s.q, *s.qdot, *s.multipliers, *(symbol for symbol, _ in (*params.paths, *states.tree.paths))]
     values = np.concatenate([np.ravel(part) for part in (*state, *jax.tree.leaves(numbers))])
     point = dict(zip(symbols, map(sympy.Float, values), strict=True))
+    point |= {v: sympy.Float(_value(rate.xreplace(point)).real) for v, rate in zip(s.zdot, s.rates, strict=True)}
     derived = {"M": steps.M, "f": steps.f, "G": steps.G, "γ": steps.gamma}
     for (name, matrix), want in zip(derived.items(), map(np.ravel, simulation), strict=True):
         got = np.array([_value(entry.xreplace(point)) for entry in matrix])

@@ -52,6 +52,10 @@ class Textbook(Printer):
         """A component of Gᵀλ."""
         raise NotImplementedError
 
+    def after(self, symbol: Symbol) -> str:
+        """A sampled state after its update, u⁺."""
+        raise NotImplementedError
+
     def _print_Symbol(self, symbol: Symbol, style: Any = None) -> str:
         return self.letter(*self.notation.dotted.get(symbol, (symbol.name, 0)))
 

@@ -81,6 +81,10 @@ class Unicode(Textbook, StrPrinter):
         when = lambda condition: "otherwise" if condition is sympy.true else f"if {self._print(condition)}"
         return "; ".join(f"{self._print(case)} {when(condition)}" for case, condition in formula.args)
 
+    def after(self, symbol: Symbol) -> str:
+        """u⁺."""
+        return f"{self._print(symbol)}⁺"
+
     def partial(self, name: str, symbol: Symbol) -> str:
         """∂L/∂φ̇."""
         return f"∂{name}/∂{self._print(symbol)}"

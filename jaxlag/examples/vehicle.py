@@ -12,6 +12,7 @@ coordinates and treats the six equations as constraints, whose multipliers are t
 """
 
 from pathlib import Path
+from typing import Any
 
 import jax.numpy as jnp
 
@@ -73,7 +74,7 @@ bindings = {
     "rear rolling": lambda q, r: q["phi2"] + q["x2"] / r,
     "front rolling": lambda q, r: q["phi3"] + q["x3"] / r,
 }
-full_terms = {"dissipation": {"dampers": full_dampers, "air": air}, "force": {"drive": drive_moment}}
+full_terms: dict[str, Any] = {"dissipation": {"dampers": full_dampers, "air": air}, "force": {"drive": drive_moment}}
 substituted = jl.substitute(jl.System(full_lagrangian, **full_terms), parts)
 first_kind = jl.System(full_lagrangian, **full_terms, holonomic=bindings)
 
