@@ -27,7 +27,7 @@ THIN = 1e-3  # of the largest area, below which an area is invisible
 
 
 def motion(trajectory: Trajectory, names: Sequence[str] | None = None, *, units: Units = None, axes: Any = None) -> Any:
-    r"""The coordinates of a motion over time, one panel each.
+    r"""The coordinates of a motion over time, and the states beside them, one panel each.
 
     $$ q_i(t), \qquad i = 1 \dots n $$
 
@@ -36,8 +36,8 @@ def motion(trajectory: Trajectory, names: Sequence[str] | None = None, *, units:
     **Arguments:**
 
     - `trajectory`: one motion, as `simulate` returns it.
-    - `names`: the coordinates to draw, in this order, by their path in q (`"phi"`, `"body.x"`, `"q"` where q is one array).
-      Default: all.
+    - `names`: the coordinates to draw, in this order, by their path in q (`"phi"`, `"body.x"`, `"q"` where q is one array), and states
+      by their path in `trajectory.states`. Default: all.
     - `units`: units by name of coordinate, and of `"t"`, written on the axes, e.g. `{"t": "s", "phi": "rad"}`.
     - `axes`: matplotlib axes to draw in, as many as there are coordinates. Default: a new figure with a common time axis.
 
@@ -58,7 +58,8 @@ def motion(trajectory: Trajectory, names: Sequence[str] | None = None, *, units:
     axes[0].get_ylabel()  # x (m)
     ```
     """
-    drawn, _ = over_time(trajectory, channels(one_motion(trajectory).q, "q"), names, "coordinate", units, axes)
+    shown = channels(one_motion(trajectory).q, "q") | channels(trajectory.states, "states")
+    drawn, _ = over_time(trajectory, shown, names, "coordinate", units, axes)
     return drawn
 
 

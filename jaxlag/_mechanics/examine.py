@@ -25,12 +25,12 @@ from .stick_slip import in_current_mode
 class Examination:
     """What `examine` found; printed, a report.
 
-    - `coordinates`: their names. `degrees_of_freedom`: n − rank G.
+    - `coordinates`: their names. `states`: those beside q. `degrees_of_freedom`: n − rank G.
     - `rows`, `rank`: of G. `redundant`: how many rows depend on rows before them, by constraint.
     - `off_position`, `off_velocity`: the largest residual of each constraint, in its own units.
     - `smallest_inertia`: the least eigenvalue of M on the motions that the constraints allow.
     - `dissipated`: the least of q̇·∂D/∂q̇ near the state, a power, by term.
-    - `time_constants`: 1/|eigenvalue| of the linearised motion, the fastest and the slowest.
+    - `time_constants`: 1/|eigenvalue| of the linearised motion, the fastest and the slowest, with the states beside q held.
     - `findings`: sentences with the cure.
     """
 
@@ -45,11 +45,13 @@ class Examination:
     dissipated: dict[str, float]
     time_constants: tuple[float, float]
     findings: tuple[str, ...]
+    states: tuple[str, ...] = ()
 
     def __repr__(self) -> str:
         fastest, slowest = self.time_constants
         rows = [
             ("coordinates", ", ".join(self.coordinates)),
+            *([("states", ", ".join(self.states))] if self.states else []),
             ("degrees of freedom", str(self.degrees_of_freedom)),
             ("constraint rows", f"{self.rows}, of rank {self.rank}"),
             ("smallest inertia", f"{self.smallest_inertia:.3g}"),
@@ -119,7 +121,7 @@ def examine(system: System, q: PyTree, qdot: PyTree, params: PyTree = None, *, t
         *_pulling(system, found["multipliers"]),
         *_unread_friction(system, q, qdot, params, t, states),
     ]
-    return Examination(**numbers, findings=tuple(findings))
+    return Examination(**numbers, findings=tuple(findings), states=tuple(name for name, _ in system.states))
 
 
 def _unread_friction(system, q, qdot, params, t, states):

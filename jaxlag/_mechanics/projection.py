@@ -234,7 +234,8 @@ def consistent_state(
        \min \tfrac12 (\dot q - \dot q_0)^T M (\dot q - \dot q_0) \text{ with } \dot g = 0,\ a = 0 $$
 
     **Arguments:** the state `q`, `qdot` (one pytree structure), `params`, the time `t`, `states` as for `acceleration`; `fixed` lists
-    coordinates whose position and velocity stay as given: keys where q is a mapping, indices where it is an array or a sequence. Any consistent units.
+    coordinates whose position and velocity stay as given: keys where q is a mapping, indices where it is an array or a sequence. Any
+    consistent units.
 
     **Returns:** (q, qdot), structured like q; differentiable in every argument.
 

@@ -221,4 +221,4 @@ def values_at(states: Mapping[str, PyTree], t: Any) -> dict[str, PyTree]:
 
 def flowing(t: Any, *derivatives: PyTree) -> PyTree:
     """A state with its derivatives by time, as it flows."""
-    return jax.tree.map(lambda *leaves: Flowing(jnp.asarray(t), leaves), *derivatives)
+    return jax.tree.map(lambda *leaves: Flowing(jnp.asarray(t), tuple(map(jnp.asarray, leaves))), *derivatives)

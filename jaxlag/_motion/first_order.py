@@ -151,7 +151,7 @@ class EquationsOfMotion:
         parts = Parts(q, v, z, u, zeros(len(self.works)), zeros(self.rows) + 1, *of_friction)  # with slip, for the time being
         if self.sampled.size:
             y = self.updated(t, parts.y, args, [True] * len(self.sampled_names))
-            parts = self.parts(self.projected(t, y, args) if self.projection else y)
+            parts = self.parts(self.projected(t, y, args) if self.projection else y)._replace(works=parts.works)
         flat, _, elements = self.mode(t, parts, args)
         if elements is None:
             return Start(parts.y, jnp.array(True), jnp.array(True))

@@ -160,8 +160,11 @@ def states_at(
 def _wrapped(options, equations, projected, adjoint):
     """The chosen solver, with what the equations ask for at the ends of its steps."""
     solver = options.solver
-    if isinstance(solver, ExplicitRungeKutta) and isinstance(adjoint, dfx.ForwardMode):
-        solver = dataclasses.replace(solver, reverse=False)
+    if isinstance(adjoint, dfx.ForwardMode):
+        if isinstance(solver, ExplicitRungeKutta):
+            solver = dataclasses.replace(solver, reverse=False)
+        elif isinstance(solver, dfx.AbstractRungeKutta) and solver.scan_kind is None:
+            solver = dataclasses.replace(solver, scan_kind="lax")  # as diffrax does for a solver that is not wrapped
     if isinstance(equations, EquationsOfMotion) and equations.rows:
         return StickSlipSolver(solver, projected, equations.controlled, equations)
     if projected is not None or options.formulation.works:

@@ -43,13 +43,13 @@ def path():
     return r
 
 
-def recording():
+def recording(quantum=QUANTUM):
     """Times, quantised positions, true velocities and commands, (24841,) each."""
     ts, r = np.arange(SAMPLES) * STEP, path()
     q, v, before = 0.0, 0.0, 0.0
     seen, speeds, commands = np.empty(SAMPLES), np.empty(SAMPLES), np.empty(SAMPLES)
     for k in range(SAMPLES):
-        seen[k], speeds[k] = np.round(q / QUANTUM) * QUANTUM, v
+        seen[k], speeds[k] = np.round(q / quantum) * quantum, v
         commands[k] = np.clip(KV * (KP * (r[k] - seen[k]) - (seen[k] - before) / STEP), -LIMIT, LIMIT)
         before = seen[k]
         q, v = held(q, v, K * commands[k], STEP, **TRUE)

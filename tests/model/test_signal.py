@@ -326,8 +326,8 @@ def test_vmap_over_rides_equals_the_loop():
 
 
 def test_new_values_trace_nothing(monkeypatch):
-    traces, checked = [], solution_map.checked
-    monkeypatch.setattr(solution_map, "checked", lambda *args: traces.append(1) or checked(*args))
+    traces, check = [], solution_map.check
+    monkeypatch.setattr(solution_map, "check", lambda *args: traces.append(1) or check(*args))
     cart = jl.System(lambda qdot: 0.5 * qdot**2, force={"of its own": lambda t, u: u(t)})
     run = lambda times, values: jl.simulate(cart, 0.0, 0.0, [0.0, 2.0], {"u": Signal(times, values)}).q[-1]
     np.testing.assert_allclose([run([0, 1], [1, 2]), run(np.array([0.0, 0.5]), jnp.array([1.0, -1.0]))], [2.5, -0.25], rtol=1e-12)

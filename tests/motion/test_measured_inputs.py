@@ -2,6 +2,7 @@
 
 import itertools
 
+import diffrax
 import jax
 import jax.numpy as jnp
 import make_linear_drive
@@ -127,6 +128,33 @@ def test_a_delay_and_its_derivative(derivative):
     np.testing.assert_allclose(derivative(late)(delay), expected, rtol=1e-6)
 
 
+@pytest.mark.parametrize("solver", [None, diffrax.Tsit5()], ids=["Dop853", "Tsit5"])
+@pytest.mark.parametrize("derivative", [jax.jacfwd, jax.jacrev])
+def test_a_delay_where_every_sample_is_at_a_jump(derivative, solver):
+    """The motion is smooth there, though the order of sample and jump changes: the position has a derivative on both sides."""
+    ts = np.concatenate([[(TIMES[1] + TIMES[2]) / 2], TIMES[2:300]])
+    late = lambda delay: jl.simulate(CART, 0.0, 0.0, ts, PARAMS | {"u": jl.Signal(TIMES, VALUES, delay=delay)}, solver=solver).q[-60:]
+    h = 1e-7
+    expected = (exactly(ts, h)[-60:, 0] - exactly(ts, -h)[-60:, 0]) / (2 * h)
+    np.testing.assert_allclose(derivative(late)(0.0), expected, rtol=2e-5)
+
+
+def test_a_delay_and_the_start_among_more_inputs_than_a_forward_pass_takes():
+    """In reverse through the loop: by the time of the start and the delay, with all values of the signal."""
+    ts = jnp.asarray(SAMPLES["coarse"])
+
+    def moved(start, delay, values):
+        signal = jl.Signal(TIMES, values, delay=delay)
+        return jl.simulate(CART, 0.0, 0.0, ts.at[0].add(start), PARAMS | {"u": signal}).q[-1]
+
+    slopes = jax.grad(moved, argnums=(0, 1, 2))(0.0, 0.0137, jnp.asarray(VALUES))
+    h = 1e-7
+    later = [exactly([k * h, *ts[1:]], 0.0137)[-1, 0] for k in (1, -1)]
+    delayed = [exactly(ts, 0.0137 + k * h)[-1, 0] for k in (1, -1)]
+    np.testing.assert_allclose(slopes[:2], [(pair[0] - pair[1]) / (2 * h) for pair in (later, delayed)], rtol=1e-5)
+    assert slopes[2].shape == VALUES.shape
+
+
 @pytest.mark.parametrize("derivative", [jax.jacfwd, jax.jacrev])
 def test_the_derivative_by_the_times_of_jumps(derivative):
     """q(1) = Σ (uᵢ − uᵢ₋₁) (1 − tᵢ)²/2."""
@@ -193,8 +221,10 @@ def test_a_held_speed_of_a_belt_takes_the_mass_along():
 def test_single_precision():
     with jax.enable_x64(False):
         found = jl.simulate(CART, np.float32(0), np.float32(0), SAMPLES["coarse"], PARAMS | {"u": jl.Signal(TIMES, VALUES)}).q
-        assert found.dtype == jnp.float32
+        dry_found = jl.simulate(DRY, np.float32(0), np.float32(0), SAMPLES["coarse"], PARAMS | {"u": jl.Signal(TIMES, VALUES), "F": F}).q
+        assert found.dtype == dry_found.dtype == jnp.float32
     np.testing.assert_allclose(found, exactly(SAMPLES["coarse"])[:, 0], atol=2e-4)
+    np.testing.assert_allclose(dry_found, dry(SAMPLES["coarse"])[:, 0], atol=2e-4)
 
 
 def test_other_entries_of_params_stay_what_they_are():
