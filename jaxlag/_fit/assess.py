@@ -200,6 +200,7 @@ class Comparison:
     - `parameters`: by name, the number of unknowns.
     - `correlated`: over how many samples the residuals of the best model are correlated, 0 where they are white. Both criteria take
       residuals as independent, and overstate the evidence where they are not.
+    - `unconverged`: names of the models whose fits have not converged, which may be better than they look.
 
     ```python
     import jaxlag as jl
@@ -213,6 +214,7 @@ class Comparison:
     bic: dict[str, float]
     parameters: dict[str, int]
     correlated: int
+    unconverged: tuple[str, ...] = ()
 
     def __repr__(self) -> str:
         width = max(map(len, self.names))
@@ -225,6 +227,7 @@ class Comparison:
         evidence = [f"  evidence for {best!r} against {second!r}: {strength}"]
         if self.correlated:
             evidence.append(f"  ! overstated: residuals of {best!r} are correlated over {self.correlated} samples")
+        evidence += [f"  ! the fit of {name!r} has not converged: the model may be better than it looks" for name in self.unconverged]
         return "\n".join(["Comparison: smaller is better", *rows, *evidence])
 
 
@@ -263,7 +266,8 @@ def compare(fits: Mapping[str, Fit]) -> Comparison:
     names = tuple(sorted(fits, key=lambda name: fits[name].bic))
     least = {which: min(getattr(f, which) for f in fits.values()) for which in ("aic", "bic")}
     above = lambda which: {name: getattr(fits[name], which) - least[which] for name in names}
-    return Comparison(names, above("aic"), above("bic"), {name: fits[name].unknown_count for name in names}, fits[names[0]].correlated)
+    counts, unconverged = {name: fits[name].unknown_count for name in names}, tuple(name for name in names if not fits[name].converged)
+    return Comparison(names, above("aic"), above("bic"), counts, fits[names[0]].correlated, unconverged)
 
 
 def _fingerprint(f):

@@ -136,6 +136,8 @@ def _unknown(role: str, name: str, state: Mapping[str, Any], params: Any) -> str
         entries, where = [], "params is not a mapping, so its parts have no names"
     close = difflib.get_close_matches(name, own + entries, n=1)
     cure = f"Did you mean {close[0]!r}?" if close else f"Add {name!r} to params, or give it a default value."
+    if name in STATE_NAMES:
+        cure = "Leave it out: it is not known there."
     if not isinstance(params, Mapping) and hasattr(params, name):
         cure = f"Write `params.{name}`."
     return f"{role} must name arguments that exist, but it names {name!r}. There are {', '.join(own)}; {where}. {cure}"

@@ -12,7 +12,7 @@ from jax.flatten_util import ravel_pytree
 
 from .._program.jit import is_concrete
 from .flat import flat_like
-from .injection import asks_for, call, check_function
+from .injection import asks_for, call, check_function, needs
 from .numbers import numbers
 from .states import Sampled, State, values_at
 from .system import CONSTRAINT_SLOTS, System, Terms, role
@@ -125,7 +125,8 @@ def substitute(system: System, coordinates: Callable) -> System:
 def _pulled_state(state: State | Sampled, coordinates: Callable) -> State | Sampled:
     """A state that is driven by the old coordinates."""
     pulled = lambda given, what: _PulledBack(given, coordinates, f"`{what}`") if callable(given) else given
-    start = pulled(state.start, "start")
+    driven = callable(state.start) and (needs(state.start, "q") or needs(state.start, "qdot"))
+    start = pulled(state.start, "start") if driven else state.start
     if isinstance(state, State):
         return State(pulled(state.rate, "rate"), start)
     return Sampled(pulled(state.update, "update"), state.every, start)

@@ -15,8 +15,6 @@ from .injection import STATE_NAMES, check_function
 from .numbers import Label, number, numbers
 from .pickling import picklable, unpickled
 
-NEEDED = object()  # in place of an argument that was not given
-
 
 @dataclasses.dataclass(frozen=True)
 class Constant:
@@ -43,13 +41,6 @@ class Constant:
     def value(self) -> PyTree:
         """The numbers."""
         return jax.tree.unflatten(self.structure, [np.array(x).reshape(shape) for shape, x in self.leaves])
-
-
-def _function(given: Any, label: str, cure: str) -> Callable:
-    if given is NEEDED:
-        raise TypeError(f"{label} must be given, but is missing. {cure}")
-    check_function(given, label)
-    return given
 
 
 def _start(given: Any, label: str) -> Any:
@@ -92,11 +83,11 @@ class State:
     ```
     """
 
-    rate: Callable = NEEDED  # type: ignore[assignment]
+    rate: Callable
     start: Any = 0.0
 
     def __post_init__(self):
-        object.__setattr__(self, "rate", _function(self.rate, "`rate`", "Write `State(rate, start)`."))
+        check_function(self.rate, "`rate`")
         object.__setattr__(self, "start", _start(self.start, "`start`"))
 
     def __reduce__(self) -> Any:
@@ -131,19 +122,17 @@ class Sampled:
     controller = jl.Sampled(lambda q, qdot, goal: 9.0 * (goal - q) - 3.0 * qdot, every=0.01)
     cart = jl.System(lambda qdot: 0.5 * qdot**2, force=lambda u: u, states={"u": controller})
     motion = jl.simulate(cart, 0.0, 0.0, jnp.linspace(0, 4, 41), {"goal": 2.0})
-    motion.q[-1]  # 2.0, within half a percent
+    motion.q[-1]  # 2.005
     motion.states["u"][0]  # 18.0
     ```
     """
 
-    update: Callable = NEEDED  # type: ignore[assignment]
-    every: Any = NEEDED
+    update: Callable
+    every: Any
     start: Any = 0.0
 
     def __post_init__(self):
-        object.__setattr__(self, "update", _function(self.update, "`update`", "Write `Sampled(update, every=1e-3)`."))
-        if self.every is NEEDED:
-            raise TypeError("`every` must be the period of the updates, but is missing. Write `Sampled(update, every=1e-3)`.")
+        check_function(self.update, "`update`")
         if callable(self.every):
             check_function(self.every, "`every`")
         else:

@@ -146,6 +146,8 @@ def test_the_card_and_a_comparison_say_so(one):
     assert white.correlated == 0 and np.all(white.inflation == 1) and "correlated over" not in repr(white)
     assert f"overstated: residuals of 'a' are correlated over {one.correlated} samples" in repr(jl.compare({"a": one, "b": one}))
     assert "overstated" not in repr(jl.compare({"a": white, "b": white}))
+    short = fit(osc.record(0), max_steps=1)
+    assert not short.converged and "the fit of 'b' has not converged" in repr(jl.compare({"a": white, "b": short}))
 
 
 def test_two_recordings_missing_samples_sigma_and_segments(one):

@@ -2,6 +2,7 @@
 
 from pathlib import Path
 
+import bench_coverage
 import jax.numpy as jnp
 import make_linear_drive as drive
 import numpy as np
@@ -83,3 +84,19 @@ def test_what_never_moves_has_no_windows():
     record = jl.Experiment(ts, np.zeros(100), 0.0, 0.0, params={"u": jl.Signal(ts, np.zeros(100))})
     with pytest.raises(ValueError, match="must be long enough for windows on which the equations of motion are tested"):
         jl.regress(DRIVE, record, {"M": 1.0, "Fv": 1.0, "Fc": np.nan, "offset": 0.1}, free=("Fc",))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("rho", [0.0, 0.95, 0.99])
+def test_intervals_hold_the_truth_where_noise_is_coloured(rho):
+    """30 recordings of 1000 samples: intervals are neither too narrow nor wider than some two times."""
+    names, deviations = list(bench_coverage.TRUE), []
+    clean = bench_coverage.position(bench_coverage.TIMES, **bench_coverage.TRUE)
+    for seed in range(30):
+        record = jl.Experiment(bench_coverage.TIMES, clean + bench_coverage.noise(rho, seed), 1.0, 0.0)
+        found = jl.regress(bench_coverage.SYSTEM, record, dict.fromkeys(names, np.nan), free=names)
+        deviations.append([(found.estimates[n] - bench_coverage.TRUE[n]) / found.standard_errors[n] for n in names])
+    inside = np.mean(np.abs(deviations) < 1.96, axis=0)
+    assert np.all(inside >= 0.85), inside
+    size = np.sqrt(np.mean(np.square(deviations), axis=0))
+    assert np.all((size > 0.4) & (size < 1.3)), size

@@ -177,3 +177,31 @@ def test_a_reaction_as_a_force_on_a_point():
     np.testing.assert_allclose([generalized["x"], generalized["y"]], expected, rtol=1e-12)
     elsewhere = jl.constraint_force(rod, q, v, p, at=lambda q: jnp.stack([q["x"], q["y"]]))["hinge"]
     assert np.all(np.isnan(elsewhere))  # at the centre it would take a moment too
+
+
+WINCH = jl.State(lambda z, u, tau: (u - z) / tau, start=lambda z0: z0)
+WINCH_PARAMS = {"m": 2.0, "g": 9.81, "u": 3.0, "tau": 0.5, "z0": 1.5}
+
+
+def hanging(q, z):
+    return z * jnp.stack([jnp.sin(q), -jnp.cos(q)])
+
+
+def by_rate(t, q, qdot, params, states, m, g):
+    v = jl.rate(hanging)(t, q, qdot, params, states)
+    return 0.5 * m * v @ v - m * g * hanging(q, states["z"](t))[1]
+
+
+def test_positions_that_depend_on_a_state_move_with_it():
+    """A rope of length z: φ̈ = −(2 ż φ̇ + g sin φ)/z, for coordinates pulled back and for the velocity of a point."""
+    mass = jl.System(lambda q, qdot, m, g: 0.5 * m * qdot @ qdot - m * g * q[1], states={"z": WINCH})
+    for system in (jl.substitute(mass, hanging), jl.System(by_rate, states={"z": WINCH})):
+        found = jl.acceleration(system, 0.3, 0.7, WINCH_PARAMS).qddot
+        np.testing.assert_allclose(found, -(2 * (3.0 - 1.5) / 0.5 * 0.7 + 9.81 * np.sin(0.3)) / 1.5, rtol=1e-12)
+
+
+def test_the_effort_of_a_virtual_work_may_be_a_state():
+    push = jl.virtual_work(lambda q: 2 * q, lambda z: z)
+    system = jl.System(lambda qdot, m: 0.5 * m * qdot**2, force=push, states={"z": WINCH})
+    np.testing.assert_allclose(jl.acceleration(system, 0.0, 0.0, WINCH_PARAMS).qddot, 2 * 1.5 / 2.0, rtol=1e-13)
+    np.testing.assert_allclose(jl.acceleration(system, 0.0, 0.0, WINCH_PARAMS, states={"z": 0.4}).qddot, 0.4, rtol=1e-13)
