@@ -26,7 +26,8 @@ def rate(coordinate: Callable) -> Callable:
     **Arguments:** `coordinate`: the position x(t, q), a number, a vector or any pytree; it receives the arguments it names, out of
     `t`, `q`, `params` and the entries of `params`.
 
-    **Returns:** a function of `(t, q, qdot, params)`, whose value has the structure and shapes of x. Any consistent units.
+    **Returns:** a function of `(t, q, qdot, params)`, whose value has the structure and shapes of x. Where x depends on states beside q,
+    a function of the system names `states` and hands it on as a fifth argument. Any consistent units.
 
     **Raises:** `TypeError` where `coordinate` is no hashable function; when the rate is called, `TypeError` where t, q or qdot is missing.
 

@@ -187,9 +187,9 @@ def hanging(q, z):
     return z * jnp.stack([jnp.sin(q), -jnp.cos(q)])
 
 
-def by_rate(t, q, qdot, params, states, m, g):
+def by_rate(t, q, qdot, z, params, states, m, g):
     v = jl.rate(hanging)(t, q, qdot, params, states)
-    return 0.5 * m * v @ v - m * g * hanging(q, states["z"](t))[1]
+    return 0.5 * m * v @ v - m * g * hanging(q, z)[1]
 
 
 def test_positions_that_depend_on_a_state_move_with_it():
