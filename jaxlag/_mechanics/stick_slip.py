@@ -141,9 +141,11 @@ def select_mode(flat: Flat, elements: FrictionElements, t, q, v, sigma, at_rest:
         in_current_mode = ~jnp.any(leaving | returning)
         agrees = in_current_mode & jnp.all(jnp.isfinite(found.force))
 
-        within = (stage == FIRST) | (stage == NEXT)
+        all_slip = (stage == LOOSE) & ~jnp.any(at_rest)  # nothing to choose
+        within = (stage == FIRST) | (stage == NEXT) | all_slip
+        last = all_slip | ~jnp.any(at_rest & ~sticking(elements, sigma))  # nothing that others may hold
         return _Search(
-            jnp.where(within, jnp.where(in_current_mode, HOLD, NEXT), jnp.where(stage == LOOSE, FIRST, DONE)),
+            jnp.where(within, jnp.where(in_current_mode, jnp.where(last, DONE, HOLD), NEXT), jnp.where(stage == LOOSE, FIRST, DONE)),
             Mode(
                 jnp.where(within, sigma, mode.sigma),
                 jnp.where(stage == HOLD, released & (rate <= 1e-6 * search.free_rate), mode.held),

@@ -26,7 +26,8 @@ def after_jump(equations: EquationsOfMotion, t, y0, y, before: Arguments, args: 
         lift = energy_exchange(flat, t, parts.q, parts.v)[0] - energy_exchange(earlier, t, parts.q, parts.v)[0]
         parts = parts._replace(works=parts.works.at[equations.works.index(EXPLICIT_TIME)].add(lift))
     slipping = parts._replace(sigma=jnp.ones_like(parts.sigma))
-    moved = slipping if equations.projection is None else equations.parts(equations.projected(t, slipping.y, args))
+    held = equations.projection is not None and equations.system.constraints
+    moved = equations.parts(equations.projected(t, slipping.y, args)) if held else slipping
     if elements is None:
         return moved.y, jnp.array(True)
     assert args.scales is not None  # friction is located

@@ -142,8 +142,8 @@ def test_a_second_fit_traces_nothing(monkeypatch):
     fit = lambda seed: jl.fit(vehicle.system, experiment(seed), GUESS, free=("b", "k"))
     fit(8)
     traces = []
-    checked = solution_map.checked
-    monkeypatch.setattr(solution_map, "checked", lambda *args: traces.append(1) or checked(*args))
+    check = solution_map.check
+    monkeypatch.setattr(solution_map, "check", lambda *args: traces.append(1) or check(*args))
     fit(9)
     assert traces == []
 

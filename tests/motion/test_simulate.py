@@ -204,8 +204,8 @@ def test_consistent_state_far_from_a_curved_constraint():
 
 def test_a_second_motion_traces_nothing(monkeypatch):
     traces = []
-    checked = solution_map.checked
-    monkeypatch.setattr(solution_map, "checked", lambda *args: traces.append(1) or checked(*args))
+    check = solution_map.check
+    monkeypatch.setattr(solution_map, "check", lambda *args: traces.append(1) or check(*args))
     energy = lambda q, qdot, c: 0.5 * qdot**2 - 0.5 * c * q**2  # a system no other test has compiled
     ts = np.linspace(0, 1, 7)
     run = lambda c, x, ts: jl.simulate(jl.System(energy), x, 0.0, ts, {"c": c})
