@@ -30,11 +30,11 @@ class Experiment(eqx.Module):
       experiment that is only planned (`jaxlag.information`).
     - `q0`, `qdot0`: the state at ts[0], structured as for `simulate`; where it is unknown, a guess.
     - `observe`: the sensors h, which return one sample, structured like one row of `values`. The function receives the arguments it
-      names, of `t`, `q`, `qdot`, `qddot`, `multipliers`, `params` and the entries of `params`; so gains and offsets of sensors are
-      parameters like others. Default: the coordinates named in `values`, or q as a whole. Use one function for all experiments of a
-      kind: they then run as a batch, while each new function is compiled anew.
+      names, of `t`, `q`, `qdot`, `qddot`, `multipliers`, `params`, the entries of `params` and the states beside q; so gains and offsets
+      of sensors are parameters like others. Default: the coordinates named in `values`, or q as a whole. Use one function for all
+      experiments of a kind: they then run as a batch, while each new function is compiled anew.
     - `sigma`: σ, the standard deviation of the noise: a number, or a pytree like `values` with one for each channel or sample. By
-      default, one common sigma is estimated from the residuals.
+      default, one for each channel is estimated from the residuals.
     - `params`: parameters of this experiment only, which override those of the fit: a payload, a measured input (`Signal`).
     - `unknown`: what is to be estimated of this experiment only: `"q0"`, `"qdot0"`, coordinates of them (`"qdot0.x"`), or entries of
       its own `params`. An unknown start moves within the constraints.

@@ -53,7 +53,7 @@ def reduce_system(
         g=Matrix(len(left), 1, [g for g, _ in left]),
         a=s.a.applyfunc(insert),
         rates=tuple(map(insert, s.rates)),
-        updates=tuple(map(insert, s.updates)),
+        updates=tuple(formula and insert(formula) for formula in s.updates),
     )
     full = residuals(s, steps)
     return new, derive(new, simplify), tuple(rules[a] for a in s.qddot), [insert(full[i]) for i, x in enumerate(s.q) if x in eliminated]

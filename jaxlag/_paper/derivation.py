@@ -25,7 +25,7 @@ class SymbolicSystem(NamedTuple):
     zdot: tuple[Symbol, ...] = ()
     rates: tuple[Expr, ...] = ()  # of these
     u: tuple[Symbol, ...] = ()  # sampled states
-    updates: tuple[Expr, ...] = ()  # of these, where they have a formula
+    updates: tuple[Expr | None, ...] = ()  # of these; None where they have no formula
 
 
 class Steps(NamedTuple):

@@ -99,7 +99,7 @@ def equations(
         params=jax.tree.map(lambda symbols: arranged(symbols.shape, iter(symbols.flat)), constants.symbols),
         motion=derivation.equations_of_motion(reduced, reduced_steps, simplify),
         rates=dict(zip(reduced.zdot, map(simplify, reduced.rates), strict=True)),
-        updates=dict(zip(reduced.u, map(simplify, reduced.updates), strict=False)),
+        updates={u: formula and simplify(formula) for u, formula in zip(reduced.u, reduced.updates, strict=True)},
         eliminated=eliminated,
         _details=details,
     )

@@ -34,7 +34,8 @@ class Equations:
       nonholonomic constraints that remain, zero for each row.
     - `M` (n, n), `f` (n), `G` (m, n), `gamma` (m): the matrices and vectors of the equations above.
     - `motion`: the equations of motion, one `sympy.Eq` for each coordinate.
-    - `rates`: the rates of the states of first order, by the symbol of ż; `updates`: those of the sampled states, by the symbol of u.
+    - `rates`: the rates of the states of first order, by the symbol of ż; `updates`: those of the sampled states, by the symbol of u, None
+      where an update has no formula.
     - `eliminated`: the coordinates that constraints express by the remaining ones, and their formulas.
 
     ```python
@@ -110,7 +111,7 @@ class Equations:
 
         `q` and `qdot` (n) hold the coordinates in the order of `Equations.q`; `params` is structured as it was for `equations`.
 
-        **Raises:** `ValueError` where NumPy lacks a function, or where λ enters nonlinearly and has no formula.
+        **Raises:** `ValueError` where there are states beside q, NumPy lacks a function, or λ enters nonlinearly and has no formula.
         """
         from .codegen import to_python
 
@@ -119,7 +120,7 @@ class Equations:
     def to_c(self) -> str:
         """The source of `void acceleration(t, q, qdot, params, qddot, multipliers)` in C99; a comment lists the entries in order.
 
-        **Raises:** `ValueError` where C lacks a function, or where λ enters nonlinearly and has no formula.
+        **Raises:** `ValueError` where there are states beside q, C lacks a function, or λ enters nonlinearly and has no formula.
         """
         from .codegen import to_c
 
@@ -139,7 +140,7 @@ class Equations:
         equal = lambda left, right: (printer.doprint(left), printer.doprint(right))
         yield [equal(x, formula) for x, formula in self.eliminated.items()]
         yield [*(equal(e.lhs, e.rhs) for e in self.motion), *((printer.doprint(residual), "0") for residual in (*self.g, *self.a))]
-        updated = [(printer.after(u), printer.doprint(formula)) for u, formula in self.updates.items()]
+        updated = [(printer.after(u), printer.doprint(formula)) for u, formula in self.updates.items() if formula is not None]
         yield [*(equal(v, formula) for v, formula in self.rates.items()), *updated]
         if details.multipliers:
             solution = [(x, details.solution[x]) for x in (*self.qddot, *details.multipliers) if x in details.solution]

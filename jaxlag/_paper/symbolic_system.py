@@ -88,7 +88,7 @@ def trace_system(
     try:
         updated = tuple(formulas(updates, *state, params.symbols, states.tree.symbols))
     except NotImplementedError:  # measured inputs and other programs of controllers, on which the mechanics does not depend
-        updated = ()
+        updated = (None,) * len(states.u)
     drawn = dict(z=states.z, zdot=states.zdot, rates=tuple(rates), u=states.u, updates=updated)
     symbols = t, tuple(x), tuple(v), tuple(a), tuple(multipliers)
     return SymbolicSystem(*symbols, L[()], D[()], Q, g, nonholonomic, **drawn), multiplier_rows

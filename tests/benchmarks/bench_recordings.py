@@ -30,6 +30,20 @@ SYSTEM = jl.System(
 )
 
 
+def pd(t, q, control, goal):
+    """The controller of the drive, which sees q as it is."""
+    rate = (q - control["seen"]) / drive.STEP
+    return {"u": jnp.clip(drive.KV * (drive.KP * (goal(t) - q) - rate), -drive.LIMIT, drive.LIMIT), "seen": q}
+
+
+IN_THE_LOOP = jl.System(
+    SYSTEM.lagrangian[0][1],
+    dissipation=SYSTEM.dissipation[0][1],
+    force=lambda control, offset: drive.K * control["u"] - offset,
+    states={"control": jl.Sampled(pd, every=drive.STEP, start={"u": 0.0, "seen": 0.0})},
+)
+
+
 def regression(ts, q, u) -> None:
     """Prints the time and the errors of `regress`."""
     record = jl.Experiment(ts, q, 0.0, 0.0, params={"u": jl.Signal(ts, u)})
@@ -109,31 +123,20 @@ def fitted(ts, q, u) -> None:
 
 def in_the_loop() -> None:
     """Prints the same of the loop simulated closed: motion, `fit` from twice the truth, and its errors by the quantum of the position."""
-
-    def pd(t, q, control, goal):
-        rate = (q - control["seen"]) / drive.STEP
-        return {"u": jnp.clip(drive.KV * (drive.KP * (goal(t) - q) - rate), -drive.LIMIT, drive.LIMIT), "seen": q}
-
-    system = jl.System(
-        lambda qdot, M: 0.5 * M * qdot**2,
-        dissipation=lambda qdot, Fv, Fc: 0.5 * Fv * qdot**2 + Fc * jnp.abs(qdot),
-        force=lambda control, offset: drive.K * control["u"] - offset,
-        states={"control": jl.Sampled(pd, every=drive.STEP, start={"u": 0.0, "seen": 0.0})},
-    )
     for quantum in (1e-6, 1e-7):
         ts, q, *_ = drive.recording(quantum)
         goal = {"goal": jl.Signal(ts, drive.path())}
         if quantum == drive.QUANTUM:
             for solver in (jl.Dop853(), jl.Dopri5()):
                 simulated = lambda x, solver=solver, goal=goal, ts=ts: (
-                    jl.simulate(system, 0.0, 0.0, ts, dict(zip(drive.TRUE, x, strict=True)) | goal, solver=solver, throw=False).q
+                    jl.simulate(IN_THE_LOOP, 0.0, 0.0, ts, dict(zip(drive.TRUE, x, strict=True)) | goal, solver=solver, throw=False).q
                 )
                 print(f"closed loop with dry friction, {type(solver).__name__}: {costs(simulated, jnp.array(list(drive.TRUE.values())))}")
         record = jl.Experiment(ts, q, 0.0, 0.0, params=goal)
         for call in ("first call", "again"):
             begin = time.perf_counter()
             twice = {name: 2 * true for name, true in drive.TRUE.items()}
-            found = jl.fit(system, record, twice, free=tuple(drive.TRUE), solver=jl.Dopri5())
+            found = jl.fit(IN_THE_LOOP, record, twice, free=tuple(drive.TRUE), solver=jl.Dopri5())
             print(f"fit in the closed loop, {call}: {time.perf_counter() - begin:.2f} s")
         print(found)
         for name, true in drive.TRUE.items():

@@ -6,6 +6,7 @@ import jax.numpy as jnp
 import make_linear_drive as drive
 import numpy as np
 import pytest
+from bench_recordings import IN_THE_LOOP, SYSTEM
 from scipy.integrate import solve_ivp
 from scipy.interpolate import CubicSpline
 
@@ -18,14 +19,9 @@ pytestmark = pytest.mark.slow
 def test_a_drive_at_1_khz_from_twice_the_truth():
     """24 841 samples, exact but for their quantum of 1 µm, with friction that sticks a quarter of the time."""
     ts, q, _, u = drive.recording()
-    system = jl.System(
-        lambda qdot, M: 0.5 * M * qdot**2,
-        dissipation=lambda qdot, Fv, Fc: 0.5 * Fv * qdot**2 + Fc * jnp.abs(qdot),
-        force=lambda t, u, offset: drive.K * u(t) - offset,
-    )
     record = jl.Experiment(ts, q, 0.0, 0.0, params={"u": jl.Signal(ts, u)})
     twice = {name: 2 * true for name, true in drive.TRUE.items()}
-    found = jl.fit(system, record, twice, free=tuple(drive.TRUE), solver=jl.Dopri5())
+    found = jl.fit(SYSTEM, record, twice, free=tuple(drive.TRUE), solver=jl.Dopri5())
     assert found.converged
     for name, true in drive.TRUE.items():
         np.testing.assert_allclose(found.estimates[name], true, rtol=1e-5, err_msg=name)
@@ -38,19 +34,9 @@ def test_a_drive_under_its_controller_from_twice_the_truth(quantum, within):
     """
     ts, q, _, _ = drive.recording(quantum)
 
-    def pd(t, q, control, goal):
-        rate = (q - control["seen"]) / drive.STEP
-        return {"u": jnp.clip(drive.KV * (drive.KP * (goal(t) - q) - rate), -drive.LIMIT, drive.LIMIT), "seen": q}
-
-    system = jl.System(
-        lambda qdot, M: 0.5 * M * qdot**2,
-        dissipation=lambda qdot, Fv, Fc: 0.5 * Fv * qdot**2 + Fc * jnp.abs(qdot),
-        force=lambda control, offset: drive.K * control["u"] - offset,
-        states={"control": jl.Sampled(pd, every=drive.STEP, start={"u": 0.0, "seen": 0.0})},
-    )
     record = jl.Experiment(ts, q, 0.0, 0.0, params={"goal": jl.Signal(ts, drive.path())})
     twice = {name: 2 * true for name, true in drive.TRUE.items()}
-    found = jl.fit(system, record, twice, free=tuple(drive.TRUE), solver=jl.Dopri5())
+    found = jl.fit(IN_THE_LOOP, record, twice, free=tuple(drive.TRUE), solver=jl.Dopri5())
     assert found.converged
     for name, true in drive.TRUE.items():
         off = abs(float(found.estimates[name]) - true)

@@ -253,3 +253,16 @@ def test_an_observer_in_the_loop():
     np.testing.assert_allclose((motion.q, motion.qdot, seen["x"], seen["v"][0], F), expected, rtol=0, atol=1e-7)
     slope = jax.grad(lambda slow: jl.simulate(system, 1.0, -0.6, ts, p | {"slow": slow}).q[-1])(0.5)
     np.testing.assert_allclose(slope, (expm(A * 2) @ [0, 0, 0, -0.6, 0])[0], rtol=1e-6)
+
+
+def test_on_paper_an_update_without_a_formula_is_left_out():
+    """It reads a table; the mechanics does not depend on that. A program would not know u."""
+    states = {"u": jl.Sampled(lambda t, q, goal: goal(t) - q, every=0.1), "w": jl.Sampled(lambda q: 2 * q, every=0.1)}
+    table = jl.Signal([0.0, 1.0], [1.0, 2.0])
+    for names, shown in (({"u": states["u"]}, False), ({"w": states["w"]}, True)):
+        (name,) = names
+        force = (lambda u: u) if name == "u" else (lambda w: w)
+        on_paper = jl.equations(jl.System(lambda qdot, m: 0.5 * m * qdot**2, force=force, states=names), "x", {"m": 2.0, "goal": table})
+        assert ("⁺" in str(on_paper)) == shown and "m ẍ" in unicodedata.normalize("NFC", str(on_paper))
+        with pytest.raises(ValueError, match="states"):
+            on_paper.to_python()
