@@ -6,6 +6,7 @@ from . import dissipation as dissipation, learnt as learnt, plot as plot
 from ._mechanics.acceleration import Acceleration as Acceleration, acceleration as acceleration, constraint_force as constraint_force
 from ._draw.animate import animate as animate
 from ._paper.equations import equations as equations
+from ._paper.linearised_result import LinearisedEquations as LinearisedEquations
 from ._paper.result import Equations as Equations
 from ._paper.to_sympy import to_sympy as to_sympy
 from ._mechanics.examine import Examination as Examination, examine as examine
@@ -19,15 +20,22 @@ from ._fit.assess import (
     validate as validate,
 )
 from ._fit.experiment import Experiment as Experiment
+from ._fit.frequency_response_test import FrequencyResponseTest as FrequencyResponseTest
 from ._fit.result import Fit as Fit, Interval as Interval, Prediction as Prediction
 from ._fit.fit import fit as fit, fit_each as fit_each
 from ._fit.robust_loss import Huber as Huber
 from ._fit.channels import Channel as Channel
 from ._fit.lead_in import Regress as Regress
+from ._fit.modal_test import ModalTest as ModalTest
 from ._fit.regress import Regression as Regression, regress as regress
 from ._motion.simulate import simulate as simulate
 from ._motion.load import load as load
 from ._motion.simulate_many import simulate_many as simulate_many
+from ._linear.equilibrium import Equilibrium as Equilibrium, equilibrium as equilibrium, steady as steady
+from ._linear.linear_system import LinearSystem as LinearSystem
+from ._linear.linearise import linearise as linearise
+from ._linear.root_locus import Crossing as Crossing, RootLocus as RootLocus, root_locus as root_locus
+from ._linear.modes import Modes as Modes
 from ._program.compilation_cache import keep_compiled as keep_compiled
 from ._model.kinematics import rate as rate, substitute as substitute, virtual_work as virtual_work
 from ._mechanics.projection import (

@@ -8,13 +8,29 @@ from ._draw.axes import COLOURS as COLOURS
 from ._draw.axes import pyplot
 from ._draw.fit import convergence, fit, parameters
 from ._draw.forces import forces, friction
+from ._draw.linear import bode, nyquist, root_locus
 from ._draw.motion import balance, energy, motion, phase
+from ._paper.linearised_result import LinearisedEquations
 from ._paper.result import Equations
 
-__all__ = ["balance", "convergence", "energy", "equations", "fit", "forces", "friction", "motion", "parameters", "phase"]
+__all__ = [
+    "balance",
+    "bode",
+    "convergence",
+    "energy",
+    "equations",
+    "fit",
+    "forces",
+    "friction",
+    "motion",
+    "nyquist",
+    "parameters",
+    "phase",
+    "root_locus",
+]
 
 
-def equations(on_paper: Equations, *, ax: Any = None) -> Any:
+def equations(on_paper: Equations | LinearisedEquations, *, ax: Any = None) -> Any:
     r"""The equations of motion of a system, typeset as a picture.
 
     $$ M\ddot q = f + G^T\lambda $$

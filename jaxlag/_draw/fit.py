@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from .._fit.experiment import Experiment
 from .._fit.result import Fit
 from .._fit.rounding import plus_minus
 from .axes import GREY, Units, canvas, channels, chosen, colour, label, legend_above, legend_beside, panels
@@ -35,8 +36,8 @@ def fit(fit: Fit, *, number: int = 0, level: float = 0.95, units: Units = None, 
 
     **Returns:** the axes, an array of shape (2, channels).
 
-    **Raises:** `ValueError` if `axes` do not match the channels, `IndexError` if there is no such experiment; `ImportError` without
-    matplotlib.
+    **Raises:** `ValueError` if `axes` do not match the channels or the experiment is no recording in time, `IndexError` if there is no such
+    experiment; `ImportError` without matplotlib.
 
     **Source:** Ljung, System Identification, 2nd ed., section 16.6 (residual analysis); Seber & Wild, Nonlinear Regression (1989),
     section 5.1 (the band).
@@ -52,6 +53,11 @@ def fit(fit: Fit, *, number: int = 0, level: float = 0.95, units: Units = None, 
     ```
     """
     experiment = fit.experiments[number]
+    if not isinstance(experiment, Experiment):
+        what = type(experiment).__name__
+        raise ValueError(
+            f"`number` must be that of a recording in time, but number {number} is a {what}. Draw its `fit.residuals[{number}]`."
+        )
     sigma = experiment.sigma
     if sigma is None:
         sigma = jax.tree.map(lambda own, value: np.broadcast_to(own, value.shape), fit.sigmas[number], experiment.values)

@@ -15,6 +15,8 @@ from .experiment import Experiment, measured
 from .fit import fit
 from .fit_card import channel_rows
 from .identifiability import correlation_of, determined_by
+from .linear_test import LinearTest, apart
+from .linear_test_statistics import channels_of_test
 from .parameters import Free
 from .problem import Problem, failure_of, linearise, with_zero_values
 from .residuals import Model
@@ -60,7 +62,11 @@ class Information:
 
 
 def information(
-    system: System, experiments: Experiment | Sequence[Experiment], params: PyTree, free: Sequence[str], **numerics: Any
+    system: System,
+    experiments: Experiment | LinearTest | Sequence[Experiment | LinearTest],
+    params: PyTree,
+    free: Sequence[str],
+    **numerics: Any,
 ) -> Information:
     r"""Fisher's information of planned experiments, and the standard errors that a fit of them will have.
 
@@ -71,7 +77,8 @@ def information(
 
     **Arguments:**
 
-    - `experiments`: one or several, with `sigma`. Their `values` may be None; samples that are NaN in them do not count.
+    - `experiments`: one or several, with `sigma`. Their `values` may be None; samples that are NaN in them do not count. Also `ModalTest`s
+      and `FrequencyResponseTest`s, with expected values.
     - `params`: where the information is computed, as for `fit`. `free`: names of the p numbers that will be identified.
     - `**numerics`: passed on to `simulate`.
 
@@ -91,7 +98,7 @@ def information(
     jl.information(oscillator, plan, {"c": 4.0}, free=("c",)).standard_errors["c"]
     ```
     """
-    experiments, params = measured(experiments, params, planned=True)
+    experiments, params = measured(experiments, params, planned=True, tests=(LinearTest,))
     for e in experiments:
         if e.sigma is None:
             raise ValueError(
@@ -99,7 +106,8 @@ def information(
             )
     chosen = Free.of(params, free)
     model = Model(system, tuple(sorted(numerics.items())), None)
-    problem = Problem.of(model, chosen, [_with_values(model, chosen, e) for e in experiments])
+    recordings, tests = apart(experiments)
+    problem = Problem.of(model, chosen, [_with_values(model, chosen, e) for e in recordings], tests)
     found = linearise(problem, jnp.zeros(problem.size))
     reason = failure_of(found)
     if reason:
@@ -151,15 +159,15 @@ class Validation:
         return "\n".join(["Validation: prediction of other data", *channel_rows(self.channels)])
 
 
-def validate(fit: Fit, experiment: Experiment, *, level: float = 0.95) -> Validation:
+def validate(fit: Fit, experiment: Experiment | LinearTest, *, level: float = 0.95) -> Validation:
     r"""Predicts another experiment with the fitted parameters, and compares the prediction with its measurements.
 
     $$ r_i = z_i - h(t_i, q(t_i; \hat\theta), \dots) $$
 
     Unknowns of the experiment's own, its start for instance, are estimated from its measurements; the fitted parameters stay fixed.
 
-    **Arguments:** `fit`: what `jaxlag.fit` returned; `experiment`: with T measured samples; `level`: of the confidence band, between 0
-    and 1. Units are any consistent set.
+    **Arguments:** `fit`: what `jaxlag.fit` returned; `experiment`: with T measured samples, or a `ModalTest` or `FrequencyResponseTest`;
+    `level`: of the confidence band, between 0 and 1. Units are any consistent set.
 
     **Returns:** a `Validation`.
 
@@ -178,12 +186,20 @@ def validate(fit: Fit, experiment: Experiment, *, level: float = 0.95) -> Valida
     """
     if experiment.values is None:
         raise ValueError("`experiment` must have been measured, but has no values. Use `fit.predict` for what it should show.")
+    if isinstance(experiment, LinearTest):
+        return _validated_test(fit, experiment, level)
     if experiment.unknown:
         model = fit.problem.model
         experiment = _with_own_estimates(model.system, experiment, fit.params, dict(model.numerics))
     prediction = fit.predict(experiment, level=level)
     residuals = jax.tree.map(lambda z, p: np.asarray(z - p), experiment.values, prediction.values)
     return Validation(channels_of(0, experiment.values, residuals), residuals, prediction)
+
+
+def _validated_test(fit, test, level):
+    prediction = fit.predict(test, level=level)
+    residuals = jax.tree.map(np.subtract, test.values, prediction.values)
+    return Validation(channels_of_test(0, test, prediction.motion, residuals), residuals, prediction)
 
 
 def _with_own_estimates(system, experiment, params, numerics):
@@ -272,5 +288,6 @@ def compare(fits: Mapping[str, Fit]) -> Comparison:
 
 def _fingerprint(f):
     """Numbers that are equal for fits of the same data."""
-    total = lambda which: float(sum(np.nansum(np.asarray(leaf)) for e in f.experiments for leaf in jax.tree.leaves(getattr(e, which))))
+    leaves = lambda which: (leaf for e in f.experiments for leaf in jax.tree.leaves(getattr(e, which)))
+    total = lambda which: float(sum(np.nansum(np.abs(np.asarray(leaf))) for leaf in leaves(which)))
     return total("values"), total("sigma"), f.problem.model.loss

@@ -18,7 +18,8 @@ class Channel(NamedTuple):
     - `experiment`: the number of the experiment; `name`: of the channel, e.g. `"y"`, `"force[1]"`; `samples`: how many were measured.
     - `fit_percent`: the fit in percent; `r_squared`: R².
     - `rms`: root mean square of the residuals, in the unit of the channel.
-    - `whiteness`: the p-value of the Ljung–Box test that residuals are independent; small where the model misses something.
+    - `whiteness`: the p-value of the Ljung–Box test that residuals are independent; small where the model misses something. NaN for modes
+      and frequency responses.
     - `correlated`: the number of samples over which the residuals are correlated, 0 where they are white.
 
     **Source:** Ljung, System Identification, 2nd ed., sections 16.4 and 16.6; Ljung & Box, Biometrika 65 (1978) 297.
@@ -46,7 +47,7 @@ class Channel(NamedTuple):
 def channels_of(number: int, values: PyTree, residuals: PyTree) -> list[Channel]:
     """Each scalar channel of an experiment, in flat order."""
     flat = lambda tree: np.concatenate([np.reshape(np.asarray(leaf), (len(leaf), -1)) for leaf in jax.tree.leaves(tree)], axis=1).T
-    return [_channel(number, *one) for one in zip(channel_names(values), flat(values), flat(residuals), strict=True)]
+    return [channel(number, *one) for one in zip(channel_names(values), flat(values), flat(residuals), strict=True)]
 
 
 def channel_names(values: PyTree) -> list[str]:
@@ -54,10 +55,12 @@ def channel_names(values: PyTree) -> list[str]:
     return [name or "z" for name in entry_names(jax.tree.map(lambda leaf: np.zeros(np.shape(leaf)[1:]), values))]
 
 
-def _channel(number, name, z, r):
+def channel(number: int, name: str, z: np.ndarray, r: np.ndarray, *, in_time: bool = True) -> Channel:
+    """A channel of the measurements z, real or complex, and their residuals r, which may be correlated where they are of one record."""
     there = np.isfinite(z) & np.isfinite(r)
     z, r = z[there], r[there]
     around_mean, off = np.linalg.norm(z - np.mean(z)) if z.size else np.nan, np.linalg.norm(r)
     part = off / around_mean if around_mean > 0 else np.nan
-    rms, correlated = off / np.sqrt(max(z.size, 1)), correlation_length(autoregression(r), z.size)
-    return Channel(number, name, z.size, 100 * (1 - part), 1 - part**2, rms, whiteness(r), correlated)
+    white, correlated = (whiteness(r), correlation_length(autoregression(r), z.size)) if in_time else (np.nan, 0)
+    fit, r_squared, rms = float(100 * (1 - part)), float(1 - part**2), float(off / np.sqrt(max(z.size, 1)))
+    return Channel(number, name, z.size, fit, r_squared, rms, white, correlated)

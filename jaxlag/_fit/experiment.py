@@ -90,7 +90,7 @@ class Experiment(eqx.Module):
         if params is not None and not isinstance(params, Mapping):
             raise TypeError(f"`params` of an experiment must be a mapping, but is a {type(params).__name__}. Name its entries in a dict.")
         self.params = dict(parameters(params or {}, self.q0))
-        self.observe = _Coordinates.named_by(self.values, self.q0) if observe is None else observe
+        self.observe = Coordinates.named_by(self.values, self.q0) if observe is None else observe
         check_function(self.observe, "`observe`")
         self.unknown = (unknown,) if isinstance(unknown, str) else tuple(unknown)
         if callable(delay):
@@ -146,17 +146,20 @@ class Experiment(eqx.Module):
         return cls(ts, values, q0, qdot0, **more)
 
 
-def measured(experiments: Any, params: PyTree, *, planned: bool = False) -> tuple[tuple[Experiment, ...], PyTree]:
-    """One experiment or several as a tuple, and `params` as arrays, both checked."""
-    experiments = (experiments,) if isinstance(experiments, Experiment) else tuple(experiments)
-    if not experiments or not all(isinstance(e, Experiment) for e in experiments):
-        raise ValueError("`experiments` must be an `Experiment` or a list of them, but is not. Make one with `jl.Experiment(...)`.")
+def measured(experiments: Any, params: PyTree, *, planned: bool = False, tests: tuple[type, ...] = ()) -> tuple[tuple[Any, ...], PyTree]:
+    """One experiment or several as a tuple, and `params` as arrays, both checked; `tests`: classes of what may stand among them."""
+    kinds = (Experiment, *tests)
+    experiments = (experiments,) if isinstance(experiments, eqx.Module) else tuple(experiments)
+    if not experiments or not all(isinstance(e, kinds) for e in experiments):
+        also = " Tests by modes or frequency responses are for `fit` and `information`." if not tests else ""
+        raise ValueError(f"`experiments` must be an `Experiment` or a list of them, but is not. Make one with `jl.Experiment(...)`.{also}")
     for i, e in enumerate(experiments):
         if e.values is None and not planned:
             raise ValueError(f"`experiments` must have been measured, but number {i} has no values. Use `information` to plan one.")
     if params is None or (jax.tree_util.all_leaves([params]) and not isinstance(params, Mapping)):
         raise ValueError(f"`params` must have entries that `free` can name, but is a {type(params).__name__}. Use a dict.")
-    params = parameters(params, experiments[0].q0)
+    first = experiments[0]
+    params = parameters(params, first.q0 if isinstance(first, Experiment) else first.q)
     for e in experiments:
         with_own(params, e.params)
     return experiments, params
@@ -213,19 +216,21 @@ def _deviations(sigma, values):
     return sigma
 
 
-class _Coordinates(eqx.Module):
+class Coordinates(eqx.Module):
     """Returns the coordinates that the channels are named after."""
 
     names: tuple[str, ...] | None = eqx.field(static=True)
 
     @classmethod
-    def named_by(cls, values, q0):
+    def named_by(cls, values: PyTree, q0: PyTree, label: str = "values") -> "Coordinates":
+        """Those of q0 that `values` is structured like."""
         if isinstance(values, Mapping) and isinstance(q0, Mapping) and set(values) <= set(q0):
             return cls(tuple(values))
-        if values is None or jax.tree.structure(values) == jax.tree.structure(q0):
+        structure: Any = jax.tree.structure(values)
+        if values is None or structure == jax.tree.structure(q0):
             return cls(None)
         raise ValueError(
-            "`observe` must say what the sensors see, but was left out, and `values` does not name coordinates of q. "
+            f"`observe` must say what the sensors see, but was left out, and `{label}` does not name coordinates of q. "
             'Write e.g. `observe=lambda q: {"x": q["x"]}`.'
         )
 

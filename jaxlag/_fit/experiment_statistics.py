@@ -20,7 +20,7 @@ from .minimum import Minimum
 def own_estimates(minimum: Minimum, known: Determined, scale: float) -> list[tuple[dict[str, Any], dict[str, Any]]]:
     """For each experiment its unknowns and their standard errors, by name."""
     firsts = (segments[0] for segments in minimum.segments_of_each())
-    return [_own_estimates(minimum, k, row, e, known, scale) for (k, row, _), e in zip(firsts, minimum.experiments, strict=True)]
+    return [_own_estimates(minimum, k, row, e, known, scale) for (k, row, _), e in zip(firsts, minimum.recordings, strict=True)]
 
 
 def _own_estimates(minimum, k, row, e, known, scale):
@@ -54,8 +54,8 @@ def _own_estimates(minimum, k, row, e, known, scale):
     return values, deviations
 
 
-def with_estimates(e: Experiment, own: dict[str, Any]) -> Experiment:
-    """The experiment with its estimates put in."""
+def with_estimates(e: Any, own: dict[str, Any]) -> Any:
+    """The experiment with its estimates put in; a test, which has none, as it is."""
     if not own:
         return e
     params = e.params | {name: value for name, value in own.items() if name in e.params}
@@ -74,7 +74,7 @@ def predictions_of(minimum: Minimum, covariance: np.ndarray) -> list[Predicted]:
     """For each experiment, its segments put together."""
     found = []
     joined = lambda parts: jax.tree.map(lambda *leaves: np.concatenate(leaves), *parts)
-    for e, segments in zip(minimum.experiments, minimum.segments_of_each(), strict=True):
+    for e, segments in zip(minimum.recordings, minimum.segments_of_each(), strict=True):
         seen, deviations = [], []
         for k, row, n in segments:
             own_samples = lambda tree, n=n: jax.tree.map(lambda x: x[:n], tree)

@@ -16,6 +16,7 @@ from .._model.system import System
 from .._motion.progress import Steps, compiling
 from .experiment import Experiment, measured
 from .lead_in import Regress, inside_bounds, led_in
+from .linear_test import LinearTest, apart
 from .minimise import each_apart, minimise, minimise_each
 from .multiple_shooting import Segments, cut
 from .parameters import Free
@@ -29,7 +30,7 @@ from .statistics import report
 
 def fit(
     system: System,
-    experiments: Experiment | Sequence[Experiment],
+    experiments: Experiment | LinearTest | Sequence[Experiment | LinearTest],
     params: PyTree,
     *,
     free: Sequence[str],
@@ -54,7 +55,8 @@ def fit(
 
     **Arguments:**
 
-    - `experiments`: one `Experiment` or several, with T samples each; T may differ.
+    - `experiments`: one `Experiment` or several, with T samples each; T may differ. Beside them, or alone, `ModalTest`s and
+      `FrequencyResponseTest`s, whose weighted squares are added; recordings need their `sigma` then.
     - `params`: all parameters, a mapping or any pytree with named parts, of numbers and arrays of any shape. Those in `free` are starting
       values; where one is NaN, `jaxlag.regress` finds it, and an estimate at its bound is moved inside.
     - `free`: names of the entries of `params` to be identified, or paths to parts of them, `"arm.length"`, `"joints[0]"`.
@@ -101,6 +103,10 @@ def fit(
         raise ValueError(
             "`segments`, `start`, `starts` and `method` must be used one at a time, but more than one was given. Omit the others."
         )
+    experiments, params = measured(experiments, params, tests=(LinearTest,))
+    recordings, tests = apart(experiments)
+    if tests:
+        _check_options(recordings, loss, segments, start)
     common: dict[str, Any] = {"free": free, "bounds": bounds}
     if start is not None:
         fit_from = partial(fit, system, priors=priors, loss=loss, tolerance=tolerance, progress=progress, **common, **numerics)
@@ -109,7 +115,7 @@ def fit(
     problem, experiments = _checked_problem(system, experiments, params, free, bounds, priors, loss, method is None, numerics)
     steps = max_steps or (100 if method is None else 1000)
     line = Steps(steps) if progress else None
-    of_segments = cut(problem, experiments, segments) if segments > 1 else Segments(problem, tuple(range(len(experiments))), ())
+    of_segments = cut(problem, recordings, segments) if segments > 1 else Segments(problem, tuple(range(len(recordings))), ())
     with compiling("the fit", progress):
         try:
             outcome, problem = minimise(
@@ -128,6 +134,22 @@ def fit(
         return dataclasses.replace(report(problem, experiments, outcome, of_segments), led_in=said)
 
 
+def _check_options(recordings, loss, segments, start):
+    """Refuses what says something of recordings in time, where there are tests."""
+    if start is not None:
+        raise ValueError(
+            "`start` must be None where modes or frequency responses are fitted, which need one, but is not. "
+            "Start from `regress(...).params` of the recordings."
+        )
+    if loss is not None:
+        raise ValueError(
+            "`loss` must be None where modes or frequency responses are fitted, among which it finds no outliers, but is not. "
+            "Leave it out, and set their outliers to NaN."
+        )
+    if segments > 1 and not recordings:
+        raise ValueError("`segments` must be 1 where nothing was recorded in time, but is more. Leave it out.")
+
+
 def _led_in(fit_from, system, experiments, params, start, max_steps, **common):
     """The fit that `start` leads to."""
     if not isinstance(start, Regress):
@@ -140,11 +162,17 @@ def _led_in(fit_from, system, experiments, params, start, max_steps, **common):
 
 def _without_nan(system, experiments, params, free, bounds):
     """The parameters with those from `regress` that are free and NaN; and what was done."""
-    experiments, params = measured(experiments, params)
+    experiments, params = measured(experiments, params, tests=(LinearTest,))
     chosen = Free.of(params, free, bounds)
     unknown = np.isnan(chosen.start)
     if not np.any(unknown):
         return params, ()
+    if apart(experiments)[1]:
+        name = chosen.entries[int(np.argmax(unknown))]
+        raise ValueError(
+            f"`params` must have a start for each free entry where modes or frequency responses are fitted, but {name!r} is NaN. "
+            "Give a guess, or take it from `regress` with the recordings."
+        )
     found = regress(system, experiments, params, free=free, bounds=bounds)
     inside, said = inside_bounds(found, free, bounds)
     return chosen.insert(jnp.where(unknown, Free.of(inside, free).start, chosen.start)), (said,)
@@ -185,8 +213,11 @@ def fit_each(
     [fit.estimates["c"] for fit in jl.fit_each(oscillator, records, {"c": 3.0}, free=("c",))]  # [4.0, 4.41]
     ```
     """
+    experiments, params = measured(experiments, params, tests=(LinearTest,))
+    if apart(experiments)[1]:
+        raise ValueError("`experiments` must be recordings in time, to be fitted in a batch, but some are tests. Call `fit` for each.")
     params, said = _without_nan(system, experiments, params, free, bounds)
-    problem, experiments = _checked_problem(system, experiments, params, free, bounds, priors, None, True, numerics, apart=True)
+    problem, experiments = _checked_problem(system, experiments, params, free, bounds, priors, None, True, numerics, alone=True)
     if len(problem.batches) > 1:
         raise ValueError("`experiments` must be of one kind, but differ in sensors, unknowns or shapes. Fit each kind by itself.")
     (batch,) = problem.batches
@@ -209,9 +240,9 @@ def fit_each(
     return [dataclasses.replace(found, led_in=said) for found in fits]
 
 
-def _checked_problem(system, experiments, params, free, bounds, priors, loss, relative, numerics, apart=False):
+def _checked_problem(system, experiments, params, free, bounds, priors, loss, relative, numerics, alone=False):
     """The problem after all checks of the arguments, and the experiments."""
-    experiments, params = measured(experiments, params)
+    experiments, params = measured(experiments, params, tests=(LinearTest,))
     if len({e.sigma is None for e in experiments}) > 1:
         raise ValueError("`experiments` must all have a `sigma` or none, but only some have. Give each of them one.")
     chosen = Free.of(params, free, bounds, priors, relative)
@@ -222,19 +253,19 @@ def _checked_problem(system, experiments, params, free, bounds, priors, loss, re
             raise ValueError(
                 f"`free` must name parameters that experiments share, but each has a {name!r} of its own. Name it `unknown` there."
             )
-    problem = Problem.of(Model(system, tuple(sorted(numerics.items())), loss), chosen, experiments)
+    problem = Problem.of(Model(system, tuple(sorted(numerics.items())), loss), chosen, *apart(experiments))
     if problem.size == 0:
         raise ValueError("`free` must name at least one entry of params, but is empty. Say which parameters to identify.")
-    _check_enough_measured(problem, experiments, apart)
+    _check_enough_measured(problem, experiments, alone)
     return problem, experiments
 
 
-def _check_enough_measured(problem, experiments, apart):
-    """No more unknowns than measurements and priors; in each experiment, where they are fitted `apart`."""
+def _check_enough_measured(problem, experiments, alone):
+    """No more unknowns than measurements and priors; in each experiment, where each is fitted `alone`."""
     counts = [_measurements(e) for e in experiments]
     priors = int(np.sum(np.isfinite(problem.free.prior_deviation)))
-    measurements = min(counts) if apart else sum(counts)
-    unknown = problem.free.size + problem.batches[0].unknowns if apart else problem.size
+    measurements = min(counts) if alone else sum(counts)
+    unknown = problem.free.size + problem.batches[0].unknowns if alone else problem.size
     if measurements + priors < unknown:
         raise ValueError(
             f"`free` must name no more than was measured, but there are {unknown} unknowns and {measurements} measurements. Free fewer."
@@ -242,7 +273,7 @@ def _check_enough_measured(problem, experiments, apart):
 
 
 def _measurements(e):
-    return sum(int(np.sum(np.isfinite(leaf))) for leaf in jax.tree.leaves(e.values))
+    return e.measurements if isinstance(e, LinearTest) else sum(int(np.sum(np.isfinite(leaf))) for leaf in jax.tree.leaves(e.values))
 
 
 def _absolute(experiments):

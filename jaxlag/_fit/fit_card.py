@@ -98,12 +98,13 @@ def channel_rows(channels: Sequence[Channel]) -> list[str]:
     label = lambda c: f"{c.experiment}: {c.name}" if several else c.name
     shown = channels[:ROWS]
     width = max((len(label(c)) for c in shown), default=0)
-    rows = [
-        f"  {label(c):<{width}}  fit {_short(c.fit_percent, '6.2f')} %   R² {_short(c.r_squared, '.5f')}   rms {c.rms:.3g}   "
-        + _whiteness(c.whiteness)
-        for c in shown
-    ]
+    rows = [f"  {label(c):<{width}}  {_quality(c)}rms {c.rms:.3g}   {_whiteness(c.whiteness)}".rstrip() for c in shown]
     return rows + ([f"  … and {len(channels) - ROWS} more channels"] if len(channels) > ROWS else [])
+
+
+def _quality(c):
+    """How much of the spread of the measurements is predicted; nothing where there is none, as of a single mode."""
+    return "" if np.isnan(c.fit_percent) else f"fit {_short(c.fit_percent, '6.2f')} %   R² {_short(c.r_squared, '.5f')}   "
 
 
 def _sigma(fit):

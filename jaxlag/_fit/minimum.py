@@ -2,6 +2,7 @@
 
 import dataclasses
 from collections.abc import Iterator, Sequence
+from typing import Any
 
 import jax
 import numpy as np
@@ -9,6 +10,7 @@ import numpy as np
 from .._program.jit import compiled
 from .experiment import Experiment
 from .levenberg_marquardt import Outcome
+from .linear_test import apart
 from .multiple_shooting import Segments
 from .problem import Linearisation, Problem
 
@@ -17,12 +19,13 @@ from .problem import Linearisation, Problem
 class Minimum:
     """A problem linearised at its minimum x.
 
+    - `experiments`: recordings in time and tests, as given; `recordings`: the former.
     - `theta`, `slope`: the p parameters there, and dθ/dy. `found`: residuals and Jacobians.
     - `weighted`: (measured − predicted) / sigma for each batch, (segments, samples · channels), NaN where nothing was measured.
     """
 
     problem: Problem
-    experiments: tuple[Experiment, ...]
+    experiments: tuple[Any, ...]
     segments: Segments
     outcome: Outcome
     x: np.ndarray
@@ -32,7 +35,7 @@ class Minimum:
     weighted: list[np.ndarray]
 
     @classmethod
-    def of(cls, problem: Problem, experiments: Sequence[Experiment], outcome: Outcome, segments: Segments) -> "Minimum":
+    def of(cls, problem: Problem, experiments: Sequence[Any], outcome: Outcome, segments: Segments) -> "Minimum":
         """At the best iterate of an outcome."""
         best = outcome.best
         theta, slope = map(np.asarray, _theta_and_slope(problem.free, np.asarray(best.y)[: problem.free.size]))
@@ -47,24 +50,39 @@ class Minimum:
     @property
     def flat(self) -> np.ndarray:
         """All entries of `weighted`."""
-        return np.concatenate([np.ravel(r) for r in self.weighted])
+        return np.concatenate([np.zeros(0), *(np.ravel(r) for r in self.weighted)])
+
+    @property
+    def recordings(self) -> tuple[Experiment, ...]:
+        """The experiments that are recordings in time."""
+        return apart(self.experiments)[0]
+
+    @property
+    def of_tests(self) -> np.ndarray:
+        """Residuals of the tests, over sigma; 0 where nothing was measured."""
+        return np.concatenate([np.zeros(0), *(np.asarray(test.residuals) for test in self.found.tests)])
+
+    @property
+    def measurements(self) -> int:
+        """How many real numbers were measured."""
+        return self.measured.size + sum(part.test.measurements for part in self.problem.tests)
 
     @property
     def measured(self) -> np.ndarray:
-        """Those that were measured."""
+        """Those of them that were measured."""
         flat = self.flat
         return flat[np.isfinite(flat)]
 
     @property
     def absolute(self) -> bool:
         """Whether sigma was given."""
-        return all(e.sigma is not None for e in self.experiments)
+        return all(e.sigma is not None for e in self.recordings)
 
     def segments_of_each(self) -> list[list[tuple[int, int, int]]]:
         """For each experiment its segments: batch, row in the batch, and number of samples of its own."""
-        samples = self.segments.samples or [e.ts.size for e in self.experiments]
+        samples = self.segments.samples or [e.ts.size for e in self.recordings]
         places = self.problem.places
-        of_each: list[list[tuple[int, int, int]]] = [[] for _ in self.experiments]
+        of_each: list[list[tuple[int, int, int]]] = [[] for _ in self.recordings]
         for j, (i, count) in enumerate(zip(self.segments.of, samples, strict=True)):
             of_each[i].append((*places[j], count))
         return of_each

@@ -57,7 +57,8 @@ def cut(problem: Problem, experiments: Sequence[Experiment], count: int) -> Segm
     of_segments = Problem.of(problem.model, problem.free, segments)
     gaps = sum(of_segments.batches[of_segments.places[b][0]].tangent_basis.shape[-1] for _, b in pairs)
     continuity = Continuity(jnp.asarray(0.0), jnp.zeros(gaps), size, tuple(pairs))
-    return Segments(dataclasses.replace(of_segments, scale=problem.scale, continuity=continuity), tuple(of), tuple(samples))
+    of_segments = dataclasses.replace(of_segments, scale=problem.scale, continuity=continuity, tests=problem.tests)
+    return Segments(of_segments, tuple(of), tuple(samples))
 
 
 def whole(e: Experiment) -> bool:

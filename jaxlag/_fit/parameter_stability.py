@@ -33,18 +33,18 @@ def different_halves(minimum: Minimum, uncertainty: Uncertainty) -> Halves | Non
     """
     from scipy import special
 
-    p, J = minimum.size, uncertainty.jacobian
+    p, beside, J = minimum.size, minimum.problem.beside, uncertainty.jacobian
     if J is None or not 0 < p <= MANY or minimum.problem.model.loss is not None or minimum.measured.size < 4 * J.shape[1]:
         return None
-    second = np.concatenate([np.zeros(p, bool), *(rows.ravel() for rows in _second_halves(minimum))])
+    second = np.concatenate([np.zeros(beside, bool), *(rows.ravel() for rows in _second_halves(minimum))])
     both = np.hstack([J, J[:, :p] * second[:, None]])
     gaps = np.asarray(minimum.found.gaps_jacobian)
     known = determined_by(both, np.hstack([gaps, np.zeros((len(gaps), p))]))
     own = np.flatnonzero(known.determined[-p:]) + J.shape[1]
-    r = np.concatenate([-np.asarray(minimum.found.residuals)[:p], np.nan_to_num(minimum.flat)])
+    r = np.concatenate([-np.asarray(minimum.found.residuals)[:beside], np.nan_to_num(minimum.flat)])
     found = known.covariance @ (both.T @ r)
     left = r - both @ found
-    ends = np.cumsum([p, *(part.size for part in minimum.weighted)])
+    ends = np.cumsum([beside, *(part.size for part in minimum.weighted)])
     weighted = [left[a:b].reshape(part.shape) + 0 * part for a, b, part in zip(ends, ends[1:], minimum.weighted, strict=False)]
     covariance, correlated = sandwich(minimum, both, known.covariance, weighted)
     covariance = covariance * (left @ left) / max(minimum.measured.size - both.shape[1], 1)
@@ -70,7 +70,7 @@ def _estimates(minimum, i, j, found, covariance):
 def _second_halves(minimum):
     """For each batch, which of its residuals are in the second half of their record, shaped like them."""
     halves = [np.zeros(part.shape, bool) for part in minimum.weighted]
-    for e, segments in zip(minimum.experiments, minimum.segments_of_each(), strict=True):
+    for e, segments in zip(minimum.recordings, minimum.segments_of_each(), strict=True):
         middle = (e.ts[0] + e.ts[-1]) / 2
         for k, row, _ in segments:
             batch = minimum.problem.batches[k]

@@ -10,9 +10,11 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import PyTree
 
+from .._linear.linear_system import LinearSystem
 from .._motion.trajectory import Trajectory
 from .._program.jit import compiled
 from .experiment import Experiment
+from .linear_test import LinearTest, deviations
 from .problem import Problem, failure_of, linearise, with_zero_values
 
 
@@ -22,7 +24,7 @@ class Prediction(NamedTuple):
     - `values`: structured like the experiment's `values`; leaves (T, ...) in the units of the channels.
     - `standard_errors`: of `values`, from the uncertainty of the parameters; structured like them.
     - `lower`, `upper`: the confidence band; structured like `values`.
-    - `motion`: the `Trajectory` behind them.
+    - `motion`: the `Trajectory` behind them; of a `ModalTest` or `FrequencyResponseTest`, the `LinearSystem`.
 
     ```python
     import jax.numpy as jnp
@@ -39,7 +41,7 @@ class Prediction(NamedTuple):
     standard_errors: PyTree
     lower: PyTree
     upper: PyTree
-    motion: Trajectory
+    motion: Trajectory | LinearSystem
 
 
 def predicted(problem: Problem, x: np.ndarray, covariance: Any, experiment: Experiment, t: float) -> Prediction:
@@ -60,6 +62,19 @@ def predicted(problem: Problem, x: np.ndarray, covariance: Any, experiment: Expe
     lower, upper = (jax.tree.map(lambda v, e, s=s: v + s * t * e, values, standard_errors) for s in (-1, 1))
     one = jax.tree.map(lambda x: x[0] if eqx.is_array(x) else x, single.batches[0])
     return Prediction(values, standard_errors, lower, upper, _motion(single.model, free.insert(free.theta(y)), one))
+
+
+def predicted_test(problem: Problem, x: np.ndarray, covariance: Any, test: LinearTest, t: float) -> Prediction:
+    """The same of a test; of complex values the ends are those of both parts."""
+    free = problem.free
+    y = jnp.asarray(x[: free.size])
+    at_estimates = dataclasses.replace(free, params=free.insert(np.asarray(free.theta(y))))
+    single = Problem.of(dataclasses.replace(problem.model, loss=None), at_estimates, [], [test])
+    found = linearise(single, y)
+    values, size = found.tests[0].predictions, free.size
+    errors = deviations(test, found.tests[0], covariance[:size, :size])
+    lower, upper = (jax.tree.map(lambda v, e, s=s: v + s * t * e, values, errors) for s in (-1, 1))
+    return Prediction(values, errors, lower, upper, single.tests[0].near)
 
 
 @compiled

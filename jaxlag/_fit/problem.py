@@ -15,6 +15,7 @@ from .._motion.simulate_many import of_each
 from .._program.jit import compiled, numpy_for
 from .experiment import Experiment
 from .experiment_batch import ExperimentBatch, batches_of, map_batch
+from .linear_test import Evaluated, LinearTest, PreparedTest
 from .parameters import Free
 from .residuals import Linearised, Model, evaluate_batch, linearise_batch
 
@@ -37,13 +38,16 @@ class Continuity:
 
 
 class Linearisation(NamedTuple):
-    """A `Problem` at one point: all residuals and their Jacobian, the same for each batch of experiments, and the gaps c of segments."""
+    """A `Problem` at one point: all residuals and their Jacobian, the same for each batch of experiments and each test, and the gaps c of
+    segments.
+    """
 
     residuals: Any
     jacobian: Any
     batches: tuple[Linearised, ...]
     gaps: Any
     gaps_jacobian: Any
+    tests: tuple[Evaluated, ...] = ()
 
 
 @jax.tree_util.register_dataclass
@@ -56,16 +60,24 @@ class Problem:
     batches: tuple[ExperimentBatch, ...]
     scale: Any  # of the noise, in units of sigma, for robust losses
     continuity: Continuity | None = None
+    tests: tuple[PreparedTest, ...] = ()
 
     @classmethod
-    def of(cls, model: Model, free: Free, experiments: Sequence[Experiment]) -> "Problem":
+    def of(cls, model: Model, free: Free, recordings: Sequence[Experiment], tests: Sequence[LinearTest] = ()) -> "Problem":
         """The problem of these experiments; its start is x = 0."""
-        return cls(model, free, batches_of(model.system, free.params, experiments), np.ones((), free.start.dtype))
+        prepared = tuple(PreparedTest.of(model.system, test, free.params) for test in tests)
+        batches = batches_of(model.system, free.params, recordings)
+        return cls(model, free, batches, np.ones((), free.start.dtype), tests=prepared)
 
     @property
     def size(self) -> int:
         """The number of unknowns."""
         return self.free.size + sum(len(batch.members) * batch.unknowns for batch in self.batches)
+
+    @property
+    def beside(self) -> int:
+        """The number of residuals beside those of recordings, and before them: of the priors, then of the tests."""
+        return self.free.size + sum(test.size for test in self.tests)
 
     @property
     def bounds(self) -> tuple[Any, Any]:
@@ -91,12 +103,13 @@ class Problem:
         return y, [z.reshape(len(batch.members), batch.unknowns) for batch, z in zip(self.batches, zs, strict=True)]
 
     def linearise(self, x: Float[Array | np.ndarray, " x"]) -> Linearisation:
-        """All residuals and their Jacobian: those of the priors, of the experiments, of the gaps."""
+        """All residuals and their Jacobian: those of the priors, of the tests, of the recordings, of the gaps."""
         y, zs = self.split(x)
         parts = tuple(linearise_batch(self.model, self.free, batch, y, z, self.scale) for batch, z in zip(self.batches, zs, strict=True))
+        tests = tuple(test.linearised(self.model.system, self.free, y) for test in self.tests)
         slope = jnp.diag(self.free.slope(y) / self.free.prior_deviation)
-        prior = jnp.zeros((self.free.size, self.size), x.dtype).at[:, : self.free.size].set(slope)
-        blocks = [(self.free.prior_residual(y), prior)]
+        of_free = [(self.free.prior_residual(y), slope), *(test[:2] for test in tests)]
+        blocks = [(r, jnp.zeros((len(r), self.size), x.dtype).at[:, : self.free.size].set(J)) for r, J in of_free]
         for k, part in enumerate(parts):
             blocks.append((part.residuals, self._over_all_unknowns(k, np.arange(len(part.residuals)), part.jacobian)))
         gaps, gaps_J = jnp.zeros(0), jnp.zeros((0, self.size))
@@ -104,12 +117,14 @@ class Problem:
             gaps, gaps_J = self._gaps(parts)
             blocks.append((self.continuity.weight * (gaps + self.continuity.dual), self.continuity.weight * gaps_J))
         residuals, jacobians = zip(*((r.ravel(), J.reshape(-1, self.size)) for r, J in blocks), strict=True)
-        return Linearisation(jnp.concatenate(residuals), jnp.concatenate(jacobians), parts, gaps, gaps_J)
+        return Linearisation(jnp.concatenate(residuals), jnp.concatenate(jacobians), parts, gaps, gaps_J, tests)
 
     def cost(self, x: Float[Array | np.ndarray, " x"]) -> Array:
         """Half the sum of squares, without the Jacobian of the residuals: for reverse-mode differentiation."""
         y, zs = self.split(x)
         total = jnp.sum(self.free.prior_residual(y) ** 2)
+        for test in self.tests:
+            total = total + jnp.sum(test.evaluated(self.model.system, self.free.insert(self.free.theta(y)))[0] ** 2)
         for batch, z in zip(self.batches, zs, strict=True):
             total = total + jnp.sum(evaluate_batch(self.model, self.free, batch, y, z, self.scale).residuals ** 2)
         return total / 2
@@ -160,8 +175,11 @@ def without_jacobian(problem: Problem, x: Float[Array | np.ndarray, " x"]) -> Li
     for batch, z in zip(problem.batches, zs, strict=True):
         found = evaluate_batch(problem.model, problem.free, batch, y, z, problem.scale)
         parts.append(Linearised(found.residuals, None, found.ends, None, found.channels, found.result))
-    r = jnp.concatenate([problem.free.prior_residual(y), *(part.residuals.ravel() for part in parts)])
-    return Linearisation(r, None, tuple(parts), jnp.zeros(0), jnp.zeros((0, problem.size)))
+    params = problem.free.insert(problem.free.theta(y))
+    tests = [test.evaluated(problem.model.system, params) for test in problem.tests]
+    r = jnp.concatenate([problem.free.prior_residual(y), *(r for r, _ in tests), *(part.residuals.ravel() for part in parts)])
+    evaluated = tuple(Evaluated(r, None, predictions) for r, predictions in tests)
+    return Linearisation(r, None, tuple(parts), jnp.zeros(0), jnp.zeros((0, problem.size)), evaluated)
 
 
 @compiled
@@ -197,8 +215,13 @@ def with_zero_values(model: Model, free: Free, experiment: Experiment) -> Experi
     return eqx.tree_at(lambda e: e.values, bare, zeros, is_leaf=lambda x: x is None)
 
 
+NOT_STEADY = "no steady state was found near which a test could be predicted, or a measured mode does not oscillate there."
+
+
 def failure_of(found: Linearisation) -> str | None:
-    """Why a motion could not be computed, or None."""
+    """Why a motion or a test could not be computed, or None."""
+    if not all(np.all(np.isfinite(np.asarray(test.residuals))) for test in found.tests):
+        return NOT_STEADY
     for part in found.batches:
         if not np.all(np.isfinite(np.asarray(part.residuals))):
             return reason_of(part.result)

@@ -15,7 +15,8 @@ from .channel_sigma import sigmas_of
 from .channels import Channel
 from .experiment import Experiment
 from .fit_card import card, estimates_by_name
-from .prediction import Prediction, predicted
+from .linear_test import LinearTest
+from .prediction import Prediction, predicted, predicted_test
 from .problem import Problem
 from .profile_likelihood import profile_end
 
@@ -66,6 +67,9 @@ class Fit:
       `prediction_errors`: standard errors of the predictions, NaN where nothing was measured.
     - `channels`: a flat list of how well each `Channel` is predicted.
 
+    A `ModalTest` among them has values by name, `"frequency"` and `"damping_ratio"`; a `FrequencyResponseTest` has complex ones, of which
+    errors are those of the real and of the imaginary part, as a complex number.
+
     Of the noise and the iteration:
 
     - `sigma`: σ̂, in units of the given sigma; where none was given, in units of the measurements, the geometric mean of those of the
@@ -92,7 +96,7 @@ class Fit:
     ```
     """
 
-    experiments: tuple[Experiment, ...]
+    experiments: tuple[Experiment | LinearTest, ...]
     params: PyTree
     estimates: dict[str, PyTree]
     standard_errors: dict[str, PyTree]
@@ -211,17 +215,19 @@ class Fit:
         )
         return lower, upper
 
-    def predict(self, experiment: Experiment, *, level: float = 0.95) -> Prediction:
+    def predict(self, experiment: Experiment | LinearTest, *, level: float = 0.95) -> Prediction:
         """What another experiment should show, with the confidence band due to the uncertainty of the parameters.
 
-        **Arguments:** `experiment`: its start is taken as exact; its `values` may be None. `level`: of the band, between 0 and 1.
+        **Arguments:** `experiment`: its start is taken as exact; its `values` may be None. Or a `ModalTest` or `FrequencyResponseTest`.
+        `level`: of the band, between 0 and 1.
 
         **Returns:** a `Prediction`. Where the sensors have a delay, its `motion` has one more sample, the first one at the start.
 
         **Raises:** `ValueError` where the motion cannot be computed, or `level` is out of range.
         """
         covariance = self.sigma_scale**2 * self.x_covariance
-        return predicted(self.problem, self.x, covariance, experiment, self.quantile(level))
+        of = predicted_test if isinstance(experiment, LinearTest) else predicted
+        return of(self.problem, self.x, covariance, experiment, self.quantile(level))  # type: ignore[operator]
 
     def to_dict(self, *, level: float = 0.95) -> dict[str, Any]:
         """The fit as plain data for `json.dumps`. None stands for a number that does not exist, e.g. the error of an undetermined one.

@@ -12,10 +12,11 @@ import numpy as np
 from .autocorrelation import independent_samples
 from .channel_sigma import too_short
 from .channels import channels_of
-from .experiment import Experiment
 from .experiment_statistics import ended_inputs, own_estimates, predictions_of, with_estimates
 from .identifiability import correlation_of
 from .levenberg_marquardt import CONVERGED, INTERRUPTED, REASONS, STEP_LIMIT, UNRELATED, Outcome
+from .linear_test import LinearTest, in_given_order
+from .linear_test_statistics import channels_of_test, doubts, predicted_tests
 from .minimum import Minimum
 from .multiple_shooting import Segments
 from .parameter_stability import different_halves
@@ -27,7 +28,7 @@ from .uncertainty import Uncertainty, uncertainty_of, undetermined_parameters
 Fields = dict[str, Any]  # of a Fit, by name
 
 
-def report(problem: Problem, experiments: Sequence[Experiment], outcome: Outcome, segments: Segments) -> Fit:
+def report(problem: Problem, experiments: Sequence[Any], outcome: Outcome, segments: Segments) -> Fit:
     """The fit that the outcome of an iteration means."""
     minimum = Minimum.of(problem, experiments, outcome, segments)
     uncertainty = uncertainty_of(minimum)
@@ -48,12 +49,12 @@ def report(problem: Problem, experiments: Sequence[Experiment], outcome: Outcome
 
 def _noise(minimum: Minimum, uncertainty: Uncertainty) -> Fields:
     """How many measurements and unknowns there are, and how large the residuals are."""
-    r = minimum.measured
+    r, beside = np.append(minimum.measured, minimum.of_tests), minimum.problem.beside
     unknown_count = minimum.x.size - uncertainty.known.null.shape[1] - len(np.asarray(minimum.found.gaps_jacobian))
-    squares = np.sum(np.asarray(minimum.found.residuals)[: minimum.size + minimum.flat.size] ** 2)
-    sigma = _sigma(r, minimum.problem, max(r.size - unknown_count, 0))
+    squares = np.sum(np.asarray(minimum.found.residuals)[: beside + minimum.flat.size] ** 2)
+    sigma = _sigma(r, minimum.problem, max(minimum.measurements - unknown_count, 0))
     return {
-        "measurements": r.size,
+        "measurements": minimum.measurements,
         "unknown_count": unknown_count,
         "absolute": minimum.absolute,
         "sigma": sigma,
@@ -104,7 +105,8 @@ def _parameters(minimum: Minimum, uncertainty: Uncertainty, scale: float) -> Fie
 
 def _unknowns(minimum: Minimum, uncertainty: Uncertainty, scale: float) -> Fields:
     """Estimates of the experiments' own unknowns, and their errors."""
-    own = own_estimates(minimum, uncertainty.known, scale)
+    of_tests: list[tuple[dict[str, Any], dict[str, Any]]] = [({}, {}) for _ in minimum.problem.tests]
+    own = in_given_order(minimum.experiments, own_estimates(minimum, uncertainty.known, scale), of_tests)
     return {
         "experiments": tuple(with_estimates(e, estimates) for e, (estimates, _) in zip(minimum.experiments, own, strict=True)),
         "unknowns": [estimates for estimates, _ in own],
@@ -114,13 +116,17 @@ def _unknowns(minimum: Minimum, uncertainty: Uncertainty, scale: float) -> Field
 
 def _predictions(minimum: Minimum, uncertainty: Uncertainty, scale: float) -> Fields:
     """What each experiment should have shown, and how well each channel is predicted."""
-    found = predictions_of(minimum, uncertainty.known.covariance)
-    pairs = enumerate(zip(minimum.experiments, found, strict=True))
+    covariance = uncertainty.known.covariance
+    found = in_given_order(minimum.experiments, predictions_of(minimum, covariance), predicted_tests(minimum, covariance))
+    nears = iter(part.near for part in minimum.problem.tests)
+    of_each = lambda k, e, one: (
+        channels_of_test(k, e, next(nears), one.residuals) if isinstance(e, LinearTest) else channels_of(k, e.values, one.residuals)
+    )
     return {
         "predictions": [one.predictions for one in found],
         "residuals": [one.residuals for one in found],
         "prediction_errors": [jax.tree.map(lambda deviation: scale * deviation, one.deviations) for one in found],
-        "channels": [channel for k, (e, one) in pairs for channel in channels_of(k, e.values, one.residuals)],
+        "channels": [row for k, (e, one) in enumerate(zip(minimum.experiments, found, strict=True)) for row in of_each(k, e, one)],
     }
 
 
@@ -136,12 +142,12 @@ def _remarks(minimum, uncertainty, sigma, channels):
         r = np.nan_to_num(np.asarray(minimum.found.residuals), posinf=0.0)  # of a motion that could not be computed
         at_bounds = list(on_bounds(free, minimum.theta, r @ np.asarray(minimum.found.jacobian)[:, :p]))
     times_noise = sigma if minimum.absolute else 1.0
-    independent = independent_samples(minimum.measured.size, uncertainty.correlated)
+    independent = independent_samples(minimum.measurements, uncertainty.correlated)
     unfinished = int(minimum.outcome.best.status) in (STEP_LIMIT, INTERRUPTED)  # halves are compared at a minimum
     different = None if unfinished else different_halves(minimum, uncertainty)
-    halves = on_halves(free.entries, different, len(minimum.experiments))
+    halves = on_halves(free.entries, different, len(minimum.recordings))
     misfit = on_misfit(_relative_size(minimum), times_noise, independent, halves, channels, explained=bool(at_bounds))
-    return [*remarks, *at_bounds, *on_inputs(ended_inputs(minimum.experiments, free.params)), *misfit]
+    return [*remarks, *at_bounds, *doubts(minimum), *on_inputs(ended_inputs(minimum.recordings, free.params)), *misfit]
 
 
 def _on_sigma(minimum):

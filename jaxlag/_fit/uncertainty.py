@@ -39,13 +39,13 @@ def uncertainty_of(minimum: Minimum) -> Uncertainty:
 
 
 def _jacobian(minimum):
-    """Of priors and residuals; those of a robust loss as if it were quadratic."""
+    """Of priors, tests and residuals; those of a robust loss as if it were quadratic."""
     if minimum.found.jacobian is None:
         return None
-    p, flat, loss = minimum.size, minimum.flat, minimum.problem.model.loss
-    J = np.asarray(minimum.found.jacobian)[: p + flat.size].copy()
+    beside, flat, loss = minimum.problem.beside, minimum.flat, minimum.problem.model.loss
+    J = np.asarray(minimum.found.jacobian)[: beside + flat.size].copy()
     if loss is not None:
-        J[p:] /= loss.slope(np.where(np.isfinite(flat), flat, 0) / minimum.problem.scale)[:, None]
+        J[beside:] /= loss.slope(np.where(np.isfinite(flat), flat, 0) / minimum.problem.scale)[:, None]
     return J
 
 
@@ -59,7 +59,8 @@ def sandwich(minimum: Minimum, J: np.ndarray, covariance: np.ndarray, weighted: 
     """The covariance over σ² of what the columns of J belong to, with the sandwich where residuals are correlated; and over how many
     samples they are. `weighted`: the residuals of each batch, like those of the minimum; `covariance`: as if they were white.
     """
-    p, begins = minimum.size, minimum.size + np.cumsum([0, *(r.size for r in weighted)])
+    beside = minimum.problem.beside
+    begins = beside + np.cumsum([0, *(r.size for r in weighted)])
 
     def of_experiment(segments, rows_of):
         """Rows of its segments one after the other, (samples, channels, ...)."""
@@ -75,7 +76,7 @@ def sandwich(minimum: Minimum, J: np.ndarray, covariance: np.ndarray, weighted: 
     if not any(lengths):
         return covariance, 0
     power = np.nanmean(np.concatenate([r.ravel() for r in series]) ** 2)
-    middle = J[:p].T @ J[:p]
+    middle = J[:beside].T @ J[:beside]
     for segments, r in zip(segments_of_each, series, strict=True):
         sizes = np.ones(r.shape[1]) if minimum.absolute else np.sqrt(np.nanmean(r**2, axis=0) / power)
         middle = middle + coloured_information(of_experiment(segments, jacobian_of), r, sizes)

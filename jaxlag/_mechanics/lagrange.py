@@ -51,6 +51,19 @@ def constraint_rows(flat: Flat, t, q, v) -> tuple[Float[Array, " m"], Float[Arra
     return psi, G.as_matrix(), gamma
 
 
+def imbalance(flat: Flat, t, q, v, qddot, multipliers) -> tuple[Float[Array, " n"], Float[Array, " m"]]:
+    """M q̈ − f − Gᵀλ and G q̈ + γ, which are zero in motion: derivatives along the motion, without a matrix."""
+
+    def parts(t, q, v):
+        """∂L/∂q, ∂L/∂q̇, ψ and Gᵀλ, each computed once."""
+        psi, pulled = jax.vjp(lambda v: velocity_residual(flat, t, q, v), v)
+        return *jax.grad(flat.lagrangian, argnums=(1, 2))(t, q, v), psi, pulled(multipliers)[0]
+
+    now, rates = jax.jvp(parts, (t, q, v), (jnp.ones_like(t), v, qddot))
+    (force, _, _, reaction), (_, momentum_rate, psi_rate, _) = now, rates
+    return momentum_rate - force - applied_force(flat, t, q, v, multipliers) - reaction, psi_rate
+
+
 def mass_matrix(
     system: System, q: PyTree, qdot: PyTree, params: PyTree = None, *, t: Any = 0.0, states: PyTree = None
 ) -> Float[Array, "n n"]:

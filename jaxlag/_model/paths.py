@@ -1,13 +1,17 @@
 """Names of what a pytree holds: its leaves, their numbers, and what lies within a name."""
 
+from collections.abc import Callable
+from typing import Any
+
 import jax
 import numpy as np
 from jaxtyping import PyTree
 
 
-def leaf_names(tree: PyTree, bare: str = "q") -> tuple[str, ...]:
+def leaf_names(tree: PyTree, bare: str = "q", is_leaf: Callable[[Any], bool] | None = None) -> tuple[str, ...]:
     """The leaves by their paths, e.g. "wheel.phi"; `bare` names a leaf without a path."""
-    paths = [jax.tree_util.keystr(path, simple=True, separator=".") for path, _ in jax.tree_util.tree_flatten_with_path(tree)[0]]
+    leaves = jax.tree_util.tree_flatten_with_path(tree, is_leaf)[0]
+    paths = [jax.tree_util.keystr(path, simple=True, separator=".") for path, _ in leaves]
     return tuple(path or bare for path in paths)
 
 

@@ -13,6 +13,7 @@ from .._program.jit import is_concrete
 from .deprecation import warn_renamed
 from .numbers import number, numbers
 from .signal_interpolation import AbstractInterpolation, Cubic, Linear, ZeroOrderHold, second_derivatives
+from .states import Flowing
 
 OLD_KINDS = {"hold": ZeroOrderHold(), "linear": Linear(), "cubic": Cubic()}
 
@@ -178,11 +179,12 @@ def broken_signals(params: PyTree) -> list[Signal]:
 
 
 def at_time(params: PyTree, t: Any) -> PyTree:
-    """`params` with each piece of a signal at the time t."""
-    is_piece = lambda node: isinstance(node, Piece)
-    if not any(map(is_piece, jax.tree.leaves(params, is_leaf=is_piece))):
+    """`params` with each piece of a signal, and each entry that flows, at the time t."""
+    moves = lambda node: isinstance(node, (Piece, Flowing))
+    if not any(map(moves, jax.tree.leaves(params, is_leaf=moves))):
         return params
-    return jax.tree.map(lambda node: dataclasses.replace(node, now=t) if is_piece(node) else node, params, is_leaf=is_piece)
+    now = lambda node: dataclasses.replace(node, now=t) if isinstance(node, Piece) else node(t) if isinstance(node, Flowing) else node
+    return jax.tree.map(now, params, is_leaf=moves)
 
 
 def moves_smoothly(moving: PyTree, params: PyTree) -> bool:

@@ -180,9 +180,14 @@ class EquationsOfMotion:
         """The root mean square."""
         return root_mean_square(error)
 
-    def margins(self, t, y, args):
-        """Per element of dry friction, the margin of its mode, negative beyond its end; and then its bound."""
-        return _margins(self, t, y, args)
+    def margins(self, t, y, args, start):
+        """Per element of dry friction, the margin of its mode, negative beyond its end; and then its bound.
+
+        The mode and the sampled states are those of `start`, y at the start of the step: what these alone determine is computed once.
+        """
+        here, there = self.parts(y), self.parts(start)
+        still = {"u": there.u, "held": there.held} | ({"sigma": there.sigma} if self.rows == self.elements else {})  # others may turn
+        return _margins(self, t, here._replace(**still), args)
 
     def changed(self, t, y, args, ended):
         """y in the mode that follows when those of the elements `ended` end; whether there is one; whether slip has come to rest."""
@@ -245,8 +250,7 @@ def _updated(equations: EquationsOfMotion, t, y, args, due):
 
 
 @jitted
-def _margins(equations: EquationsOfMotion, t, y, args):
-    parts = equations.parts(y)
+def _margins(equations: EquationsOfMotion, t, parts, args):
     q, v, sigma, held = parts.q, parts.v, parts.sigma, parts.held
     flat, _, elements = equations.mode(t, parts, args)
     assert elements is not None  # asked of systems with dry friction alone

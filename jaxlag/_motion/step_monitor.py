@@ -62,11 +62,11 @@ class _Search(NamedTuple):
 
 
 def first_end(margins: Callable, path: Callable, t0, t1, elements: int, scales: Any, exactly: Any = True) -> Seen:
-    """When the first of `margins(t, y)` turns negative along a `path`; the elements' bounds come after their margins, and count as well.
+    """When the first of `margins(t, y, start)` turns negative along a `path`; the elements' bounds come after their margins, and count.
 
-    Not `exactly`: only whether there is one.
+    `start` is y at the start, where what stays as it is along the path may be taken from. Not `exactly`: only whether there is an end.
     """
-    of_time_alone = time_dependence(margins, t0, path(t0))
+    of_time_alone = time_dependence(lambda t, y: margins(t, y, y), t0, path(t0))
     look, near = _looking(margins, path, t0, t1, of_time_alone), NEAR * scales.rounding
     brief = jnp.maximum(BRIEF * scales.duration, near)
     if of_time_alone is not None and not of_time_alone.is_bounded:
@@ -74,7 +74,8 @@ def first_end(margins: Callable, path: Callable, t0, t1, elements: int, scales: 
 
     def closer(search):
         low, high, found, rounds, sections, *_, largest = search
-        ts = jnp.where(found, _around(low, high, *search[5:7]), low + (high - low) / LOOKS * np.arange(LOOKS + 1))
+        evenly = lambda: low + (high - low) / LOOKS * np.arange(LOOKS + 1)
+        ts = jax.lax.cond(found, lambda: _around(low, high, *search[5:7]), evenly)
         ts = jnp.where(np.arange(ts.size) == ts.size - 1, high, ts)
         part = jnp.diff(ts)[:, None]
         value, slope, change = look(ts)
@@ -157,9 +158,11 @@ def _dips(value, slope, part):
 def _looking(margins, path, t0, t1, of_time_alone: TimeDependence | None) -> Callable[..., Looks]:
     """Looks at some times along a path."""
 
+    start = path(t0)
+
     def along(t):
         y, dy = jax.jvp(path, (t,), (jnp.ones_like(t),))
-        return jax.jvp(margins, (t, y), (jnp.ones_like(t), dy))
+        return jax.jvp(lambda t, y: margins(t, y, start), (t, y), (jnp.ones_like(t), dy))
 
     if of_time_alone is None:
         changed = lambda ts: jnp.zeros(())

@@ -1,7 +1,10 @@
 """Derivatives of formulas with nonsmooth terms: |u|, sign, floor, ceiling, min and max."""
 
+import functools
+from collections.abc import Callable
+
 import sympy
-from sympy import Expr, Symbol
+from sympy import Abs, Dummy, Expr, Symbol, sign
 
 
 class _Abs(sympy.Function):
@@ -30,3 +33,20 @@ def derivative(formula: Expr, symbol: Symbol) -> Expr:
     for nonsmooth, differentiable in NONSMOOTH.items():
         formula = formula.replace(differentiable, nonsmooth)
     return formula
+
+
+class Side(Dummy):
+    """The side from which a kink is approached, 1 or −1."""
+
+
+def one_sided(formula: Expr, is_zero: Callable[[Expr], bool]) -> Expr:
+    """The formula beside its kinks: |u| as s u and sign u as s, with a `Side` s, where u is zero.
+
+    What is smooth there has derivatives without s: |u| u, but not |u|.
+    """
+    sides: dict[Expr, Side] = {}
+    at_kink = lambda e: isinstance(e, (Abs, sign)) and is_zero(e.args[0])
+    beside = lambda e: sides.setdefault(e.args[0], Side(real=True)) * (e.args[0] if isinstance(e, Abs) else 1)
+    for extremum, s in ((sympy.Max, 1), (sympy.Min, -1)):
+        formula = formula.replace(extremum, lambda *parts, s=s: functools.reduce(lambda x, y: (x + y + s * Abs(x - y)) / 2, parts))
+    return formula.replace(at_kink, beside)

@@ -1,14 +1,44 @@
 """The equations of motion of a system, from the functions that are simulated. SymPy is imported when they are asked for."""
 
 from collections.abc import Collection
+from typing import Any, overload
 
 import jax
 from jaxtyping import PyTree
 
 from .._model.deprecation import warn_renamed
 from .._model.system import System
+from .linearised_result import LinearisedEquations
 from .result import Details, Equations, arranged
 from .to_sympy import require_sympy
+
+
+@overload
+def equations(
+    system: System,
+    q: PyTree,
+    params: PyTree = None,
+    *,
+    multipliers: bool = False,
+    positive: str | Collection[str] = (),
+    linearised_at: None = None,
+    inputs: str | Collection[str] = (),
+    style: str | None = None,
+) -> Equations: ...
+
+
+@overload
+def equations(
+    system: System,
+    q: PyTree,
+    params: PyTree = None,
+    *,
+    multipliers: bool = False,
+    positive: str | Collection[str] = (),
+    linearised_at: object,
+    inputs: str | Collection[str] = (),
+    style: str | None = None,
+) -> LinearisedEquations: ...
 
 
 def equations(
@@ -18,8 +48,10 @@ def equations(
     *,
     multipliers: bool = False,
     positive: str | Collection[str] = (),
+    linearised_at: Any = None,
+    inputs: str | Collection[str] = (),
     style: str | None = None,
-) -> Equations:
+) -> Equations | LinearisedEquations:
     r"""The equations of motion of a system on paper, from the same functions that are simulated.
 
     $$ \frac{d}{dt}\frac{\partial L}{\partial\dot q} - \frac{\partial L}{\partial q} + \frac{\partial D}{\partial\dot q} = Q + G^T\lambda $$
@@ -37,17 +69,25 @@ def equations(
       of these constraints afterwards (Lagrange's equations of the second kind); `True` keeps all coordinates and all multipliers (of the
       first kind).
     - `positive`: names of parameters, coordinates or multipliers to be taken as positive, so that √(l²) is l.
+    - `linearised_at`: an equilibrium, as a tree like q of numbers, text or SymPy expressions, e.g. `{"phi": 0, "y": "l - m*g/c"}`; or a
+      pair (q, q̇), a steady motion at these constant rates. In a mapping, coordinates may be left out: constraints determine them, or they
+      keep their symbols; and parameters may be given beside them, such as a preload `"s": "m*g/c"`. Unknown names are new symbols.
+    - `inputs`: with `linearised_at`, names of parameters u that change with time; their deviations stand on the right-hand side.
     - `style`: the old spelling of `multipliers`: `"first kind"` is `True`, `"second kind"` is `False`.
 
     States beside q follow the equations of motion: ż = rate, and u⁺ = update of a sampled one where that has a formula.
 
-    **Returns:** `Equations`. The multipliers have the sign of M q̈ = f + Gᵀλ. Any consistent set of units.
+    **Returns:** `Equations`, whose multipliers have the sign of M q̈ = f + Gᵀλ. With `linearised_at`, `LinearisedEquations`:
+    M δq̈ + (C + G) δq̇ + (K + N) δq = B δu in independent coordinates, compared with the derivatives of the simulation. Any consistent set
+    of units.
 
     **Raises:** `ValueError` or `TypeError` where an argument or a function of the system is of the wrong kind, where two symbols would have
     the same name, or where the equations differ from the simulation, as they do where a function has a derivative rule that does not follow
-    from its formula; `NotImplementedError`, which names the line, where an operation has no formula; `ImportError` without SymPy.
+    from its formula; where `linearised_at` is neither an equilibrium nor a steady motion (the message says what accelerates, and when it
+    would be one), or has no linear equations of second order (nonholonomic constraints, a kink of friction); `NotImplementedError`, which
+    names the line, where an operation has no formula; `ImportError` without SymPy.
 
-    **Source:** Goldstein, Classical Mechanics, 3rd ed., sections 1.4, 1.5 and 2.4.
+    **Source:** Goldstein, Classical Mechanics, 3rd ed., sections 1.4, 1.5, 2.4 and 6.2.
 
     ```python
     import jaxlag as jl
@@ -55,6 +95,8 @@ def equations(
     on_paper = jl.equations(vehicle.system, vehicle.q0, vehicle.params)
     print(on_paper)  # Θₛ φ̈ + 2 a² b φ̇ + 2 a² c φ = 0
     print(on_paper.derivation())
+    still = {"phi": 0, "y": "l - M*g/(2*c)", "M0": "k*r*v*abs(v)"}
+    print(jl.equations(vehicle.system, vehicle.q0, vehicle.params, linearised_at=still))  # ω₀² = 2 a² c/Θₛ
     ```
     """
     require_sympy("equations")
@@ -62,6 +104,8 @@ def equations(
         raise TypeError(
             f"`multipliers` must be True or False, but is {multipliers!r}. Use True for Lagrange's equations of the first kind."
         )
+    if linearised_at is None and inputs:
+        raise ValueError(f"`inputs` must come with `linearised_at`, but is {inputs!r} without it. Give the state, or leave it out.")
     from . import derivation, symbolic_system
     from .coordinate_elimination import eliminate_coordinates, reduce_system
     from .notation import Notation
@@ -70,6 +114,8 @@ def equations(
 
     if style is not None:
         multipliers = _from_style(style)
+    if linearised_at is not None and multipliers:
+        raise ValueError("`multipliers` must be False with `linearised_at`, but is True. Linear equations are in independent coordinates.")
     positive = (positive,) if isinstance(positive, str) else tuple(positive)
     coordinates, constants = symbol_tree(q, "q", positive), symbol_tree(params, "params", positive)
     states = symbolic_system.States.of(system, coordinates, constants)
@@ -78,6 +124,10 @@ def equations(
     simplify = Simplifier(full.qdot, parameters)
     steps = derivation.derive(full, simplify)
     symbolic_system.check_against_simulation(system, full, steps, coordinates, constants, states)
+    if linearised_at is not None:
+        from .linearised import linearised
+
+        return linearised(system, full, steps, linearised_at, inputs, parameters, coordinates, constants, states)
     eliminated = {} if multipliers else eliminate_coordinates(full, simplify)
     reduced, reduced_steps, qddot, reactions = reduce_system(full, steps, eliminated, simplify)
     details = Details(

@@ -14,6 +14,7 @@ from .textbook_printer import Textbook, split_name
 class Latex(Textbook, LatexPrinter):
     """Formulas as LaTeX."""
 
+    deviation = r"\delta "
     LETTERS: ClassVar = {"phi": r"\varphi", "epsilon": r"\varepsilon"}
 
     def __init__(self, notation: Notation):

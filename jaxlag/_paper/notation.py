@@ -20,6 +20,7 @@ class Notation:
         self.place = {symbol: i for i, symbol in enumerate(self.kind)}
         derived = (1, s.q, s.qdot), (2, s.q, s.qddot), (1, s.z, s.zdot)
         self.dotted = {y: (x.name, dots) for dots, xs, ys in derived for x, y in zip(xs, ys, strict=True)}
+        self.deviations: frozenset[Symbol] = frozenset()  # symbols of names such as δphi, which are written δφ
 
     def highest(self, formula: Expr) -> int:
         """The highest kind among the symbols of a formula; −1 for a number."""

@@ -95,13 +95,13 @@ class Equations:
     def __repr__(self) -> str:
         from .unicode_printer import Unicode
 
-        return _lines(self._sections(Unicode(self._details.notation)))
+        return lines(self._sections(Unicode(self._details.notation)))
 
     def latex(self) -> str:
         """LaTeX of what `print` shows: an `aligned` environment (amsmath)."""
         from .latex_printer import Latex
 
-        return _aligned(self._sections(Latex(self._details.notation)))
+        return aligned(self._sections(Latex(self._details.notation)))
 
     def _repr_latex_(self) -> str:
         return f"$${self.latex()}$$"
@@ -186,13 +186,13 @@ class Derivation:
     def __repr__(self) -> str:
         from .unicode_printer import Unicode
 
-        return _lines(self._sections(Unicode(self._equations._details.notation)))
+        return lines(self._sections(Unicode(self._equations._details.notation)))
 
     def latex(self) -> str:
         """LaTeX of what `print` shows: an `aligned` environment (amsmath)."""
         from .latex_printer import Latex
 
-        return _aligned(self._sections(Latex(self._equations._details.notation)))
+        return aligned(self._sections(Latex(self._equations._details.notation)))
 
     def _repr_latex_(self) -> str:
         return f"$${self.latex()}$$"
@@ -222,10 +222,12 @@ def arranged(shape: tuple, formulas: Iterable) -> Any:
     return array if shape else array[()]
 
 
-def _lines(sections: Iterable[Section]) -> str:
+def lines(sections: Iterable[Section]) -> str:
+    """Sections as text, with an empty line between them."""
     return "\n\n".join("\n".join(f"{left} = {right}" for left, right in section) for section in sections if section)
 
 
-def _aligned(sections: Iterable[Section]) -> str:
+def aligned(sections: Iterable[Section]) -> str:
+    """Sections as an `aligned` environment of LaTeX."""
     rows = [f"{left} &= {right}" for section in sections for left, right in section]
     return "\\begin{aligned}\n" + " \\\\\n".join(rows) + "\n\\end{aligned}"

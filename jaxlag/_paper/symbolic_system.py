@@ -70,7 +70,7 @@ def trace_system(
     _check_names([t, *x, *v, *a, *multipliers, *(symbol for symbol, _ in params.paths), *beside], positive)
 
     def functions(t, q, v, multipliers, params_, states):
-        flat = _bound(system, like, params_, params, StatesAt(states, t, q, v))
+        flat = bound(system, like, params_, params, StatesAt(states, t, q, v))
         D = sum((D(t, q, v, multipliers) for D in flat.dissipations.values()), start=jnp.zeros(()))
         Q = sum((Q(t, q, v, multipliers) for Q in flat.forces.values()), start=jnp.zeros_like(q))
         rates = flat.state_rates(t, q, v)
@@ -78,7 +78,7 @@ def trace_system(
         return flat.lagrangian(t, q, v), D, Q, flat.holonomic(t, q), flat.nonholonomic(t, q, v), rates
 
     def updates(t, q, v, params_, states):
-        found = _bound(system, like, params_, params, StatesAt(states, t, q, v)).updates(t, q, v)
+        found = bound(system, like, params_, params, StatesAt(states, t, q, v)).updates(t, q, v)
         return ravelled([found[name] for name in sampled(system)], q.dtype)
 
     vector = lambda symbols: filled((len(symbols),), symbols)
@@ -94,7 +94,8 @@ def trace_system(
     return SymbolicSystem(*symbols, L[()], D[()], Q, g, nonholonomic, **drawn), multiplier_rows
 
 
-def _bound(system: System, like: PyTree, numbers: PyTree, params: SymbolTree, at: StatesAt) -> Flat:
+def bound(system: System, like: PyTree, numbers: PyTree, params: SymbolTree, at: StatesAt) -> Flat:
+    """The system over flat vectors, with numbers for the symbols of its parameters."""
     return bind(system, jax.tree.map(lambda leaf: jnp.zeros(leaf.shape), like), eqx.combine(numbers, params.rest), at)
 
 
@@ -124,7 +125,7 @@ def check_against_simulation(system: System, s: SymbolicSystem, steps: Steps, q:
     like = coordinates(q.example, "q")
 
     def simulated(t, q_, v, multipliers, params_, states_):
-        flat = _bound(system, like, params_, params, StatesAt(states_, t, q_, v))
+        flat = bound(system, like, params_, params, StatesAt(states_, t, q_, v))
         M, force = inertia(flat, t, q_, v)
         _, G, gamma = constraint_rows(flat, t, q_, v)
         return M.as_matrix(), force + applied_force(flat, t, q_, v, multipliers), G, gamma
@@ -139,10 +140,10 @@ def check_against_simulation(system: System, s: SymbolicSystem, steps: Steps, q:
     symbols = [s.t, *s.q, *s.qdot, *s.multipliers, *(symbol for symbol, _ in (*params.paths, *states.tree.paths))]
     values = np.concatenate([np.ravel(part) for part in (*state, *jax.tree.leaves(numbers))])
     point = dict(zip(symbols, map(sympy.Float, values), strict=True))
-    point |= {v: sympy.Float(_value(rate.xreplace(point)).real) for v, rate in zip(s.zdot, s.rates, strict=True)}
+    point |= {v: sympy.Float(number(rate.xreplace(point)).real) for v, rate in zip(s.zdot, s.rates, strict=True)}
     derived = {"M": steps.M, "f": steps.f, "G": steps.G, "γ": steps.gamma}
     for (name, matrix), want in zip(derived.items(), map(np.ravel, simulation), strict=True):
-        got = np.array([_value(entry.xreplace(point)) for entry in matrix])
+        got = np.array([number(entry.xreplace(point)) for entry in matrix])
         error = np.abs(got - want)
         if (error > 1e-9 * (1 + np.max(np.abs(want), initial=0))).any():  # NaN, where a function is undefined, compares as false
             raise ValueError(
@@ -151,5 +152,6 @@ def check_against_simulation(system: System, s: SymbolicSystem, steps: Steps, q:
             )
 
 
-def _value(number: Any) -> complex:
-    return complex(number) if number.is_finite else complex("nan")
+def number(formula: Any) -> complex:
+    """The value of a formula without symbols; NaN where it is not finite."""
+    return complex(formula) if formula.is_finite else complex("nan")

@@ -15,6 +15,7 @@ class Textbook(Printer):
     """An abstract printer: parameters before coordinates before velocities, ẍ after its factor."""
 
     minus = "-"
+    deviation = "δ"  # in front of what differs little from its value
 
     def __init__(self, notation: Notation, **settings: Any):
         super().__init__(settings)
@@ -57,7 +58,8 @@ class Textbook(Printer):
         raise NotImplementedError
 
     def _print_Symbol(self, symbol: Symbol, style: Any = None) -> str:
-        return self.letter(*self.notation.dotted.get(symbol, (symbol.name, 0)))
+        name, dots = self.notation.dotted.get(symbol, (symbol.name, 0))
+        return self.deviation + self.letter(name[1:], dots) if symbol in self.notation.deviations else self.letter(name, dots)
 
     def _print_Add(self, formula: Expr, order: Any = None) -> str:
         first, *others = self.notation.terms(formula)

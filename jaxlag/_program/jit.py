@@ -108,6 +108,21 @@ def numpy_for(*trees: PyTree) -> Any:
     return np if is_concrete(*trees) else jnp
 
 
+def seen(tree: PyTree) -> PyTree | None:
+    """The values as Python may look at them: of what is differentiated its value, of a batch the first; None where `jit` hides them."""
+    leaves, structure = jax.tree.flatten(tree)
+    leaves = [_seen(leaf) for leaf in leaves]
+    return None if _has_tracers(leaves) else jax.tree.unflatten(structure, leaves)
+
+
+def _seen(leaf):
+    leaf = jax.lax.stop_gradient(leaf)
+    while isinstance(leaf, jax.core.Tracer) and hasattr(leaf, "batch_dim"):
+        values = leaf.val if leaf.batch_dim is None else jnp.take(leaf.val, 0, axis=leaf.batch_dim)
+        leaf = jax.lax.stop_gradient(values)
+    return leaf
+
+
 def is_concrete(*trees: PyTree) -> bool:
     """Whether the values are known, so that Python may look at them; under `jit` and `vmap` they are not."""
     return not _has_tracers(jax.tree.leaves(trees))

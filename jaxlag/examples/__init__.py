@@ -1,1 +1,1 @@
-"""Example systems, ready to import: `from jaxlag.examples import pendulum, stribeck, vehicle`."""
+"""Example systems, ready to import: `from jaxlag.examples import bicycle, pendulum, stribeck, vehicle`."""

@@ -193,6 +193,8 @@ OF_A_WRONG_TYPE = {
     "jl.Experiment([0, 1], [1.0, 2.0], 1.0, 0.0, delay=np.ones(2))": "`delay` must be one number, but has shape (2,)",
     'jl.Experiment([0, 1], [1.0, 2.0], 1.0, 0.0, observe="x")': "`observe` must be a function, but is 'x'",
     "jl.Experiment([0, 1], [1.0, 2.0], 1.0, 0.0, params=[1.0])": "`params` of an experiment must be a mapping, but is a list",
+    "jl.ModalTest([1.0], 0.0, sigma=0.1, params=[1.0])": "`params` of a test must be a mapping, but is a list",
+    'jl.ModalTest([1.0], 0.0, sigma=0.1, observe="x")': "`observe` must be a function, but is 'x'",
     'jl.Regularised("x")': "`width` must be an array of real numbers, but is a str that is text",
     "jl.Projection(1.5)": "`iterations` must be an integer, but is 1.5",
     "jl.StickSlip(True)": "`max_transitions` must be an integer, but is True",

@@ -1,0 +1,1 @@
+"""Near an equilibrium or a steady motion: where it is, how the system moves there, and whether it is stable."""

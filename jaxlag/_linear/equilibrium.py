@@ -1,0 +1,204 @@
+"""Equilibria and steady motions: where nothing accelerates."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.flatten_util import ravel_pytree
+from jaxtyping import Array, Float, PyTree
+
+from .._model.numbers import number
+from .._model.paths import entry_names, is_within
+from .._model.state_values import given_states
+from .._model.system import System
+from .._model.validation import coordinates, parameters, state
+from .._program.jit import is_concrete, seen
+from .rest import Search, steady_state
+from .stability import stability, undecided
+
+
+class Equilibrium(eqx.Module):
+    """Where a system rests, or moves steadily.
+
+    - `q`, `qdot`: structured like the guess; `states`, `multipliers`: by name; `t`: the time.
+    - `friction`: by dissipation term with dry friction, the force that holds and the bound that it would have to exceed.
+    - `stability`: "stable", "unstable" or "neutral", by the potential energy on the constraints; elsewhere a sentence.
+    - `stiffness`: the second variation of the potential on the constraints, relative to M: squares of natural frequencies, ascending;
+      without inertia, the eigenvalues of the stiffness itself. None where there is no potential.
+    - `undecided`: coordinates on which nothing depends: they stay where they were.
+    """
+
+    q: PyTree
+    qdot: PyTree
+    states: dict[str, PyTree]
+    multipliers: dict[str, PyTree]
+    friction: dict[str, tuple[Array, Array]]
+    t: Float[Array | np.ndarray, ""]
+    stiffness: Float[Array, " k"] | None
+    stability: str = eqx.field(static=True)
+    undecided: tuple[str, ...] = eqx.field(static=True)
+
+    def __repr__(self) -> str:
+        if not is_concrete(self):
+            return "Equilibrium(traced)"
+        value = lambda tree: ", ".join(
+            f"{name} = {x:.6g}" for name, x in zip(entry_names(tree, "q"), np.asarray(ravel_pytree(tree)[0]), strict=True)
+        )
+        rows = [("at", value(self.q))]
+        if np.any(ravel_pytree(self.qdot)[0]):
+            rows.append(("moving with", value(self.qdot)))
+        rows += [(name, value(tree)) for name, tree in (("states", self.states), ("multipliers", self.multipliers)) if tree]
+        for name, (force, bound) in self.friction.items():
+            rows.append(("friction", f"{name}: {np.max(np.abs(force), initial=0.0):.4g} of {np.min(bound):.4g} that it can hold"))
+        rows.append(("stability", self.stability))
+        if self.undecided:
+            rows.append(("undecided", f"{', '.join(self.undecided)}: nothing depends on them"))
+        return "\n".join(
+            ["Equilibrium" if not np.any(ravel_pytree(self.qdot)[0]) else "Steady motion", *(f"  {n:<13}{v}" for n, v in rows)]
+        )
+
+
+def equilibrium(
+    system: System,
+    q: PyTree,
+    params: PyTree = None,
+    *,
+    t: Any = 0.0,
+    states: PyTree = None,
+    fixed: Sequence[str] = (),
+    stable: bool = False,
+) -> Equilibrium:
+    r"""Where a system rests.
+
+    $$ f(q, 0, \lambda) + G^T\lambda = 0, \qquad g(q) = 0, \qquad \dot z = 0 $$
+
+    Newton's method from the guess `q`, to whatever equilibrium is near, a minimum or not. Coordinates on which nothing depends stay where
+    they are. Without friction the equilibrium is a point; with dry friction it is the middle of a band, and where there is none without
+    friction, the guess itself, if friction can hold it.
+
+    **Arguments:** `q`, a guess, structured as for `simulate`; `params`, `t`, `states` (guesses, too) as for `acceleration`; `fixed`: names
+    of coordinates that stay as given, to choose one of many equilibria (what holds a coordinate by a force is a holonomic constraint);
+    `stable`: goes down in the potential energy to a minimum first, which asks for a system whose forces at rest all come from L. Any
+    consistent units.
+
+    **Returns:** an `Equilibrium`; print it. Differentiable in `params` to any order, by the implicit function theorem.
+
+    **Raises:** `ValueError` where no equilibrium was found, with the force that is left. Under `jit` all is NaN there.
+
+    **Source:** Goldstein, Classical Mechanics, 3rd ed., section 6.1.
+
+    ```python
+    import jax
+    import jax.numpy as jnp
+    import jaxlag as jl
+    system = jl.System(lambda q, qdot, m, c, g: 0.5 * m * qdot**2 - 0.5 * c * q**2 + m * g * q)
+    sag = lambda c: jl.equilibrium(system, 0.0, {"m": 2.0, "c": c, "g": 9.81}).q
+    sag(100.0)  # m g/c = 0.1962
+    jax.grad(sag)(100.0)  # −m g/c² = −0.001962
+    ```
+    """
+    q = coordinates(q, "q")
+    return _found(system, q, jax.tree.map(jnp.zeros_like, q), params, t, states, Search(fixed=_entries(q, fixed, "fixed"), stable=stable))
+
+
+def steady(
+    system: System,
+    q: PyTree,
+    qdot: PyTree,
+    params: PyTree = None,
+    *,
+    t: Any = 0.0,
+    states: PyTree = None,
+    fixed: Sequence[str] = (),
+    fixed_rates: Sequence[str] = (),
+) -> Equilibrium:
+    r"""A steady motion: some coordinates run uniformly, all others are at rest.
+
+    $$ f(q, \dot q, \lambda) + G^T\lambda = 0, \qquad \ddot q = 0, \qquad g(q) = 0, \qquad \psi(q, \dot q) = 0 $$
+
+    A spinning top, a governor, a rolling wheel. Coordinates run whose velocity in the guess `qdot` is not zero; nothing may depend on them
+    but by their velocities. Where more is unknown than the equations say, as the speed of a governor, the nearest to the guess is taken.
+
+    **Arguments:** as `equilibrium`, and `qdot`, a guess of the velocities; `fixed_rates`: names of coordinates whose velocity stays as
+    given. Any consistent units.
+
+    **Returns:** an `Equilibrium`, with its `qdot`. Differentiable in `params` and in what is fixed.
+
+    **Raises:** `ValueError` where no steady motion was found, or what was found does not stay as it is.
+
+    **Source:** Goldstein, Classical Mechanics, 3rd ed., section 8.3 (Routh's procedure, steady motion).
+
+    ```python
+    import jax.numpy as jnp
+    import jaxlag as jl
+    bead = jl.System(  # on a rotating hoop
+        lambda q, qdot, R, g: 0.5 * R**2 * (qdot["theta"] ** 2 + (jnp.sin(q["theta"]) * qdot["phi"]) ** 2) + g * R * jnp.cos(q["theta"])
+    )
+    at = jl.steady(bead, {"theta": 1.0, "phi": 0.0}, {"theta": 0.0, "phi": 5.0}, {"R": 1.0, "g": 9.81}, fixed_rates=["phi"])
+    at.q["theta"]  # arccos(g/(R φ̇²)) = 1.168
+    ```
+    """
+    q, qdot = state(q, qdot)
+    known = seen(qdot)
+    if known is None:
+        raise ValueError("`qdot` must be known outside of `jit` to say which coordinates run, but is hidden. Call `steady` from Python.")
+    runs = np.flatnonzero(np.asarray(ravel_pytree(known)[0]))
+    held = _entries(q, fixed_rates, "fixed_rates")
+    search = Search(fixed=_entries(q, fixed, "fixed"), running=tuple(int(i) for i in runs if i not in held))
+    return _found(system, q, qdot, params, t, states, search)
+
+
+def _entries(q, names, label):
+    """The numbers of q that the names stand for."""
+    if isinstance(names, str):
+        raise ValueError(f"`{label}` must be a list of names, but is the string {names!r}. Write `{label}=[{names!r}]`.")
+    entries = entry_names(q, "q")
+    for name in names:
+        if not any(is_within(entry, name) for entry in entries):
+            raise ValueError(f"`{label}` must name coordinates, but holds {name!r}. The coordinates are {', '.join(entries)}.")
+    return tuple(i for i, entry in enumerate(entries) if any(is_within(entry, name) for name in names))
+
+
+def _found(system: System, q: PyTree, qdot: PyTree, params: PyTree, t: Any, states: PyTree, search: Search) -> Equilibrium:
+    """The result of a search, and of one in which friction holds, where there is no other."""
+    if search.stable and system.force:
+        terms = ", ".join(repr(name) for name, _ in system.force)
+        raise ValueError(f"`stable` must be False where forces are not from L, but there are {terms}. Write their potential into L.")
+    t = number(t, "`t`", jax.tree.leaves(q)[0].dtype, cure="Pass one time, and use `jax.vmap` for several.")
+    given = system, t, q, qdot, parameters(params, q), given_states(system, states, q)
+    found, names = steady_state(search, *given), entry_names(q, "q")
+    values = seen(found)
+    if values is not None and not values.succeeded and found.friction:
+        found = steady_state(search._replace(held=True), *given)
+        values = seen(found)
+    if values is None:
+        return Equilibrium(*found[:6], None, "not known under `jit`", ())
+    values = jax.tree.map(np.asarray, values)
+    _refuse(values, names)
+    return Equilibrium(*found[:6], *stability(system, values), undecided(values, names))
+
+
+def _refuse(found, names):
+    """Raises where nothing was found."""
+    if found.succeeded and found.uniform:
+        return
+    if found.succeeded:
+        raise ValueError(
+            "`qdot` must run in coordinates on which nothing depends, but the motion found does not stay as it is. Let others run."
+        )
+    left = np.abs(np.nan_to_num(found.left, nan=np.inf))
+    i = int(np.argmax(left))
+    what = f"a force of {found.force[i]:.4g} is left on {names[i]!r}" if i < len(names) else "constraints or states are left unsatisfied"
+    if found.friction:
+        needed = ", ".join(
+            f"{name!r} would have to hold {np.max(np.abs(force)):.4g} and holds {np.min(bound):.4g}"
+            for name, (force, bound) in found.friction.items()
+        )
+        what = f"friction {needed}"
+    raise ValueError(
+        f"`q` must be near an equilibrium, but none was found: {what}. "
+        "Start nearer, add what holds this coordinate, or let it run by `steady`."
+    )

@@ -1,0 +1,192 @@
+"""The motion near an equilibrium or a steady motion, as a linear system in independent coordinates."""
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.flatten_util import ravel_pytree
+from jaxtyping import PyTree
+
+from .._model.flat import Flat, StatesAt, bind
+from .._model.injection import check_function
+from .._model.numbers import number
+from .._model.paths import entry_names, is_within
+from .._model.state_values import Layout, given_states, of_first_order, sampled, start_values
+from .._model.system import System
+from .._model.validation import coordinates, parameters, state
+from .._motion.trajectory import Trajectory
+from .._program.jit import is_concrete, seen
+from .dynamics import dynamics_of
+from .inputs import Input, find_inputs
+from .linear_system import Coordinates, LinearSystem
+from .matrices import Choice, Matrices, constraint_slopes, matrices
+from .sampled_data import between_updates
+from .steadiness import moved_on, refuse_unsteady
+from .tangent_space import Partition, partition
+
+
+def linearise(
+    system: System,
+    q: Any,
+    qdot: PyTree = None,
+    params: PyTree = None,
+    *,
+    inputs: Sequence[str] = (),
+    outputs: Callable | None = None,
+    t: Any = 0.0,
+    states: PyTree = None,
+    independent: Any = None,
+    frozen: bool = False,
+) -> LinearSystem:
+    r"""The motion near an equilibrium or a steady motion, with every kind of constraint, in independent coordinates.
+
+    $$ \dot x = A x + B u, \qquad y = C x + D u, \qquad \delta(q, \dot q, z) = T x, \qquad
+       \frac{\partial(g, \psi)}{\partial(q, \dot q, z)}\,T = 0, \qquad
+       A = \left[\frac{\partial F}{\partial(q, \dot q, z)}\,T\right]_{\text{independent}} $$
+
+    F is the motion (q̇, q̈, ż) and ψ = (dg/dt, a). x holds the deviations of independent coordinates, then of independent velocities, then
+    of the states z of first order; where x is one of these, T is the identity.
+
+    **Arguments:**
+
+    - `q`, `qdot`: the state, at rest where `qdot` is left out; or in place of both what `equilibrium` or `steady` found, or a `Trajectory`,
+      along which all arrays get the samples as first axis. `params`, `t`, `states` as for `acceleration`.
+    - `inputs`: names of what u moves: entries of `params` (numbers, arrays, signals), a coordinate (a force on it), a force (1 + u times
+      itself), a holonomic constraint (g = u) or a nonholonomic one (a = u), a sampled state. What moves does so with its velocity and
+      acceleration wherever these count: a base is shaken by its place.
+    - `outputs`: what is seen, a function as `observe` of an `Experiment`; all coordinates where it is left out.
+    - `independent`: names of coordinates that are to be independent if possible, or a `LinearSystem` whose choice is taken. Needed under
+      `jit` where there are constraints: the choice is made by numbers, which `jit` hides; `grad` and `vmap` do not.
+      Along a trajectory the choice is that of its first sample; where these cease to be independent, T and A grow beyond all bounds.
+    - `frozen`: allows a state that is not steady, at which eigenvalues say little of stability.
+
+    Dry friction: what sticks is held, what slips keeps its sliding force. With `Sampled` states of one period the result is in discrete
+    time, exactly. Any consistent units.
+
+    **Returns:** a `LinearSystem`. Differentiable in `q`, `qdot`, `params`, `states`.
+
+    **Raises:** `ValueError` where the state accelerates or A changes along the motion, where it is not on its constraints, at a singular
+    position, and where a name stands for nothing.
+
+    **Source:** Wehage & Haug, J. Mechanical Design 104 (1982) 247-255 (independent coordinates); Meijaard, Papadopoulos, Ruina & Schwab,
+    Proc. R. Soc. A 463 (2007) 1955-1982 (a rolling bicycle, as a check).
+
+    ```python
+    import jax.numpy as jnp
+    import jaxlag as jl
+    rod = jl.System(
+        lambda q, qdot, m, g: 0.5 * m * qdot @ qdot - m * g * q[1], holonomic={"rod": lambda q, l: q @ q - l**2}
+    )
+    pendulum = jl.linearise(rod, jnp.array([0.0, -2.0]), params={"m": 3.0, "g": 9.81, "l": 2.0})
+    pendulum.modes().angular_frequency  # √(g/l) = 2.215
+    ```
+    """
+    along = isinstance(q, Trajectory)
+    if hasattr(q, "qdot"):  # an equilibrium, an instant, a trajectory
+        t, states = getattr(q, "ts" if along else "t", t), q.states if states is None else states
+        q, qdot = q.q, q.qdot
+    q = coordinates(q, "q")
+    q, qdot = state(q, jax.tree.map(jnp.zeros_like, q) if qdot is None else qdot)
+    dtype = jax.tree.leaves(q)[0].dtype
+    t = jnp.asarray(t, dtype) if along else number(t, "`t`", dtype, cure="Pass one time, or a `Trajectory`.")
+    params, states = parameters(params, q), given_states(system, states, q)
+    first = jax.tree.map(lambda x: x[0], (t, q, qdot, states)) if along else (t, q, qdot, states)
+    near = _Near(system, first, params)
+    choice = near.choice(inputs, outputs, independent)
+    of = lambda t, q, qdot, states: matrices(choice, system, t, q, qdot, params, states)
+    found = jax.vmap(of)(t, q, qdot, states) if along else of(t, q, qdot, states)
+    if along and is_concrete(found) and np.any(found.shifted):
+        raise ValueError("`inputs` must not move a constraint along a trajectory, where A changes, but do. Move a force instead.")
+    if not (along or frozen):
+        refuse_unsteady(found, lambda step: of(*moved_on(first, step)), near.names)
+    return _linear_system(near, choice, found, q, qdot)
+
+
+class _Near:
+    """A state of a system, its names, and what can be chosen near it."""
+
+    def __init__(self, system: System, at: Any, params: PyTree):
+        t, q, qdot, states = at
+        self.system, self.given = system, (t, q, qdot, params, states)
+        self.values = start_values(system, states, t, q, qdot, params)
+        self.at = StatesAt(self.values, t, ravel_pytree(q)[0], ravel_pytree(qdot)[0])
+        self.flat: Flat = bind(system, q, params, self.at)
+        self.entries = entry_names(q, "q")
+        self.first_order, self.sampled = ({name: self.values[name] for name in of(system)} for of in (of_first_order, sampled))
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Those of the coordinates, then of the states."""
+        return (*self.entries, *entry_names(self.first_order), *entry_names(self.sampled))
+
+    def choice(self, inputs: Sequence[str], outputs: Callable | None, independent: Any) -> Choice:
+        """What is moved, what is seen, and which coordinates are independent."""
+        if outputs is not None:
+            check_function(outputs, "`outputs`")
+        _, q, _, params, _ = self.given
+        found = find_inputs(inputs, params, q, self.flat, self.sampled)
+        moved, every = [entry.name for entry in found if entry.kind == "sampled"], entry_names(self.sampled)
+        if moved and set(moved) != set(every):
+            raise ValueError("`inputs` must name all sampled states or none, but leaves some out, which then had no law. Name them too.")
+        loops = () if moved else tuple(Input(name, "sampled", i) for i, name in enumerate(every))
+        return Choice((*found, *loops), outputs, self._partition(independent), len(loops))
+
+    def _partition(self, independent: Any) -> Partition:
+        if isinstance(independent, LinearSystem):
+            return independent.coordinates.partition
+        t, q, qdot, params, states = self.given
+        G, positions, _ = jax.eval_shape(lambda: constraint_slopes(self.system, t, q, qdot, params, states))
+        if not G.shape[0]:
+            return partition(np.zeros(G.shape), 0)
+        values = seen(self.given)
+        if values is None:
+            raise ValueError(HIDDEN)
+        rows, _, off = jax.tree.map(np.asarray, constraint_slopes(self.system, *values))
+        if not off <= np.sqrt(np.finfo(rows.dtype).eps):
+            raise ValueError(f"`q` and `qdot` must satisfy the constraints, but are off by {off:.2g} of their size. {CURE}")
+        return partition(rows, positions.shape[0], [i for name in independent or () for i in self._entries_within(name)])
+
+    def _entries_within(self, name):
+        found = [i for i, entry in enumerate(self.entries) if is_within(entry, name)]
+        if not found:
+            raise ValueError(f"`independent` must name coordinates, but holds {name!r}. The coordinates are {', '.join(self.entries)}.")
+        return found
+
+
+CURE = "Put them there by `consistent_state`, or look for an equilibrium by `equilibrium` or `steady`."
+HIDDEN = (
+    "`independent` must be a `LinearSystem` under `jit`, which hides the numbers by which independent coordinates are chosen, but is not. "
+    "Linearise once outside and pass the result: `independent=lin`."
+)
+
+
+def _linear_system(near: _Near, choice: Choice, found: Matrices, q: PyTree, qdot: PyTree) -> LinearSystem:
+    """What was found, with its names; in discrete time where sampled states update themselves."""
+    _, like, _, params, _ = near.given
+    dynamics, y = dynamics_of(near.system, like, params, near.at, choice.inputs, choice.outputs)
+    at = choice.partition
+    positions, velocities = ([near.entries[i] for i in which] for which in at[:2])
+    shapes = dynamics.output_shapes(y, near.flat.rows)
+    multipliers = jax.eval_shape(near.flat.unravel_multipliers, jax.ShapeDtypeStruct((near.flat.rows,), y.q.dtype))
+    rows = found.multipliers.by_state[..., : near.flat.rows, :]
+    outputs = found.outputs
+    system = LinearSystem(
+        A=found.rates.by_state,
+        B=found.rates.by_inputs[..., 0, :, :],
+        C=outputs.by_state,
+        D=outputs.by_inputs[..., 0, :, :],
+        D_rates=outputs.by_inputs[..., 1:, :, :],
+        basis=found.basis,
+        constraint_forces=rows,
+        mass=found.mass,
+        q=q,
+        qdot=qdot,
+        sample_time=None,
+        state_names=(*positions, *(f"{name}_dot" for name in velocities), *entry_names(near.first_order)),
+        input_names=tuple(entry.name for entry in choice.inputs),
+        output_names=entry_names(shapes, "q" if choice.outputs is None else "y"),
+        coordinates=Coordinates(at, Layout.of(like), Layout.of(near.first_order), Layout.of(multipliers)),
+    )
+    return between_updates(near.system, params, near.sampled, found.updates, system) if choice.loops else system

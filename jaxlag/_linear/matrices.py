@@ -1,0 +1,187 @@
+"""The matrices of the motion near a state: its equations, differentiated along the tangent space of all constraints."""
+
+import dataclasses
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.flatten_util import ravel_pytree
+from jaxtyping import Array, Bool, Float, PyTree
+
+from .._mechanics.lagrange import applied_force, constraint_rows
+from .._mechanics.projection import off_constraints
+from .._mechanics.pseudo_inverse import CLEAR
+from .._mechanics.saddle_point import augmented
+from .._mechanics.stick_slip import in_current_mode
+from .._model.flat import StatesAt
+from .._model.state_values import start_values
+from .._model.system import System
+from .._model.validation import checked
+from .._program.jit import compiled
+from .dynamics import Balance, Dynamics, Forces, Whole, dynamics_of
+from .inputs import Input
+from .newton import least_change
+from .tangent_space import Partition
+
+
+@dataclasses.dataclass(frozen=True)
+class Choice:
+    """What is moved, what is seen, and in which coordinates."""
+
+    inputs: tuple[Input, ...]  # those of the user, then, where the system has them, its sampled states
+    outputs: Callable | None
+    partition: Partition
+    loops: int  # sampled states among the inputs, which its own updates move
+
+
+class ByInputs(NamedTuple):
+    """How something depends on x, and on u, u̇ and ü."""
+
+    by_state: Float[Array, "r d"]
+    by_inputs: Float[Array, "3 r m"]
+
+
+class Steadiness(NamedTuple):
+    """What a steady state has none of: q̈, ż and changes of sampled states; and how much of it counts as none."""
+
+    left: Float[Array, " y"]
+    allowed: Float[Array, " y"]
+    determined: Bool[Array, ""]
+
+
+class Matrices(NamedTuple):
+    """ẋ, outputs, multipliers and updates of sampled states by x and u; δ(q, q̇, z) = T x; M."""
+
+    rates: ByInputs
+    outputs: ByInputs
+    multipliers: ByInputs
+    updates: ByInputs
+    basis: Float[Array, "y d"]
+    mass: Float[Array, "n n"]
+    steadiness: Steadiness
+    shifted: Bool[Array, ""]  # whether x is not the state itself, but the state less what u and u̇ make of it
+
+
+@compiled
+def constraint_slopes(system, t, q, qdot, params, states):
+    """G, how many of its rows hold positions (as an array of that length), and how far the state is off the constraints."""
+    flat, t, q, v = checked(system, t, q, qdot, params, states)
+    _, G, _ = constraint_rows(in_current_mode(flat, t, q, v), t, q, v)
+    return G, jnp.zeros(flat.holonomic(t, q).size), off_constraints(flat, t, q, v)
+
+
+@compiled
+def matrices(choice: Choice, system: System, t: Any, q: PyTree, qdot: PyTree, params: PyTree, states: PyTree) -> Matrices:
+    """The matrices near a state."""
+    checked(system, t, q, qdot, params, states)
+    values = start_values(system, states, t, q, qdot, params)
+    at = StatesAt(values, t, ravel_pytree(q)[0], ravel_pytree(qdot)[0])
+    dynamics, y = dynamics_of(system, q, params, at, choice.inputs, choice.outputs)
+    basis, driven = tangent_basis(dynamics, choice.partition, y)
+    forces = dynamics.forces(y)
+    slopes, M, found = _slopes(dynamics, choice.partition, y, forces, basis, driven)
+    n = y.q.size
+    velocity = ByInputs(basis[n : 2 * n], jnp.stack([*(of_u[n : 2 * n] for of_u in driven), jnp.zeros_like(driven[0][n : 2 * n])]))
+    positions, velocities = (np.array(which, int) for which in choice.partition[:2])
+    qddot, multipliers, z, outputs, updates = slopes
+    parts = [jax.tree.map(lambda x: x[..., positions, :], velocity), jax.tree.map(lambda x: x[..., velocities, :], qddot), z]
+    rates = jax.tree.map(lambda *rows: jnp.concatenate(rows, axis=-2), *parts)
+    near = jnp.finfo(y.q.dtype).eps ** 0.375
+    by_state = jnp.abs(jnp.concatenate([of.by_state for of in (qddot, z, updates)]))
+    allowed = near * by_state @ (jnp.abs(basis.T) @ (1 + jnp.abs(jnp.concatenate(y))))
+    allowed = allowed.at[:n].add(near**2 * _rounding(dynamics, y, forces.multipliers, M))
+    left = jnp.concatenate([forces.qddot, found.z, found.updates - dynamics.held])
+    steadiness = Steadiness(left, allowed, forces.sound.determined & forces.sound.satisfied)
+    outputs, multipliers, updates = (_shifted(rates, of) for of in (outputs, multipliers, updates))
+    return Matrices(_proper(rates), outputs, multipliers, updates, basis, M, steadiness, jnp.any(rates.by_inputs[1:] != 0))
+
+
+def _slopes(
+    dynamics: Dynamics, at: Partition, y: Whole, forces: Forces, basis: Array, driven: tuple[Array, Array]
+) -> tuple[list[ByInputs], Array, Balance]:
+    """How q̈, λ, ż, outputs and updates follow the state and the inputs, all of them on the constraints; M; and the balance itself.
+
+    One derivative of the balance in all directions: with E = M q̈ − f − Gᵀλ and c = G q̈ + γ,  M δq̈ − Gᵀδλ = −δE,  G δq̈ = −δc.
+    """
+    (n,), d, m, rows = y.q.shape, basis.shape[1], len(dynamics.inputs), forces.multipliers.size
+    held = np.array(at.velocity_rows, int)
+    redundant = len(held) < rows
+    inside = least_change(_rows(dynamics, y), forces.multipliers, 1.0) if redundant else jnp.zeros(n, y.q.dtype)
+
+    def along(c):
+        x, *u, qddot, multipliers = jnp.split(c, np.cumsum([d, m, m, m, n]))
+        step = basis @ x + driven[0] @ u[0] + driven[1] @ u[1]
+        moved, motion = Whole(*(a + b for a, b in zip(y, jnp.split(step, (n, 2 * n)), strict=True))), (u[0], u[1], u[2])
+        found = dynamics.balance(moved, forces.qddot + qddot, forces.multipliers + multipliers, motion)
+        spread = dynamics.rows_along(moved, inside, motion) if redundant else jnp.zeros(rows, y.q.dtype)
+        return (found, spread), found
+
+    nothing = jnp.zeros(d + 3 * m + n + rows, y.q.dtype)
+    (slope, spread), found = jax.jacfwd(along, has_aux=True)(nothing)
+    split = lambda J: (J[:, : d + 3 * m], J[:, d + 3 * m : d + 3 * m + n], J[:, d + 3 * m + n :])
+    (E, M, by_force), (c, G, _) = split(slope.imbalance), split(slope.constraint_rate)
+    saddle = jnp.block([[M, by_force[:, held]], [G[held], jnp.zeros((len(held), len(held)), M.dtype)]])
+    change = -jnp.linalg.solve(saddle, jnp.concatenate([E, c[held]]))
+    qddot, multipliers = change[:n], jnp.zeros((rows, d + 3 * m), M.dtype).at[held].set(change[n:])
+    if redundant:  # the λ of least norm is G times something: what the selected rows lack of it
+        in_range = G @ jnp.linalg.pinv(G, rtol=jnp.finfo(G.dtype).eps ** CLEAR)
+        multipliers = in_range @ multipliers + spread[:, : d + 3 * m] - in_range @ spread[:, : d + 3 * m]
+
+    def followed(J):
+        """Along the state and the inputs, with q̈ and λ as they follow."""
+        given, by_qddot, by_multipliers = split(J)
+        return given + by_qddot @ qddot + by_multipliers @ multipliers
+
+    of = lambda J: ByInputs(J[:, :d], jnp.moveaxis(J[:, d:].reshape(len(J), 3, m), 1, 0))
+    return [of(x) for x in (qddot, multipliers, followed(slope.z), followed(slope.outputs), followed(slope.updates))], M, found
+
+
+def tangent_basis(dynamics: Dynamics, at: Partition, y: Whole) -> tuple[Array, tuple[Array, Array]]:
+    """T, and how the state follows u and u̇ where these move constraints: from ∂(g, ψ) = 0 for the dependent ones."""
+    (n,), (k,), m = y.q.shape, y.z.shape, len(dynamics.inputs)
+    rows_of = lambda given, rows: given[np.array(rows, int)]
+
+    def residuals(c):
+        q, v, z, *u = jnp.split(c, np.cumsum([n, n, k, m]))
+        g, psi = dynamics.constraints(Whole(q, v, z), (u[0], u[1], jnp.zeros_like(u[0])))
+        return jnp.concatenate([rows_of(g, at.position_rows), rows_of(psi, at.velocity_rows)])
+
+    independent = np.array([*at.positions, *(n + i for i in at.velocities), *range(2 * n, 2 * n + k)], int)
+    dependent = np.array([*at.dependent_positions, *(n + i for i in at.dependent_velocities)], int)
+    known = np.concatenate([independent, 2 * n + k + np.arange(2 * m)])
+    T = jnp.zeros((2 * n + k, len(known)), y.q.dtype).at[independent, np.arange(len(independent))].set(1)
+    if dependent.size:
+        slopes = jax.jacfwd(residuals)(jnp.concatenate([*y, jnp.zeros(2 * m, y.q.dtype)]))
+        T = T.at[dependent].set(-jnp.linalg.solve(slopes[:, dependent], slopes[:, known]))
+    d = len(independent)
+    return T[:, :d], (T[:, d : d + m], T[:, d + m :])
+
+
+def _rows(dynamics, y):
+    """G."""
+    mode = in_current_mode(dynamics.at(y, dynamics.still()), dynamics.t, y.q, y.v)
+    return constraint_rows(mode, dynamics.t, y.q, y.v)[1]
+
+
+def _proper(rates: ByInputs) -> ByInputs:
+    """The same motion in x − B₂ u̇ − (B₁ + A B₂) u, which u alone drives."""
+    A, (B, B1, B2) = rates
+    return ByInputs(A, jnp.stack([B + A @ (B1 + A @ B2), 0 * B1, 0 * B2]))
+
+
+def _shifted(rates: ByInputs, of: ByInputs) -> ByInputs:
+    """What depends on x, in terms of the x of `_proper`."""
+    A, (_, B1, B2) = rates
+    C, (D, D1, D2) = of
+    return ByInputs(C, jnp.stack([D + C @ (B1 + A @ B2), D1 + C @ B2, D2]))
+
+
+def _rounding(dynamics: Dynamics, y: Whole, multipliers: Array, mass: Array) -> Float[Array, " n"]:
+    """How far the forces that balance each other in q̈ would accelerate, each by itself."""
+    mode, G = in_current_mode(dynamics.at(y, dynamics.still()), dynamics.t, y.q, y.v), _rows(dynamics, y)
+    of_lagrangian = jax.grad(mode.lagrangian, argnums=1)(dynamics.t, y.q, y.v)
+    applied = applied_force(mode, dynamics.t, y.q, y.v, multipliers)
+    forces = jnp.abs(of_lagrangian) + jnp.abs(applied) + jnp.abs(G.T) @ jnp.abs(multipliers)
+    return jnp.abs(jnp.linalg.inv(augmented(mass, G)[0])) @ forces

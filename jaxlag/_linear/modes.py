@@ -1,0 +1,175 @@
+"""Modes: natural frequencies, damping, shapes, and the constraint forces that go with them."""
+
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Complex, Float, PyTree
+
+from .._program.jit import compiled, is_concrete
+from .eigenvalues import are_repeated, eigen, rounding, symmetric_eigen
+
+
+class SecondOrder(NamedTuple):
+    """M ξ̈ + (C + G) ξ̇ + (K + N) ξ = …: `mass` M, `damping` C and `stiffness` K symmetric, `gyroscopic` G and `circulatory` N
+    antisymmetric, in independent coordinates.
+    """
+
+    mass: Float[Array, "v v"]
+    damping: Float[Array, "v v"]
+    gyroscopic: Float[Array, "v v"]
+    stiffness: Float[Array, "v v"]
+    circulatory: Float[Array, "v v"]
+
+
+class Modes(eqx.Module):
+    r"""Modes of a `LinearSystem`, by the size of their eigenvalue: one of each conjugate pair; under `jit` and `vmap`, of each eigenvalue.
+
+    $$ \delta q = \mathrm{Re}\,(\hat q\,e^{\lambda t}), \qquad \omega_0 = |\lambda|, \qquad \zeta = -\mathrm{Re}\,\lambda/|\lambda| $$
+
+    - `eigenvalues`: λ, in 1/time; those of rigid bodies and of coordinates on which nothing depends are exactly 0.
+    - `angular_frequency`: ω₀ in rad/time; `frequency`: ω₀/2π; both of the undamped oscillation, and of a real λ its size.
+    - `damping_ratio`: ζ; 1 and more of what does not oscillate, negative of what grows. `time_constant`: 1/|Re λ|.
+    - `stable`: whether it does not grow. `repeated`: whether another mode has the same eigenvalue: of these shapes any combination is
+      one too, and derivatives of their eigenvalues are those of the mean.
+    - `shapes`: q̂, structured like q, with the modes as first axis; real where there is no damping. `states`: of the first-order states.
+    - `multipliers`: the constraint forces of the mode, by name.
+
+    Printed, it is a table. In discrete time λ is log(z)/T.
+    """
+
+    eigenvalues: Complex[Array, " k"]
+    damping_ratio: Float[Array, " k"]
+    stable: Bool[Array, " k"]
+    repeated: Bool[Array, " k"]
+    shapes: PyTree
+    multipliers: dict[str, PyTree]
+    states: dict[str, PyTree]
+
+    @property
+    def angular_frequency(self) -> Float[Array, " k"]:
+        """ω₀ = |λ|, in rad/time."""
+        return _size(self.eigenvalues)
+
+    @property
+    def frequency(self) -> Float[Array, " k"]:
+        """ω₀/2π, in 1/time."""
+        return self.angular_frequency / (2 * jnp.pi)
+
+    @property
+    def time_constant(self) -> Float[Array, " k"]:
+        """1/|Re λ|, infinite where nothing decays or grows."""
+        decay = jnp.abs(self.eigenvalues.real)
+        return jnp.where(decay > 0, 1 / jnp.where(decay > 0, decay, 1), jnp.inf)
+
+    def __len__(self) -> int:
+        return self.eigenvalues.shape[-1]
+
+    def __getitem__(self, which: Any) -> "Modes":
+        """Some of the modes."""
+        return jax.tree.map(lambda x: x[which], self)
+
+    def __repr__(self) -> str:
+        if not is_concrete(self) or self.eigenvalues.ndim != 1:
+            return f"Modes(of shape {self.eigenvalues.shape})"
+        head = f"{'mode':>4}  {'ω₀ (rad/s)':>12}  {'f (Hz)':>12}  {'ζ':>9}  {'1/|Re λ| (s)':>12}  "
+        rows = zip(*map(np.asarray, (self.angular_frequency, self.frequency, self.damping_ratio, self.time_constant)), strict=True)
+        lines = [
+            f"{i:>4}  {w:>12.5g}  {f:>12.5g}  {z:>9.3g}  {T:>12.4g}  {_kind(self.eigenvalues[i], self.stable[i], self.repeated[i])}"
+            for i, (w, f, z, T) in enumerate(rows)
+        ]
+        return "\n".join(["Modes", head.rstrip(), *lines])
+
+
+def _kind(value, stable, repeated):
+    if value == 0:
+        return "stays where it is put"
+    kind = "stable" if stable else "flutter" if value.imag else "divergence"
+    return f"{kind}{', repeated' if repeated else ''}"
+
+
+def _size(values):
+    """|λ|, with a derivative where λ = 0."""
+    there = values != 0
+    return jnp.where(there, jnp.abs(jnp.where(there, values, 1)), 0)
+
+
+class Found(NamedTuple):
+    """Eigenvalues in continuous time, eigenvectors in x as columns, which of them do not grow, and which are repeated."""
+
+    values: Array
+    vectors: Array
+    stable: Array
+    repeated: Array
+
+
+@compiled
+def of_second_order(system: SecondOrder) -> Found:
+    """Modes without damping: K x = ω² M x, real and orthonormal in M."""
+    root = jnp.linalg.cholesky(system.mass)
+    half = jax.scipy.linalg.solve_triangular(root, system.stiffness, lower=True)
+    scaled = jax.scipy.linalg.solve_triangular(root, half.T, lower=True)
+    squares, vectors = symmetric_eigen((scaled + scaled.T) / 2)
+    shapes = jax.scipy.linalg.solve_triangular(root.T, vectors, lower=False)
+    omega = jnp.sqrt(jnp.where(squares != 0, jnp.abs(squares), 1)) * (squares != 0)
+    values = jnp.where(squares < 0, omega, 1j * omega)
+    order = jnp.argsort(jnp.abs(omega), stable=True)
+    bound = jnp.full(len(squares), 10 * len(squares) * jnp.finfo(squares.dtype).eps * jnp.max(jnp.abs(squares), initial=0.0))
+    again = jnp.sum(are_repeated(squares, bound), axis=1) > 1
+    return Found(values[order], shapes[:, order], (squares >= 0)[order], again[order])
+
+
+def of_first_order(A: Float[Array, "d d"], sample_time: Any) -> Found:
+    """Eigenvalues of A, of a conjugate pair the upper one where Python may look at them."""
+    found = _of_first_order(A, sample_time)
+    values = jax.lax.stop_gradient(found.values)
+    if not is_concrete(values):
+        return found
+    upper = np.flatnonzero(np.asarray(values).imag >= 0)
+    return Found(found.values[upper], found.vectors[:, upper], found.stable[upper], found.repeated[upper])
+
+
+@compiled
+def _of_first_order(A, sample_time):
+    values, vectors = eigen(A)
+    bound = rounding(A, vectors)
+    again = jnp.sum(are_repeated(values, bound), axis=1) > 1
+    if sample_time is not None:
+        there = values != 0
+        values = jnp.where(there, jnp.log(jnp.where(there, values, 1)) / sample_time, -jnp.inf)
+        bound = bound / sample_time
+        order = jnp.argsort(jnp.abs(values), stable=True)
+        values, vectors, bound, again = values[order], vectors[:, order], bound[order], again[order]
+    dust = jnp.where(jnp.abs(values.real) <= bound, jax.lax.stop_gradient(values.real), 0)
+    return Found(values - dust, vectors, values.real <= bound, again)
+
+
+def is_conservative(system: SecondOrder) -> bool:
+    """Whether damping, gyroscopic and circulatory terms are nothing but rounding; no where Python may not look."""
+    given = jax.lax.stop_gradient(system)
+    if not is_concrete(given):
+        return False
+    root = np.linalg.cholesky(np.asarray(given.mass))
+    of = lambda matrix: np.max(np.abs(np.linalg.solve(root, np.linalg.solve(root, np.asarray(matrix)).T)), initial=0.0)
+    eps, size = np.finfo(given.mass.dtype).eps, of(given.stiffness)
+    dust = 100 * len(root) * eps
+    return bool(max(of(given.damping), of(given.gyroscopic)) <= dust * np.sqrt(size) and of(given.circulatory) <= dust * size)
+
+
+def damping_ratios(values: Array) -> Array:
+    """−Re λ/|λ|, and 0 of λ = 0."""
+    size = _size(values)
+    return jnp.where(values.real != 0, -values.real / jnp.where(size > 0, size, 1), 0.0)
+
+
+def normalised(vectors: Array, shapes: Array, mass: Array | None) -> Array:
+    """Eigenvectors scaled so that the largest entry of each shape is 1, or positive with q̂ᴴ M q̂ = 1; columns."""
+    at = jnp.argmax(jnp.abs(shapes) >= (1 - 1e-6) * jnp.max(jnp.abs(shapes), axis=0, keepdims=True, initial=0.0), axis=0)
+    largest = jnp.take_along_axis(shapes, at[None, :], axis=0)
+    largest = jnp.where(largest == 0, 1, largest)  # a mode of the states alone
+    if mass is None:
+        return vectors / largest
+    energy = jnp.einsum("ij,ik,kj->j", shapes.conj(), mass, shapes).real
+    return vectors * jnp.abs(largest) / (largest * jnp.sqrt(jnp.where(energy > 0, energy, 1))[None, :])

@@ -1,0 +1,84 @@
+"""Roots by Newton's method where the Jacobian may be singular or not square, with derivatives by the implicit function theorem."""
+
+import functools
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import lineax as lx
+from jaxtyping import Array, Bool, Float
+
+ITERATIONS = 100
+Residual = Callable[[Any, Float[Array, " u"]], Float[Array, " r"]]  # R(args, w)
+
+
+class Root(NamedTuple):
+    """w with R(w) = 0, and whether it is one."""
+
+    w: Float[Array, " u"]
+    found: Bool[Array, ""]
+
+
+def root_near(residual: Residual, args: Any, guess: Float[Array, " u"], ease: Float[Array, " u"] | float = 1.0) -> Root:
+    """The root that Newton's method finds from a guess; of several that nothing decides between, the nearest, where to move one unknown
+    costs less the greater its `ease`.
+
+    A step is halved until the step that would follow it is shorter: a test that does not depend on the units of R or w.
+
+    Source: Deuflhard, Newton Methods for Nonlinear Problems, section 3.3.2 (natural monotonicity test).
+    """
+    fixed, eps = jax.lax.stop_gradient(args), jnp.finfo(guess.dtype).eps
+    slope = lambda w: jax.jacfwd(residual, 1)(fixed, w)
+    length = lambda step, w: jnp.max(jnp.abs(step) / (1 + jnp.abs(w)), initial=0.0)
+
+    def turn(carry):
+        w, _, i = carry
+        J = slope(w)
+        change = lambda w: -least_change(J, residual(fixed, w), ease * (1 + jnp.abs(w)))
+        step = change(w)
+
+        def is_shorter(part):
+            after = length(change(w + part * step), w)
+            return jnp.isfinite(after) & (after <= (1 - part / 4) * length(step, w))
+
+        part = jax.lax.while_loop(lambda part: (part > 1e-3) & ~is_shorter(part), lambda part: part / 2, jnp.ones((), w.dtype))
+        near = length(step, w) <= eps**0.5  # where rounding decides what is shorter
+        return w + jnp.where(near, 1.0, part) * step, length(step, w) <= 8 * eps, i + 1
+
+    def is_on_its_way(carry):
+        w, done, i = carry
+        return (i < ITERATIONS) & ~done & jnp.all(jnp.isfinite(w))
+
+    w, _, _ = jax.lax.while_loop(is_on_its_way, turn, (jax.lax.stop_gradient(guess), jnp.array(False), jnp.array(0)))
+    return Root(_root(residual, args, w), is_root(slope(w), residual(fixed, w), w))
+
+
+def is_root(J: Array, R: Array, w: Array) -> Bool[Array, ""]:
+    """Whether a residual is zero: a change of w by rounding would bring as much about."""
+    allowed = jnp.finfo(w.dtype).eps ** 0.5 * (jnp.abs(J) @ (1 + jnp.abs(w)))
+    return jnp.all(jnp.isfinite(w)) & jnp.all(jnp.abs(R) <= allowed)
+
+
+@functools.partial(jax.custom_jvp, nondiff_argnums=(0,))
+def _root(residual: Residual, args: Any, w: Float[Array, " u"]) -> Float[Array, " u"]:
+    """w, which depends on args as R(args, w) = 0 says: differentiable to any order."""
+    return w
+
+
+@_root.defjvp
+def _root_rule(residual, primals, tangents):
+    (args, found), (d_args, _) = primals, tangents
+    w = _root(residual, args, found)
+    change = jax.jvp(lambda args: residual(args, w), (args,), (d_args,))[1]
+    return w, -least_change(jax.jacfwd(residual, 1)(args, w), change, 1 + jnp.abs(jax.lax.stop_gradient(w)))
+
+
+def least_change(J: Float[Array, "r u"], R: Float[Array, " r"], scale: Any) -> Float[Array, " u"]:
+    """The least x with J x = R, x in units of `scale`, and each row of J in its own."""
+    scale = jnp.broadcast_to(jnp.asarray(scale, J.dtype), J.shape[1:])
+    scaled = J * scale[None, :]
+    size = jnp.max(jnp.abs(jax.lax.stop_gradient(scaled)), axis=1, initial=0.0)
+    rows = jnp.where(size > 0, 1 / jnp.where(size > 0, size, 1), 1)
+    solver = lx.SVD(rcond=float(jnp.finfo(J.dtype).eps) ** 0.625)
+    return scale * lx.linear_solve(lx.MatrixLinearOperator(rows[:, None] * scaled), rows * R, solver, throw=False).value

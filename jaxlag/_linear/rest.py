@@ -1,0 +1,180 @@
+"""The equations of rest and of steady motion, and their solution."""
+
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.flatten_util import ravel_pytree
+from jaxtyping import Array, Bool, Float, PyTree
+
+from .._mechanics.friction_elements import find_elements
+from .._mechanics.lagrange import applied_force, constraint_rows, inertia
+from .._model.flat import Flat, StatesAt, bind
+from .._model.state_values import Layout, start_values
+from .._model.system import System
+from .._model.validation import checked
+from .._program.jit import compiled
+from .descent import minimum_near
+from .newton import is_root, least_change, root_near
+
+
+class Search(NamedTuple):
+    """What is looked for: which coordinates are `fixed`, which velocities are found too, a minimum or any equilibrium, and whether
+    dry friction holds.
+    """
+
+    fixed: tuple[int, ...] = ()
+    running: tuple[int, ...] = ()
+    stable: bool = False
+    held: bool = False
+
+
+class Rest(NamedTuple):
+    """A steady state, and how it was found."""
+
+    q: PyTree
+    qdot: PyTree
+    states: dict[str, PyTree]
+    multipliers: dict[str, PyTree]
+    friction: dict[str, tuple[Array, Array]]  # force and bound
+    t: Array
+    succeeded: Bool[Array, ""]
+    uniform: Bool[Array, ""]  # whether it stays as it is
+    left: Float[Array, " r"]  # what is left of the equations, in parts of what is allowed
+    force: Float[Array, " n"]  # of these the forces
+    M: Float[Array, "n n"]
+    by_q: Float[Array, "r n"]  # how the equations depend on q
+
+
+class Unknowns(NamedTuple):
+    """What is solved for: q and q̇ where they are not given, the states, λ, and the friction forces μ on slip velocities."""
+
+    q: Float[Array, " a"]
+    v: Float[Array, " b"]
+    states: Float[Array, " c"]
+    multipliers: Float[Array, " m"]
+    friction: Float[Array, " r"]
+
+
+class Given(NamedTuple):
+    """On what a steady state depends."""
+
+    numbers: PyTree  # of params
+    t: Float[Array | np.ndarray, ""]
+    q: Float[Array, " n"]
+    v: Float[Array, " n"]
+
+
+class Equations:
+    """f + Gᵀλ = 0, g = 0, ψ = 0, ż = 0: the equations of a steady state as functions of what is given and unknown."""
+
+    def __init__(self, search: Search, system: System, q: PyTree, params: PyTree, values: PyTree, at: Given, flat: Flat):
+        self.search, self.system, self.like = search, system, Layout.of(q).shapes
+        self.rest = eqx.partition(params, eqx.is_inexact_array)[1]
+        self.unravel_states = ravel_pytree(values)[1]
+        self.moving = np.setdiff1d(np.arange(at.q.size), search.fixed).astype(int)
+        self.running = np.array(search.running, int)
+        elements = find_elements(flat, at.t, at.q, at.v)
+        self.friction_rows = elements.element_of_row.size if elements is not None and search.held else 0
+        self.sizes = np.cumsum([self.moving.size, self.running.size, ravel_pytree(values)[0].size, flat.rows])
+
+    def taken_apart(self, given: Given, w: Float[Array, " u"]) -> tuple[Flat, Float[Array, " n"], Float[Array, " n"], Unknowns]:
+        """The system and its state at w."""
+        of = Unknowns(*jnp.split(w, self.sizes))
+        q, v = given.q.at[self.moving].set(of.q), given.v.at[self.running].set(of.v)
+        at = StatesAt(self.unravel_states(of.states), given.t, q, v)
+        return bind(self.system, self.like, eqx.combine(given.numbers, self.rest), at), q, v, of
+
+    def __call__(self, given: Given, w: Float[Array, " u"]) -> Float[Array, " r"]:
+        """What is left of the equations at w."""
+        flat, q, v, of = self.taken_apart(given, w)
+        g, (psi, _, _) = flat.holonomic(given.t, q), constraint_rows(flat, given.t, q, v)
+        rates = ravel_pytree(flat.state_rates(given.t, q, v))[0]
+        values, updates = self.unravel_states(of.states), flat.updates(given.t, q, v)
+        changes = ravel_pytree([jax.tree.map(jnp.subtract, new, values[name]) for name, new in updates.items()])[0]
+        return jnp.concatenate([self.force(flat, given.t, q, v, of), g, psi, rates, changes]).astype(w.dtype)
+
+    def force(self, flat: Flat, t: Any, q: Array, v: Array, of: Unknowns) -> Float[Array, " n"]:
+        """f + Gᵀλ without dry friction, or with what it would have to hold."""
+        elements = find_elements(flat, t, q, v)
+        held = 0.0
+        if elements is not None:
+            potentials, nothing = elements.potentials, jnp.zeros(elements.size, v.dtype)
+            without = {name: lambda *state, D=D: D(*state, nothing) for name, D in potentials.items()}
+            flat = flat._replace(dissipations=without)
+            held = jax.vjp(lambda v: elements.slip(t, q, v), v)[1](of.friction)[0] if self.friction_rows else 0.0
+        _, G, _ = constraint_rows(flat, t, q, v)
+        return inertia(flat, t, q, v)[1] + applied_force(flat, t, q, v, of.multipliers) + G.T @ of.multipliers + held
+
+
+@compiled
+def steady_state(search: Search, system: System, t: Any, q: PyTree, qdot: PyTree, params: PyTree, states: PyTree) -> Rest:
+    """The steady state near a guess."""
+    flat, t, q0, v0 = checked(system, t, q, qdot, params, states)
+    values = start_values(system, states, t, q, qdot, params)
+    given = Given(eqx.filter(params, eqx.is_inexact_array), t, q0, v0)
+    equations = Equations(search, system, q, params, values, given, flat)
+    start = jax.lax.stop_gradient(q0)
+    if search.stable:
+        start = minimum_near(lambda q: -flat.lagrangian(t, q, v0), lambda q: flat.holonomic(t, q), start, equations.moving)
+    nothing = jnp.zeros(flat.rows, q0.dtype), jnp.zeros(equations.friction_rows, q0.dtype)
+    of = Unknowns(start[equations.moving], v0[equations.running], ravel_pytree(values)[0].astype(q0.dtype), *nothing)
+    f, (_, G, _) = equations.force(flat, t, start, v0, of), constraint_rows(flat, t, start, v0)
+    of = of._replace(multipliers=least_change(G.T, -f, 1.0) if flat.rows else of.multipliers)
+    ease = jnp.ones(sum(x.size for x in of), q0.dtype).at[equations.sizes[2] :].set(1e8 if search.held else 1.0)  # q stays if it can
+    w, found = root_near(equations, given, jnp.concatenate(of), ease)
+    return _described(equations, given, w, found)
+
+
+def _described(equations: Equations, given: Given, w: Array, found: Array) -> Rest:
+    """A steady state with all that is said of it."""
+    flat, q, v, of = equations.taken_apart(given, w)
+    t, (known, at_rest) = given.t, jax.lax.stop_gradient((given, w))
+    J, R = jax.jacfwd(equations, 1)(known, at_rest), equations(known, at_rest)
+    allowed = jnp.abs(J) @ (1 + jnp.abs(at_rest)) + jnp.finfo(w.dtype).tiny
+    step = 0.1 * (1 + jnp.max(jnp.abs(q))) / jnp.maximum(jnp.max(jnp.abs(v)), jnp.finfo(w.dtype).tiny)
+    later = at_rest.at[: equations.moving.size].add(jax.lax.stop_gradient(step * v)[equations.moving])
+    uniform = is_root(J, equations(known._replace(q=known.q + step * known.v), later), at_rest)
+    in_terms_of_q = lambda q: equations(known._replace(q=q), at_rest.at[: equations.moving.size].set(q[equations.moving]))
+    multipliers = of.multipliers
+    if flat.rows:  # of dependent rows, those of least norm
+        _, G, _ = constraint_rows(flat, t, q, v)
+        multipliers = least_change(G.T, G.T @ multipliers, 1.0)
+    friction, holds = _friction(equations, flat, t, q, v, of)
+    succeeded = found & holds
+    shown = lambda x: jnp.where(succeeded, x, jnp.nan)
+    states = jax.tree.map(shown, equations.unravel_states(of.states))
+    return Rest(
+        flat.unravel(shown(q)),
+        flat.unravel(shown(v)),
+        states,
+        flat.unravel_multipliers(shown(multipliers)),
+        friction,
+        t,
+        succeeded,
+        uniform,
+        R / allowed,
+        R[: q.size],
+        inertia(flat, t, q, v)[0].as_matrix(),
+        jax.jacfwd(in_terms_of_q)(jax.lax.stop_gradient(q)),
+    )
+
+
+def _friction(
+    equations: Equations, flat: Flat, t: Any, q: Array, v: Array, of: Unknowns
+) -> tuple[dict[str, tuple[Array, Array]], Bool[Array, ""]]:
+    """By dissipation term, the friction force at rest and its bound; and whether all forces are within their bounds."""
+    elements = find_elements(flat, t, q, v)
+    if elements is None:
+        return {}, jnp.array(True)
+    nothing, force = jnp.zeros(elements.size, v.dtype), of.friction if equations.friction_rows else jnp.zeros(elements.element_of_row.size)
+    bounds = {
+        name: jax.grad(lambda u, D=D: D(t, q, v, of.multipliers, u))(nothing)[elements.element_of_row[elements.rows_of_term[name]]]
+        for name, D in elements.potentials.items()
+        if name in elements.rows_of_term
+    }
+    total = jax.grad(lambda u: sum(D(t, q, v, of.multipliers, u) for D in elements.potentials.values()))(nothing)
+    holds = jnp.all(elements.norms(force) <= total * (1 + jnp.finfo(v.dtype).eps ** 0.5))
+    return {name: (force[elements.rows_of_term[name]], bound) for name, bound in bounds.items()}, holds

@@ -1,0 +1,258 @@
+"""How eigenvalues move with a parameter, and where the system becomes unstable."""
+
+import functools
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Complex, Float, PyTree
+
+from .._model.injection import call
+from .._model.numbers import number, numbers
+from .._model.paths import leaf_names
+from .._model.state_values import given_states, sampled
+from .._model.system import System
+from .._model.validation import coordinates, parameters, state
+from .._program.jit import compiled, is_concrete, seen
+from .branches import Spectrum, Transition, finer, followed
+from .eigenvalues import eigen, rounding
+from .equilibrium import equilibrium, steady
+from .linear_system import LinearSystem
+from .linearise import linearise
+from .matrices import Choice, matrices
+from .zero_eigenvalues import always_zero, coupled, without_zeros
+
+
+class Crossing(eqx.Module):
+    """Where a branch crosses the imaginary axis: the `value` of the parameter, the `frequency` |Im λ| in rad/time, its `kind`, "flutter"
+    (a pair that oscillates) or "divergence" (λ = 0), and the `direction`: whether growth of the parameter "destabilises" or "stabilises".
+    """
+
+    value: Float[Array, ""]
+    frequency: float = eqx.field(static=True)
+    kind: str = eqx.field(static=True)
+    direction: str = eqx.field(static=True)
+
+
+class RootLocus(eqx.Module):
+    """Eigenvalues `over` a parameter: `eigenvalues[k, i]` of branch i at `values[k]`, and the `crossings` in their order."""
+
+    over: str = eqx.field(static=True)
+    values: Float[Array, " k"]
+    eigenvalues: Complex[Array, "k d"]
+    crossings: tuple[Crossing, ...]
+
+    def __repr__(self) -> str:
+        head = f"RootLocus of {self.eigenvalues.shape[1]} eigenvalues over {self.over} = {self.values[0]:g} … {self.values[-1]:g}"
+        if not is_concrete(self):
+            return head
+        lines = [
+            f"  {self.over} = {float(c.value):.8g}: {c.kind} {c.direction}" + (f", {c.frequency:.5g} rad/s" if c.frequency else "")
+            for c in self.crossings
+        ]
+        return "\n".join([head, *(lines or ["  no branch crosses the imaginary axis"])])
+
+
+def root_locus(
+    system: System,
+    q: Any,
+    qdot: Any = None,
+    params: PyTree = None,
+    *,
+    over: str,
+    values: Any,
+    t: Any = 0.0,
+    states: PyTree = None,
+) -> RootLocus:
+    r"""Eigenvalues of the motion near a steady state, over a parameter, and the values at which it becomes unstable or stable.
+
+    $$ \det(\lambda - A(p)) = 0, \qquad \mathrm{Re}\,\lambda(p^*) = 0, \qquad
+       \mathrm dp^* = -\frac{\mathrm{Re}\,(y^H\,\mathrm dA\,x/y^H x)}{\mathrm{Re}\,(y^H A' x/y^H x)} $$
+
+    Branches are followed by their eigenvectors, so that they do not swap where they cross. A crossing is located to rounding between
+    the values at which it is seen; one that comes and goes between two eighths of a step is not.
+
+    **Arguments:** `q`, `qdot`: the steady state as functions of `params` and its entries, e.g. `qdot=lambda v, r: {"x": v, "phi": v / r}`;
+    or a guess, which takes longer, from which `equilibrium` or `steady` finds it anew at each value. `over`: the name of a number in
+    `params`; `values`: increasing, at least two. `t`, `states` as for `acceleration`. Any consistent units.
+
+    **Returns:** a `RootLocus`. The `value` of a crossing is differentiable, once, in `params`; `eigenvalues` are not, and their derivative
+    is NaN: take those of `linearise`.
+
+    **Raises:** `ValueError` where a state is not steady, `over` names no number, or the system has sampled states.
+
+    **Source:** Bolotin, Nonconservative Problems of the Theory of Elastic Stability (flutter, divergence); Seyranian & Mailybaev,
+    Multiparameter Stability Theory with Mechanical Applications, sections 2.4 and 2.9 (derivatives, also where eigenvalues meet).
+
+    ```python
+    import jax.numpy as jnp
+    import jaxlag as jl
+    bead = jl.System(  # on a hoop that rotates with w
+        lambda q, qdot, R, g, w: 0.5 * R**2 * (qdot**2 + (jnp.sin(q) * w) ** 2) + g * R * jnp.cos(q)
+    )
+    locus = jl.root_locus(bead, 0.0, params={"R": 1.0, "g": 9.81, "w": 0.0}, over="w", values=jnp.linspace(0.0, 5.0, 11))
+    locus.crossings[0].value  # √(g/R) = 3.132
+    ```
+    """
+    values = np.asarray(numbers(values, "`values`"))
+    if values.ndim != 1 or len(values) < 2 or not np.all(np.diff(values) > 0):
+        raise ValueError("`values` must be a list of at least two numbers that increase, but is not. Write e.g. `jnp.linspace(0, 10, 21)`.")
+    if sampled(system):
+        raise ValueError("`system` must have no sampled states, but has. Linearise it at each value: its eigenvalues are those of a step.")
+    family = _Family(system, q, qdot, params, over, t, states, float(values[0]))
+    known = seen(family.params)
+    if known is None:
+        raise ValueError("`params` must be known to follow branches, but are hidden by `jit`. Call `root_locus` from Python.")
+    matrix = functools.cache(lambda at: np.asarray(family.matrix(at, known)))
+    grid = [matrix(at) for at in finer(values)]
+    core = coupled(grid)
+    part = np.ix_(core, core)
+    zeros = always_zero([A[part] for A in grid])
+    shown, transitions = followed(lambda at: _spectrum(at, matrix(at)[part], zeros), values)
+    family.refuse_unsteady(float(values[-1]), known)
+    crossings = [_crossing(family, core, zeros, transition) for transition in transitions]
+    eigenvalues = np.stack([at.values for at in shown])
+    eigenvalues = np.concatenate([eigenvalues, np.zeros((len(values), len(grid[0]) - eigenvalues.shape[1]))], axis=1)
+    return RootLocus(over, jnp.asarray(values), _without_derivative(jnp.asarray(eigenvalues), family.params), tuple(crossings))
+
+
+class _Family:
+    """A steady state and its linear system, by the value of a parameter."""
+
+    def __init__(self, system: System, q: Any, qdot: Any, params: PyTree, over: str, t: Any, states: PyTree, first: float):
+        self.system, self.q, self.qdot, self.over = system, q, qdot, over
+        like = q if not callable(q) else call(q, "`q`", params, t=0.0)
+        like = coordinates(like, "q")
+        self.t = number(t, "`t`", jax.tree.leaves(like)[0].dtype, cure="Pass one time.")
+        self.params, self.states = parameters(params, like), given_states(system, states, like)
+        names = leaf_names(self.params, "params")
+        if over not in names or np.shape(jax.tree.leaves(self.params)[names.index(over)]):
+            raise ValueError(f"`over` must name one number of `params`, but is {over!r}. The entries are {', '.join(names)}.")
+        self.index = names.index(over)
+        self.steady: dict[float, Any] = {}  # states that were found, from which others start
+        self.partition = self._linearised(first, seen(self.params)).coordinates.partition
+
+    def at(self, value: Any, params: PyTree) -> PyTree:
+        """`params` with this value."""
+        leaves, structure = jax.tree.flatten(params)
+        leaves[self.index] = jnp.asarray(value, leaves[self.index].dtype)
+        return jax.tree.unflatten(structure, leaves)
+
+    def matrix(self, value: Any, params: PyTree) -> Float[Array, "d d"]:
+        """A."""
+        choice, moved = Choice((), None, self.partition, 0), self.at(value, params)
+        if callable(self.q) or callable(self.qdot):
+            at = *_state(self.q, self.qdot, self.t, moved), moved, self.states
+        else:
+            found = self._found(value, params)
+            at = found.q, found.qdot, moved, found.states
+        return matrices(choice, self.system, self.t, *at).rates.by_state
+
+    def refuse_unsteady(self, value: float, params: PyTree) -> None:
+        """Raises where the state is not steady at this value."""
+        self._linearised(value, params)
+
+    def _linearised(self, value: Any, params: PyTree) -> LinearSystem:
+        params = self.at(value, params)
+        if callable(self.q) or callable(self.qdot):
+            q, qdot = _state(self.q, self.qdot, self.t, params)
+            return linearise(self.system, q, qdot, params, t=self.t, states=self.states)
+        return linearise(self.system, self._found(value, params), params=params)
+
+    def _found(self, value, params):
+        params = self.at(value, params)
+        near = self.steady[min(self.steady, key=lambda known: abs(known - value))] if self.steady else None
+        q, qdot = (self.q, self.qdot) if near is None else (near.q, near.qdot)
+        if self.qdot is None:
+            found = equilibrium(self.system, q, params, t=self.t, states=self.states)
+        else:
+            found = steady(self.system, q, qdot, params, t=self.t, states=self.states)
+        if is_concrete(found):
+            self.steady[value] = found
+        return found
+
+
+def _state(q, qdot, t, params):
+    """The steady state that functions give."""
+    q, qdot = (call(of, f"`{name}`", params, t=t) if callable(of) else of for of, name in ((q, "q"), (qdot, "qdot")))
+    return state(q, jax.tree.map(lambda x: 0.0 * jnp.asarray(x), q) if qdot is None else qdot)
+
+
+def _spectrum(at: float, A: np.ndarray, zeros: list[int]) -> Spectrum:
+    """All eigenvalues but those that are zero at every value."""
+    A, basis = without_zeros(A, zeros)
+    values, vectors, bound = map(np.asarray, _eigen(A))
+    return Spectrum(at, values, basis @ vectors, bound)
+
+
+@compiled
+def _eigen(A):
+    values, vectors = eigen(A)
+    return values, vectors, rounding(A, vectors)
+
+
+def _crossing(family: _Family, core: np.ndarray, zeros: list[int], transition: Transition) -> Crossing:
+    """A transition, with its derivative in `params`."""
+    at, spectrum = transition.at, transition.spectrum
+    value = spectrum.values[transition.which]
+    oscillates = abs(value.imag) > 10 * spectrum.rounding[transition.which]
+    point = jnp.asarray(at)
+    if not is_concrete(family.params):
+        if zeros and not oscillates:
+            raise ValueError(
+                f"`params` must not be differentiated at {family.over} = {at:g}, but are: an eigenvalue comes to zero there beside others "
+                "that are always zero. Take differences."
+            )
+        known, part = seen(family.params), np.ix_(core, core)
+        slope = np.asarray(jax.jvp(lambda value: family.matrix(value, known), (point,), (jnp.ones_like(point),))[1])
+        weights = _weights(np.asarray(family.matrix(at, known))[part], slope[part], value)
+        point = _moving(point, weights, family.matrix(at, family.params)[part])
+    direction = "destabilises" if transition.grows else "stabilises"
+    return Crossing(point, float(abs(value.imag)) if oscillates else 0.0, "flutter" if oscillates else "divergence", direction)
+
+
+def _weights(A: np.ndarray, slope: np.ndarray, value: complex) -> np.ndarray:
+    """W with dp* = Σ W dA. Where two eigenvalues meet in one eigenvector, yᴴx = 0, and yᴴ (dA + A' dp*) x = 0 keeps them together."""
+    values, vectors = np.linalg.eig(A)
+    i = int(np.argmin(np.abs(values - value)))
+    x, y = vectors[:, i], np.linalg.inv(vectors)[i]
+    y = y / np.linalg.norm(y)
+    if abs(y @ x) < 1e-5:
+        return -np.real(np.outer(y, x) / (y @ slope @ x))
+    return -np.real(np.outer(y, x) / (y @ x)) / np.real(y @ slope @ x / (y @ x))
+
+
+@jax.custom_jvp
+def _without_derivative(x, params):
+    """x, whose derivative is not zero, as it would be, but NaN."""
+    return x
+
+
+@_without_derivative.defjvp
+def _without_derivative_rule(primals, tangents):
+    moved = [jnp.sum(jnp.real(d)) for d in jax.tree.leaves(tangents[1]) if jnp.issubdtype(d.dtype, jnp.inexact)]
+    return primals[0], jnp.full_like(primals[0], jnp.nan) * sum(moved)
+
+
+@jax.custom_jvp
+def _moving(at, weights, A):
+    """The value at a crossing, which moves as A does: differentiable once."""
+    return at
+
+
+@_moving.defjvp
+def _moving_rule(primals, tangents):
+    (at, weights, A), (_, _, dA) = primals, tangents
+    return _moving(at, weights, A), jnp.sum(_once(weights, A) * dA)
+
+
+@jax.custom_jvp
+def _once(weights, A):
+    return weights
+
+
+@_once.defjvp
+def _once_rule(primals, tangents):
+    raise NotImplementedError("the value at a crossing must be differentiated once only, but is twice. Take differences of its gradient.")
