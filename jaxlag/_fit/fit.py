@@ -273,7 +273,7 @@ def _check_enough_measured(problem, experiments, alone):
 
 
 def _measurements(e):
-    return e.measurements if isinstance(e, LinearTest) else sum(int(np.sum(np.isfinite(leaf))) for leaf in jax.tree.leaves(e.values))
+    return sum(int(np.sum(np.isfinite(leaf))) for leaf in jax.tree.leaves(e.values)) if isinstance(e, Experiment) else e.measurements
 
 
 def _absolute(experiments):

@@ -181,7 +181,7 @@ def linear_at(part: PreparedTest, system: System, params: PyTree) -> LinearSyste
 def apart(experiments: Sequence[Any]) -> tuple[tuple[Experiment, ...], tuple[LinearTest, ...]]:
     """The recordings in time, and the tests."""
     recordings = tuple(e for e in experiments if isinstance(e, Experiment))
-    return recordings, tuple(e for e in experiments if isinstance(e, LinearTest))
+    return recordings, tuple(e for e in experiments if not isinstance(e, Experiment))
 
 
 def in_given_order(experiments: Sequence[Any], of_recordings: Sequence[Any], of_tests: Sequence[Any]) -> list[Any]:

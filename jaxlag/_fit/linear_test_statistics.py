@@ -6,6 +6,7 @@ from jaxtyping import PyTree
 
 from .._linear.linear_system import LinearSystem
 from .channels import Channel, channel
+from .experiment import Experiment
 from .experiment_statistics import Predicted
 from .linear_test import LinearTest, deviations, linear_at
 from .minimum import Minimum
@@ -31,7 +32,7 @@ def channels_of_test(number: int, test: LinearTest, near: LinearSystem, residual
 
 def doubts(minimum: Minimum) -> list[str]:
     """What is in doubt about the tests among the experiments."""
-    numbers = [i for i, e in enumerate(minimum.experiments) if isinstance(e, LinearTest)]
+    numbers = [i for i, e in enumerate(minimum.experiments) if not isinstance(e, Experiment)]
     params = minimum.problem.free.insert(minimum.theta)
     pairs = zip(numbers, minimum.problem.tests, strict=True)
     return [f"of experiment {i}, {doubt}" for i, part in pairs for doubt in _doubts(part, minimum.problem.model.system, params)]

@@ -12,10 +12,11 @@ import numpy as np
 from .autocorrelation import independent_samples
 from .channel_sigma import too_short
 from .channels import channels_of
+from .experiment import Experiment
 from .experiment_statistics import ended_inputs, own_estimates, predictions_of, with_estimates
 from .identifiability import correlation_of
 from .levenberg_marquardt import CONVERGED, INTERRUPTED, REASONS, STEP_LIMIT, UNRELATED, Outcome
-from .linear_test import LinearTest, in_given_order
+from .linear_test import in_given_order
 from .linear_test_statistics import channels_of_test, doubts, predicted_tests
 from .minimum import Minimum
 from .multiple_shooting import Segments
@@ -120,7 +121,7 @@ def _predictions(minimum: Minimum, uncertainty: Uncertainty, scale: float) -> Fi
     found = in_given_order(minimum.experiments, predictions_of(minimum, covariance), predicted_tests(minimum, covariance))
     nears = iter(part.near for part in minimum.problem.tests)
     of_each = lambda k, e, one: (
-        channels_of_test(k, e, next(nears), one.residuals) if isinstance(e, LinearTest) else channels_of(k, e.values, one.residuals)
+        channels_of(k, e.values, one.residuals) if isinstance(e, Experiment) else channels_of_test(k, e, next(nears), one.residuals)
     )
     return {
         "predictions": [one.predictions for one in found],

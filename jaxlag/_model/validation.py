@@ -79,6 +79,8 @@ def _parameters(params, dtype, name):
 def _parameter(leaf, dtype, label):
     if isinstance(leaf, (int, float)) and not isinstance(leaf, bool):
         return np.asarray(leaf, dtype)
+    if type(leaf) is np.ndarray and leaf.dtype == dtype:  # the common one
+        return np.array(leaf)
     if isinstance(leaf, jax.Array):  # a weakly typed one, such as `jnp.asarray(1.0)`, counts as a number: nothing is compiled anew for it
         return leaf.astype(dtype) if leaf.dtype.kind == "f" and jax.typeof(leaf).weak_type else leaf
     if isinstance(leaf, Mapping):  # one that JAX takes for a leaf
