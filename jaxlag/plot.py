@@ -9,6 +9,7 @@ from ._draw.axes import pyplot
 from ._draw.fit import convergence, fit, parameters
 from ._draw.forces import forces, friction
 from ._draw.linear import bode, nyquist, root_locus
+from ._draw.mode_shapes import mode_shapes
 from ._draw.motion import balance, energy, motion, phase
 from ._paper.linearised_result import LinearisedEquations
 from ._paper.result import Equations
@@ -22,6 +23,7 @@ __all__ = [
     "fit",
     "forces",
     "friction",
+    "mode_shapes",
     "motion",
     "nyquist",
     "parameters",

@@ -1,6 +1,6 @@
-"""A motion as a moving picture: points and links by position maps, constraint forces as arrows."""
+"""A motion or a mode as a moving picture: points and links by position maps, constraint forces as arrows."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from typing import Any
 
 import jax
@@ -8,46 +8,54 @@ import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
 
+from .._linear.modes import Modes
 from .._mechanics.acceleration import constraint_force
 from .._model.injection import call
 from .._motion.trajectory import Trajectory
 from .animation import Animation
 from .axes import Units, one_motion
+from .mode_on_points import ModesOnPoints, as_many, draw_at_rest, said
 from .moving_picture import POINTS_PER_FRAME, MovingPicture
 
 MOST_FRAMES = 2000
+PERIOD = 2.0  # seconds in which a mode is shown
 
 
 def animate(
-    trajectory: Trajectory,
+    trajectory: Trajectory | Modes,
     points: Mapping[str, Callable],
     links: Sequence[Any] = (),
     *,
     forces: Mapping[str, str | Sequence[str]] | None = None,
+    amplitude: float | None = None,
     trail: float | int | None = None,
     fps: float | int = 25,
-    speed: float | int = 1.0,
+    speed: float | int | None = None,
     units: Units = None,
     ax: Any = None,
 ) -> Animation:
-    r"""A motion as a moving picture in the plane, in real time.
+    r"""A motion as a moving picture in the plane, in real time; or a mode, over one period.
 
-    $$ x_p(t) = x_p(t, q(t)), \qquad F_c \cdot \delta x_p = Q_c \cdot \delta q $$
+    $$ x_p(t) = x_p(t, q(t)), \qquad F_c \cdot \delta x_p = Q_c \cdot \delta q, \qquad
+       x_p(t) = x_p(q_0) + \mathrm{Re}\,\Big(a\,\frac{\partial x_p}{\partial q}\,\hat q\,e^{i\,\mathrm{Im}\,\lambda\,t}\Big) $$
 
     Between the samples q is interpolated, as by `Trajectory.at`. The limits of the axes are fixed by the whole motion; a machine that
-    travels far is best shown in a moving frame, by points without its travel.
+    travels far is best shown in a moving frame, by points without its travel. A mode is shown to first order, with the phases of its
+    shape and without its decay, over the faint mechanism at rest; one that does not oscillate goes to and fro. `plot.mode_shapes` draws several, still.
 
     **Arguments:**
 
-    - `trajectory`: one motion, as `simulate` returns it.
+    - `trajectory`: one motion, as `simulate` returns it, or one mode, `near.modes()[0]` of what `linearise` returns.
     - `points`: position maps by name; each returns (x, y), two numbers, from any of the arguments `t`, `q`, `qdot`, `params` and its
       entries, which it names.
     - `links`: pairs joined by a line, each end the name of a point or a fixed position, `("bob", (0.0, 0.0))`.
     - `forces`: constraint forces drawn as arrows: for the name of a constraint, the name of the point it acts on, or of all such points,
       `{"rod": ("a", "b")}` for one that pulls two bodies together; the forces are `constraint_force(..., at=points)`. The largest of
-      each is written beside its name; all arrows have the same scale.
+      each is written beside its name; all arrows have the same scale. Not of a mode.
+    - `amplitude`: of a mode: how far the point moves that moves most. Default: 10 % of the size of the mechanism.
     - `trail`: for how long the path of the points remains visible, in units of time; `math.inf` keeps all of it.
-    - `fps`: frames per second. `speed`: units of time shown per second, 1 for real time, 0.1 for ten times slower.
+    - `fps`: frames per second. `speed`: units of time shown per second, 1 for real time, 0.1 for ten times slower. Default: 1, and of a
+      mode what shows a period in two seconds.
     - `units`: units of `"t"`, of `"x"` for both axes, and of forces by the name of the constraint.
     - `ax`: matplotlib axes to draw in. Default: those of a new figure.
 
@@ -56,9 +64,10 @@ def animate(
     so shows at most 12.5 per second.
 
     **Raises:** `ValueError` if `points`, `links` or `forces` do not match each other or the system, if `fps` and `speed` give fewer than 2
-    or more than 2000 frames, or if fewer than 2 samples were computed; `ImportError` without matplotlib.
+    or more than 2000 frames, if fewer than 2 samples were computed, or if it is not one motion or one mode; `ImportError` without
+    matplotlib.
 
-    **Source:** Goldstein, Classical Mechanics, 3rd ed., eq. 1.49 (the force on a point).
+    **Source:** Goldstein, Classical Mechanics, 3rd ed., eq. 1.49 (the force on a point) and section 6.3 (modes).
 
     ```python
     import jax.numpy as jnp
@@ -71,17 +80,56 @@ def animate(
     moving.frames  # 51
     ```
     """
-    motion, links = _computed_part(one_motion(trajectory)), tuple(links)
+    links = tuple(links)
     acting = {name: (on,) if isinstance(on, str) else tuple(on) for name, on in (forces or {}).items()}
-    _check_names(motion, points, links, acting)
-    at = _frame_times(np.asarray(motion.ts), fps, speed)
+    if isinstance(trajectory, Modes):
+        if acting:
+            raise ValueError(f"`forces` must be those of a motion, but {', '.join(acting)} is to be drawn on a mode. Leave it out.")
+        check_names((), points, links, {})
+        return _mode(trajectory, points, links, amplitude, trail, fps, speed, units, ax)
+    if amplitude is not None:
+        raise ValueError(f"`amplitude` must be left out for a motion, which has its own, but is {amplitude:g}. Leave it out.")
+    motion = _computed_part(one_motion(trajectory))
+    check_names(motion.multipliers, points, links, acting)
+    at = _frame_times(np.asarray(motion.ts), fps, 1.0 if speed is None else speed)
     tracks = {name: _track(motion, at, name, point) for name, point in points.items()}
     arrows = {name: _forces(motion, at, name, {point: points[point] for point in on}) for name, on in acting.items()}
     picture = MovingPicture.of(at, tracks, links, arrows, trail, units, ax)
     return Animation(picture.ax, at.size, fps, picture.draw)
 
 
-def _check_names(motion: Trajectory, points: Mapping[str, Callable], links: tuple, forces: Mapping[str, tuple[str, ...]]) -> None:
+def _mode(
+    mode: Modes,
+    points: Mapping[str, Callable],
+    links: tuple,
+    amplitude: float | None,
+    trail: float | int | None,
+    fps: float | int,
+    speed: float | int | None,
+    units: Units,
+    ax: Any,
+) -> Animation:
+    """A mode over one period, whose last frame leads to its first."""
+    if mode.eigenvalues.ndim:
+        raise ValueError(f"`trajectory` must be one mode, but is {mode.eigenvalues.shape} of them. Take one, e.g. `near.modes()[0]`.")
+    turning = float(mode.eigenvalues.imag)
+    if speed is not None and not turning:
+        raise ValueError(f"`speed` must be left out for a mode that does not oscillate, but is {speed:g}. Leave it out.")
+    period = 2 * np.pi / abs(turning) if turning else PERIOD
+    speed = period / PERIOD if speed is None else speed
+    count = _checked(round(period * fps / speed), period, speed)
+    modes = as_many(mode)
+    on_points = ModesOnPoints.of(modes, points, links, amplitude)
+    phases = np.arange(POINTS_PER_FRAME * (count - 1) + 1) * 2 * np.pi / (POINTS_PER_FRAME * count)
+    (track,) = on_points.at(phases[None] * (np.sign(turning) or 1.0))
+    (title,) = said(modes, units)
+    at = np.arange(count) * period / count
+    picture = MovingPicture.of(at, on_points.by_name(track), links, {}, trail, units, ax, title)
+    draw_at_rest(picture.ax, on_points.by_name(on_points.rest), links)
+    return Animation(picture.ax, count, fps, picture.draw)
+
+
+def check_names(constraints: Collection[str], points: Mapping[str, Callable], links: tuple, forces: Mapping[str, tuple[str, ...]]) -> None:
     """Checks that links and forces refer to points, and forces to constraints."""
     if not points:
         raise ValueError(
@@ -95,8 +143,8 @@ def _check_names(motion: Trajectory, points: Mapping[str, Callable], links: tupl
             if end not in points if isinstance(end, str) else np.shape(end) != (2,):
                 raise ValueError(f"`links` must join points or positions (x, y), but one ends at {end!r}. The points are {known_points}.")
     for name, on in forces.items():
-        if name not in motion.multipliers:
-            known = ", ".join(motion.multipliers) or "none"
+        if name not in constraints:
+            known = ", ".join(constraints) or "none"
             raise ValueError(f"`forces` must be of constraints of the system, but {name!r} is not. There are {known}.")
         for point in on:
             if point not in points:
@@ -115,12 +163,17 @@ def _computed_part(motion: Trajectory) -> Trajectory:
 def _frame_times(ts: np.ndarray, fps: float | int, speed: float | int) -> np.ndarray:
     """The equidistant times of the frames."""
     count = int(np.floor((ts[-1] - ts[0]) * fps / speed + 1e-9)) + 1
+    return ts[0] + np.arange(_checked(count, ts[-1] - ts[0], speed)) * speed / fps
+
+
+def _checked(count: int, length: float, speed: float | int) -> int:
+    """The number of frames, if it is sensible."""
     if not 2 <= count <= MOST_FRAMES:
         raise ValueError(
-            f"`fps` and `speed` must give 2 to {MOST_FRAMES} frames, but this motion of {ts[-1] - ts[0]:g} gives {count}. "
+            f"`fps` and `speed` must give 2 to {MOST_FRAMES} frames, but this motion of {length:g} gives {count}. "
             f"Change `speed`, now {speed:g}: the time that passes in one second."
         )
-    return ts[0] + np.arange(count) * speed / fps
+    return count
 
 
 def _track(motion: Trajectory, at: np.ndarray, name: str, point: Callable) -> np.ndarray:

@@ -23,6 +23,7 @@ class MovingPicture:
     arrows: dict[str, dict[str, np.ndarray]]  # by constraint and point, (frames, 2)
     trail: float | int | None
     unit: str
+    title: str | None  # in place of the time
     paths: list
     lines: list
     dots: list
@@ -38,6 +39,7 @@ class MovingPicture:
         trail: float | int | None,
         units: Units,
         ax: Any,
+        title: str | None = None,
     ) -> "MovingPicture":
         """The picture laid out once, so that frames only move what is on it."""
         fixed = [np.asarray(end, float) for link in links for end in link if not isinstance(end, str)]
@@ -60,7 +62,7 @@ class MovingPicture:
                 quivers[name, point] = ax.quiver([0.0], [0.0], [0.0], [0.0], color=colour(len(tracks) + i), label=entry, **style)
         if quivers:
             ax.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), fontsize="small", frameon=False, borderpad=0)
-        picture = cls(ax, at, tracks, links, arrows, trail, (units or {}).get("t", ""), paths, lines, dots, quivers)
+        picture = cls(ax, at, tracks, links, arrows, trail, (units or {}).get("t", ""), title, paths, lines, dots, quivers)
         picture.draw(0)
         if is_own:  # laid out once, so that the axes do not jitter
             ax.figure.draw_without_rendering()
@@ -82,7 +84,8 @@ class MovingPicture:
             quiver.set_offsets(position(point))
             quiver.set_UVC(*self.arrows[name][point][i])
         digits = max(0, int(np.ceil(-np.log10(step))))
-        self.ax.set_title(f"t = {self.at[i]:.{digits}f} {self.unit}".rstrip(), loc="left", fontsize="medium")
+        time = f"t = {self.at[i]:.{digits}f} {self.unit}".rstrip()
+        self.ax.set_title(time if self.title is None else self.title, loc="left", fontsize="medium")
         return [*self.paths, *self.lines, *self.dots, *self.quivers.values()]
 
 

@@ -35,6 +35,12 @@ class Transition(NamedTuple):
     which: int
     grows: bool  # beyond this value
     spectrum: Spectrum
+    far: float  # the farther end of the step in which it lies
+
+    @property
+    def eigenvalue(self) -> complex:
+        """The one that begins or ceases to grow."""
+        return self.spectrum.values[self.which]
 
 
 def continued(before: Spectrum, after: Spectrum) -> Spectrum:
@@ -71,6 +77,7 @@ def _transitions(spectrum_at: Callable, before: Spectrum, after: Spectrum) -> It
     """Between two spectra, one after the other: each where the number of growing eigenvalues changes."""
     count = lambda spectrum: np.sum(spectrum.signs > 0)
     size = np.max(np.abs([before.values, after.values]), initial=0.0)
+    ends = before.at, after.at
     while count(before) != count(after):
         low, high = before, after
         while (middle := (low.at + high.at) / 2) not in (low.at, high.at):
@@ -80,5 +87,5 @@ def _transitions(spectrum_at: Callable, before: Spectrum, after: Spectrum) -> It
         growing = high if grows else low
         near = np.abs(growing.values.real) <= 1e-5 * size
         for which in np.flatnonzero((growing.signs > 0) & near & (growing.values.imag >= -growing.rounding)):
-            yield Transition(high.at, int(which), grows, growing)
+            yield Transition(high.at, int(which), grows, growing, max(ends, key=lambda end: abs(end - high.at)))
         before = high

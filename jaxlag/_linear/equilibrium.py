@@ -16,6 +16,7 @@ from .._model.state_values import given_states
 from .._model.system import System
 from .._model.validation import coordinates, parameters, state
 from .._program.jit import is_concrete, seen
+from .not_differentiated import without_derivative
 from .rest import Search, steady_state
 from .stability import stability, undecided
 
@@ -27,7 +28,8 @@ class Equilibrium(eqx.Module):
     - `friction`: by dissipation term with dry friction, the force that holds and the bound that it would have to exceed.
     - `stability`: "stable", "unstable" or "neutral", by the potential energy on the constraints; elsewhere a sentence.
     - `stiffness`: the second variation of the potential on the constraints, relative to M: squares of natural frequencies, ascending;
-      without inertia, the eigenvalues of the stiffness itself. None where there is no potential.
+      without inertia, the eigenvalues of the stiffness itself. None where there is no potential, under `jit` and under `vmap`. Its
+      derivative is NaN: take those of `linearise`.
     - `undecided`: coordinates on which nothing depends: they stay where they were.
     """
 
@@ -45,20 +47,26 @@ class Equilibrium(eqx.Module):
         if not is_concrete(self):
             return "Equilibrium(traced)"
         value = lambda tree: ", ".join(
-            f"{name} = {x:.6g}" for name, x in zip(entry_names(tree, "q"), np.asarray(ravel_pytree(tree)[0]), strict=True)
+            f"{name} = {x:.6g}" for name, x in zip(entry_names(tree, "q"), _without_dust(np.asarray(ravel_pytree(tree)[0])), strict=True)
         )
         rows = [("at", value(self.q))]
         if np.any(ravel_pytree(self.qdot)[0]):
             rows.append(("moving with", value(self.qdot)))
         rows += [(name, value(tree)) for name, tree in (("states", self.states), ("multipliers", self.multipliers)) if tree]
         for name, (force, bound) in self.friction.items():
-            rows.append(("friction", f"{name}: {np.max(np.abs(force), initial=0.0):.4g} of {np.min(bound):.4g} that it can hold"))
+            *_, largest = _without_dust(np.asarray([*bound, np.max(np.abs(force), initial=0.0)]))
+            rows.append(("friction", f"{name}: {largest:.4g} of {np.min(bound):.4g} that it can hold"))
         rows.append(("stability", self.stability))
         if self.undecided:
             rows.append(("undecided", f"{', '.join(self.undecided)}: nothing depends on them"))
         return "\n".join(
             ["Equilibrium" if not np.any(ravel_pytree(self.qdot)[0]) else "Steady motion", *(f"  {n:<13}{v}" for n, v in rows)]
         )
+
+
+def _without_dust(x: np.ndarray) -> np.ndarray:
+    """With 0 for what is zero within rounding, as the search sees it: in parts of 1 + |x|."""
+    return np.where(np.abs(x) <= 8 * np.finfo(x.dtype).eps * (1 + np.max(np.abs(x), initial=0.0)), 0.0, x)
 
 
 def equilibrium(
@@ -86,7 +94,8 @@ def equilibrium(
 
     **Returns:** an `Equilibrium`; print it. Differentiable in `params` to any order, by the implicit function theorem.
 
-    **Raises:** `ValueError` where no equilibrium was found, with the force that is left. Under `jit` all is NaN there.
+    **Raises:** `ValueError` where no equilibrium was found, with the force that is left; of many under `vmap` where the first has none.
+    Under `jit`, and of the others, all is NaN there.
 
     **Source:** Goldstein, Classical Mechanics, 3rd ed., section 6.1.
 
@@ -170,15 +179,19 @@ def _found(system: System, q: PyTree, qdot: PyTree, params: PyTree, t: Any, stat
     t = number(t, "`t`", jax.tree.leaves(q)[0].dtype, cure="Pass one time, and use `jax.vmap` for several.")
     given = system, t, q, qdot, parameters(params, q), given_states(system, states, q)
     found, names = steady_state(search, *given), entry_names(q, "q")
+    is_known = is_concrete(jax.lax.stop_gradient(found))
+    if found.friction and not (is_known and seen(found).succeeded):
+        held = steady_state(search._replace(held=True), *given)
+        found = held if is_known else jax.tree.map(lambda free, held: jnp.where(found.succeeded, free, held), found, held)
     values = seen(found)
-    if values is not None and not values.succeeded and found.friction:
-        found = steady_state(search._replace(held=True), *given)
-        values = seen(found)
-    if values is None:
-        return Equilibrium(*found[:6], None, "not known under `jit`", ())
-    values = jax.tree.map(np.asarray, values)
-    _refuse(values, names)
-    return Equilibrium(*found[:6], *stability(system, values), undecided(values, names))
+    if values is not None:
+        values = jax.tree.map(np.asarray, values)
+        _refuse(values, names)
+    if not is_known:
+        return Equilibrium(*found[:6], None, f"not known under `{'jit' if values is None else 'vmap'}`", ())
+    stiffness, kind = stability(system, values)
+    shown = None if stiffness is None else without_derivative(stiffness, (found.q, given))
+    return Equilibrium(*found[:6], shown, kind, undecided(values, names))
 
 
 def _refuse(found, names):

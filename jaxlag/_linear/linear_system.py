@@ -13,6 +13,7 @@ from .._model.state_values import Layout
 from .._program.jit import compiled, is_concrete
 from .eigenvalues import eigen
 from .modes import Modes, SecondOrder, damping_ratios, is_conservative, normalised, of_first_order, of_second_order
+from .origin import Origin
 from .response import Bode, bode, free_motion, frequencies, frequency_response, held, in_discrete_steps, zeros
 from .tangent_space import Partition
 
@@ -36,7 +37,8 @@ class LinearSystem(eqx.Module):
     - `basis`: T, where inputs move no constraint; q flat in the order of `jax.flatten_util.ravel_pytree`. `constraint_forces`: Λ, with
       δλ = Λ x. `mass`: M. `coordinates`: which entries of q are independent.
     - `state_names`, `input_names`, `output_names`: one for each number; `phi_dot` is the velocity of `phi`.
-    - `q`, `qdot`: the state, structured as given. `sample_time`: None in continuous time.
+    - `q`, `qdot`: the state, structured as given; `origin`: the same, with time and params; None along a trajectory.
+    - `sample_time`: None in continuous time.
     - `second_order`: the matrices M, C, G, K, N of a system of second order; None where there are first-order states, nonholonomic
       constraints or friction that sticks.
 
@@ -60,6 +62,7 @@ class LinearSystem(eqx.Module):
     mass: Float[Array, "*t n n"]
     q: PyTree
     qdot: PyTree
+    origin: Origin | None
     sample_time: Any
     state_names: tuple[str, ...] = eqx.field(static=True)
     input_names: tuple[str, ...] = eqx.field(static=True)
@@ -98,7 +101,7 @@ class LinearSystem(eqx.Module):
         shaped = lambda layout, columns: jax.vmap(lambda x: _unravelled(layout, x))(columns.T)
         at = self.coordinates
         of = shaped(at.q, q), shaped(at.multipliers, forces), shaped(at.states, z)
-        return Modes(found.values, damping_ratios(found.values), found.stable, found.repeated, *of)
+        return Modes(found.values, damping_ratios(found.values), found.stable, found.repeated, *of, self.origin)
 
     def frequency_response(self, omega: Any) -> Complex[Array, "w p m"]:
         """G(iω) from the inputs to the outputs at the angular frequencies `omega`, rad/time, 0 or more: (len(omega), outputs, inputs)."""

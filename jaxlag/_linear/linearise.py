@@ -22,6 +22,7 @@ from .dynamics import dynamics_of
 from .inputs import Input, find_inputs
 from .linear_system import Coordinates, LinearSystem
 from .matrices import Choice, Matrices, constraint_slopes, matrices
+from .origin import Origin
 from .sampled_data import between_updates
 from .steadiness import moved_on, refuse_unsteady
 from .tangent_space import Partition, partition
@@ -101,7 +102,7 @@ def linearise(
         raise ValueError("`inputs` must not move a constraint along a trajectory, where A changes, but do. Move a force instead.")
     if not (along or frozen):
         refuse_unsteady(found, lambda step: of(*moved_on(first, step)), near.names)
-    return _linear_system(near, choice, found, q, qdot)
+    return _linear_system(near, choice, found, q, qdot, None if along else Origin.of(t, q, qdot, params))
 
 
 class _Near:
@@ -162,7 +163,7 @@ HIDDEN = (
 )
 
 
-def _linear_system(near: _Near, choice: Choice, found: Matrices, q: PyTree, qdot: PyTree) -> LinearSystem:
+def _linear_system(near: _Near, choice: Choice, found: Matrices, q: PyTree, qdot: PyTree, origin: Origin | None) -> LinearSystem:
     """What was found, with its names; in discrete time where sampled states update themselves."""
     _, like, _, params, _ = near.given
     dynamics, y = dynamics_of(near.system, like, params, near.at, choice.inputs, choice.outputs)
@@ -183,6 +184,7 @@ def _linear_system(near: _Near, choice: Choice, found: Matrices, q: PyTree, qdot
         mass=found.mass,
         q=q,
         qdot=qdot,
+        origin=origin,
         sample_time=None,
         state_names=(*positions, *(f"{name}_dot" for name in velocities), *entry_names(near.first_order)),
         input_names=tuple(entry.name for entry in choice.inputs),

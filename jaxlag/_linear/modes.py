@@ -1,5 +1,7 @@
 """Modes: natural frequencies, damping, shapes, and the constraint forces that go with them."""
 
+import dataclasses
+import itertools
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -10,6 +12,7 @@ from jaxtyping import Array, Bool, Complex, Float, PyTree
 
 from .._program.jit import compiled, is_concrete
 from .eigenvalues import are_repeated, eigen, rounding, symmetric_eigen
+from .origin import Origin
 
 
 class SecondOrder(NamedTuple):
@@ -35,9 +38,9 @@ class Modes(eqx.Module):
     - `stable`: whether it does not grow. `repeated`: whether another mode has the same eigenvalue: of these shapes any combination is
       one too, and derivatives of their eigenvalues are those of the mean.
     - `shapes`: q̂, structured like q, with the modes as first axis; real where there is no damping. `states`: of the first-order states.
-    - `multipliers`: the constraint forces of the mode, by name.
+    - `multipliers`: the constraint forces of the mode, by name. `origin`: the state near which it is one; None along a trajectory.
 
-    Printed, it is a table. In discrete time λ is log(z)/T.
+    `modes[0]` is one of them, which `animate` shows. Printed, it is a table. In discrete time λ is log(z)/T.
     """
 
     eigenvalues: Complex[Array, " k"]
@@ -47,6 +50,7 @@ class Modes(eqx.Module):
     shapes: PyTree
     multipliers: dict[str, PyTree]
     states: dict[str, PyTree]
+    origin: Origin | None
 
     @property
     def angular_frequency(self) -> Float[Array, " k"]:
@@ -69,23 +73,33 @@ class Modes(eqx.Module):
 
     def __getitem__(self, which: Any) -> "Modes":
         """Some of the modes."""
-        return jax.tree.map(lambda x: x[which], self)
+        origin, of_many = self.origin, self.eigenvalues.ndim - 1
+        if of_many > 0:  # all modes of one system have one origin
+            origin = jax.tree.map(lambda x: x[which[:of_many] if isinstance(which, tuple) else which], origin)
+        parts = jax.tree.map(lambda x: x[which], dataclasses.replace(self, origin=None))
+        return dataclasses.replace(parts, origin=origin)
 
     def __repr__(self) -> str:
         if not is_concrete(self) or self.eigenvalues.ndim != 1:
             return f"Modes(of shape {self.eigenvalues.shape})"
         head = f"{'mode':>4}  {'ω₀ (rad/s)':>12}  {'f (Hz)':>12}  {'ζ':>9}  {'1/|Re λ| (s)':>12}  "
-        rows = zip(*map(np.asarray, (self.angular_frequency, self.frequency, self.damping_ratio, self.time_constant)), strict=True)
-        lines = [
-            f"{i:>4}  {w:>12.5g}  {f:>12.5g}  {z:>9.3g}  {T:>12.4g}  {_kind(self.eigenvalues[i], self.stable[i], self.repeated[i])}"
-            for i, (w, f, z, T) in enumerate(rows)
-        ]
+        columns = tuple(map(np.asarray, (self.angular_frequency, self.frequency, self.damping_ratio, self.time_constant)))
+        lines = []
+        for still, run in itertools.groupby(range(len(self)), key=lambda i: bool(self.eigenvalues[i] == 0)):
+            first, *others = run
+            for i in [first] if still else [first, *others]:
+                w, f, z, T = (column[i] for column in columns)
+                which = f"{i}–{others[-1]}" if still and others else i
+                kind = _still(1 + len(others)) if still else _kind(self.eigenvalues[i], self.stable[i], self.repeated[i])
+                lines.append(f"{which:>4}  {w:>12.5g}  {f:>12.5g}  {z:>9.3g}  {T:>12.4g}  {kind}")
         return "\n".join(["Modes", head.rstrip(), *lines])
 
 
+def _still(count):
+    return "stays where it is put" if count == 1 else f"{count} modes stay where they are put"
+
+
 def _kind(value, stable, repeated):
-    if value == 0:
-        return "stays where it is put"
     kind = "stable" if stable else "flutter" if value.imag else "divergence"
     return f"{kind}{', repeated' if repeated else ''}"
 

@@ -1,6 +1,7 @@
 """How eigenvalues move with a parameter, and where the system becomes unstable."""
 
 import functools
+from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
@@ -17,23 +18,14 @@ from .._model.system import System
 from .._model.validation import coordinates, parameters, state
 from .._program.jit import compiled, is_concrete, seen
 from .branches import Spectrum, Transition, finer, followed
+from .crossing import Crossing, located, moving
 from .eigenvalues import eigen, rounding
 from .equilibrium import equilibrium, steady
 from .linear_system import LinearSystem
 from .linearise import linearise
 from .matrices import Choice, matrices
+from .not_differentiated import without_derivative
 from .zero_eigenvalues import always_zero, coupled, without_zeros
-
-
-class Crossing(eqx.Module):
-    """Where a branch crosses the imaginary axis: the `value` of the parameter, the `frequency` |Im λ| in rad/time, its `kind`, "flutter"
-    (a pair that oscillates) or "divergence" (λ = 0), and the `direction`: whether growth of the parameter "destabilises" or "stabilises".
-    """
-
-    value: Float[Array, ""]
-    frequency: float = eqx.field(static=True)
-    kind: str = eqx.field(static=True)
-    direction: str = eqx.field(static=True)
 
 
 class RootLocus(eqx.Module):
@@ -103,8 +95,6 @@ def root_locus(
         raise ValueError("`system` must have no sampled states, but has. Linearise it at each value: its eigenvalues are those of a step.")
     family = _Family(system, q, qdot, params, over, t, states, float(values[0]))
     known = seen(family.params)
-    if known is None:
-        raise ValueError("`params` must be known to follow branches, but are hidden by `jit`. Call `root_locus` from Python.")
     matrix = functools.cache(lambda at: np.asarray(family.matrix(at, known)))
     grid = [matrix(at) for at in finer(values)]
     core = coupled(grid)
@@ -112,10 +102,10 @@ def root_locus(
     zeros = always_zero([A[part] for A in grid])
     shown, transitions = followed(lambda at: _spectrum(at, matrix(at)[part], zeros), values)
     family.refuse_unsteady(float(values[-1]), known)
-    crossings = [_crossing(family, core, zeros, transition) for transition in transitions]
+    crossings = [_crossing(family, matrix, core, zeros, transition) for transition in transitions]
     eigenvalues = np.stack([at.values for at in shown])
     eigenvalues = np.concatenate([eigenvalues, np.zeros((len(values), len(grid[0]) - eigenvalues.shape[1]))], axis=1)
-    return RootLocus(over, jnp.asarray(values), _without_derivative(jnp.asarray(eigenvalues), family.params), tuple(crossings))
+    return RootLocus(over, jnp.asarray(values), without_derivative(jnp.asarray(eigenvalues), family.params), tuple(crossings))
 
 
 class _Family:
@@ -127,12 +117,17 @@ class _Family:
         like = coordinates(like, "q")
         self.t = number(t, "`t`", jax.tree.leaves(like)[0].dtype, cure="Pass one time.")
         self.params, self.states = parameters(params, like), given_states(system, states, like)
+        if not is_concrete(jax.lax.stop_gradient((self.params, self.states, self.t))):
+            raise ValueError(
+                "`params` must be known to follow branches, but are hidden by `jit` or one set of many under `vmap`. "
+                "Call `root_locus` from Python, for one set after the other."
+            )
         names = leaf_names(self.params, "params")
         if over not in names or np.shape(jax.tree.leaves(self.params)[names.index(over)]):
             raise ValueError(f"`over` must name one number of `params`, but is {over!r}. The entries are {', '.join(names)}.")
         self.index = names.index(over)
         self.steady: dict[float, Any] = {}  # states that were found, from which others start
-        self.partition = self._linearised(first, seen(self.params)).coordinates.partition
+        self.choice = Choice((), None, self._linearised(first, seen(self.params)).coordinates.partition, 0)
 
     def at(self, value: Any, params: PyTree) -> PyTree:
         """`params` with this value."""
@@ -142,13 +137,15 @@ class _Family:
 
     def matrix(self, value: Any, params: PyTree) -> Float[Array, "d d"]:
         """A."""
-        choice, moved = Choice((), None, self.partition, 0), self.at(value, params)
+        return matrices(self.choice, self.system, self.t, *self.state(value, params)).rates.by_state
+
+    def state(self, value: Any, params: PyTree) -> tuple[PyTree, PyTree, PyTree, PyTree]:
+        """q, q̇, `params` and the states of first order, of which A is a function."""
+        moved = self.at(value, params)
         if callable(self.q) or callable(self.qdot):
-            at = *_state(self.q, self.qdot, self.t, moved), moved, self.states
-        else:
-            found = self._found(value, params)
-            at = found.q, found.qdot, moved, found.states
-        return matrices(choice, self.system, self.t, *at).rates.by_state
+            return *_state(self.q, self.qdot, self.t, moved), moved, self.states
+        found = self._found(value, params)
+        return found.q, found.qdot, moved, found.states
 
     def refuse_unsteady(self, value: float, params: PyTree) -> None:
         """Raises where the state is not steady at this value."""
@@ -193,66 +190,23 @@ def _eigen(A):
     return values, vectors, rounding(A, vectors)
 
 
-def _crossing(family: _Family, core: np.ndarray, zeros: list[int], transition: Transition) -> Crossing:
+def _crossing(family: _Family, matrix: Callable, core: np.ndarray, zeros: list[int], transition: Transition) -> Crossing:
     """A transition, with its derivative in `params`."""
-    at, spectrum = transition.at, transition.spectrum
-    value = spectrum.values[transition.which]
-    oscillates = abs(value.imag) > 10 * spectrum.rounding[transition.which]
+    part = np.ix_(core, core)
+    comes_to_zero = abs(transition.eigenvalue.imag) <= 10 * transition.spectrum.rounding[transition.which]
+    at, value = transition.at, transition.eigenvalue
+    if not (zeros and comes_to_zero):
+        at, value = located(lambda at: matrix(at)[part], transition)
     point = jnp.asarray(at)
     if not is_concrete(family.params):
-        if zeros and not oscillates:
+        if zeros and comes_to_zero:
             raise ValueError(
                 f"`params` must not be differentiated at {family.over} = {at:g}, but are: an eigenvalue comes to zero there beside others "
                 "that are always zero. Take differences."
             )
-        known, part = seen(family.params), np.ix_(core, core)
-        slope = np.asarray(jax.jvp(lambda value: family.matrix(value, known), (point,), (jnp.ones_like(point),))[1])
-        weights = _weights(np.asarray(family.matrix(at, known))[part], slope[part], value)
-        point = _moving(point, weights, family.matrix(at, family.params)[part])
+        A, known = np.asarray(matrix(at)), seen(family.params)
+        state = lambda value: family.state(value, known)
+        point = moving(point, A, core, value, (family.choice, family.system, family.t), state, family.state(at, family.params))
     direction = "destabilises" if transition.grows else "stabilises"
-    return Crossing(point, float(abs(value.imag)) if oscillates else 0.0, "flutter" if oscillates else "divergence", direction)
-
-
-def _weights(A: np.ndarray, slope: np.ndarray, value: complex) -> np.ndarray:
-    """W with dp* = Σ W dA. Where two eigenvalues meet in one eigenvector, yᴴx = 0, and yᴴ (dA + A' dp*) x = 0 keeps them together."""
-    values, vectors = np.linalg.eig(A)
-    i = int(np.argmin(np.abs(values - value)))
-    x, y = vectors[:, i], np.linalg.inv(vectors)[i]
-    y = y / np.linalg.norm(y)
-    if abs(y @ x) < 1e-5:
-        return -np.real(np.outer(y, x) / (y @ slope @ x))
-    return -np.real(np.outer(y, x) / (y @ x)) / np.real(y @ slope @ x / (y @ x))
-
-
-@jax.custom_jvp
-def _without_derivative(x, params):
-    """x, whose derivative is not zero, as it would be, but NaN."""
-    return x
-
-
-@_without_derivative.defjvp
-def _without_derivative_rule(primals, tangents):
-    moved = [jnp.sum(jnp.real(d)) for d in jax.tree.leaves(tangents[1]) if jnp.issubdtype(d.dtype, jnp.inexact)]
-    return primals[0], jnp.full_like(primals[0], jnp.nan) * sum(moved)
-
-
-@jax.custom_jvp
-def _moving(at, weights, A):
-    """The value at a crossing, which moves as A does: differentiable once."""
-    return at
-
-
-@_moving.defjvp
-def _moving_rule(primals, tangents):
-    (at, weights, A), (_, _, dA) = primals, tangents
-    return _moving(at, weights, A), jnp.sum(_once(weights, A) * dA)
-
-
-@jax.custom_jvp
-def _once(weights, A):
-    return weights
-
-
-@_once.defjvp
-def _once_rule(primals, tangents):
-    raise NotImplementedError("the value at a crossing must be differentiated once only, but is twice. Take differences of its gradient.")
+    kind, frequency = ("divergence", 0.0) if comes_to_zero else ("flutter", float(abs(value.imag)))
+    return Crossing(point, frequency, kind, direction)

@@ -74,7 +74,7 @@ def by_rows(asked: Request, D) -> tuple[Float[Array, "m m"], Bool[Array, ""]]:
     rest, or `reach`. Others are left out: below `NOISE`, where dependent rows have them by rounding, for good; above it, unsatisfied.
     """
     eps = jnp.finfo(D.dtype).eps
-    U, values = _left_singular_vectors(D[:, None] * asked.rows)
+    U, values = _left_singular_vectors(jnp.concatenate([D[:, None] * asked.rows, _absent(D)], axis=1))
     wanted, rest = D[:, None] * asked.c, U.T @ (D[:, None] * (asked.c - asked.rows @ asked.free))
     clear, seen = values > eps**CLEAR * values[0], values > eps**SEEN * values[0]
     step = rest / jnp.where(seen, values, 1)[:, None]
@@ -84,6 +84,11 @@ def by_rows(asked: Request, D) -> tuple[Float[Array, "m m"], Bool[Array, ""]]:
     contradicts = jnp.abs(rest) > eps**FOLLOWS * (length(wanted) + length(asked.free))
     satisfied = ~jnp.any(~held & ((values > eps**NOISE * values[0]) | jnp.any(contradicts, axis=1)))
     return _by_values(values**2, U, held, D), satisfied
+
+
+def _absent(D):
+    """A direction of its own for each row of zeros: among those that are not held, rounding would mix it with others."""
+    return jnp.diag(D == 0).astype(D.dtype)
 
 
 def _left_singular_vectors(rows: Float[Array, "m n"]) -> tuple[Float[Array, "m m"], Float[Array, " m"]]:
@@ -149,7 +154,7 @@ def pseudo_inverse(S: Float[Array, "m m"]) -> Float[Array, "m m"]:
 
     def singular(D):
         D = jax.lax.stop_gradient(D)
-        values, U = jnp.linalg.eigh(jax.lax.stop_gradient(S) * jnp.outer(D, D))
+        values, U = jnp.linalg.eigh(jax.lax.stop_gradient(S) * jnp.outer(D, D) + _absent(D))
         return _by_values(values, U, values > jnp.finfo(D.dtype).eps ** (2 * CLEAR) * values[-1], D), jnp.array(True)
 
     one = jnp.eye(len(S), dtype=S.dtype)

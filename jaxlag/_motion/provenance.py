@@ -9,6 +9,20 @@ from .._mechanics.stick_slip import Regularised, StickSlip
 from .._model.system import System
 
 
+def taken_apart(params: PyTree) -> tuple[list[Array | np.ndarray], tuple]:
+    """The arrays in params, and all else."""
+    leaves, structure = jax.tree.flatten(params)
+    numbers = [leaf for leaf in leaves if eqx.is_array(leaf)]
+    return numbers, (structure, tuple(None if eqx.is_array(leaf) else leaf for leaf in leaves))
+
+
+def put_together(numbers: list[Array | np.ndarray], rest: tuple) -> PyTree:
+    """The params of both."""
+    structure, others = rest
+    arrays = iter(numbers)
+    return jax.tree.unflatten(structure, [next(arrays) if other is None else other for other in others])
+
+
 class Provenance(eqx.Module):
     """The system and params of a motion, and the treatment of friction. What is not an array in params is kept apart, so that batches
     of motions consist of arrays only.
@@ -21,16 +35,13 @@ class Provenance(eqx.Module):
 
     @classmethod
     def of(cls, system: System, params: PyTree, friction: StickSlip | Regularised = StickSlip()) -> "Provenance":
-        leaves, structure = jax.tree.flatten(params)
-        numbers = [leaf for leaf in leaves if eqx.is_array(leaf)]
-        return cls(numbers, system, (structure, tuple(None if eqx.is_array(leaf) else leaf for leaf in leaves)), friction)
+        numbers, rest = taken_apart(params)
+        return cls(numbers, system, rest, friction)
 
     @property
     def params(self) -> PyTree:
         """The params, put together again."""
-        structure, others = self.rest
-        numbers = iter(self.numbers)
-        return jax.tree.unflatten(structure, [next(numbers) if other is None else other for other in others])
+        return put_together(self.numbers, self.rest)
 
     @property
     def one_sided(self) -> tuple[str, ...]:

@@ -341,3 +341,24 @@ def test_singular_values_of_two_rows():
         np.testing.assert_allclose(values, np.linalg.svd(rows, compute_uv=False), rtol=0, atol=4e-15 * largest)
         np.testing.assert_allclose(U @ U.T, np.eye(2), rtol=0, atol=4e-15)
         assert abs(a @ b) <= 4e-15 * largest**2
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_rows_of_zeros_among_rows_that_depend_on_each_other(seed):
+    """As of friction that slips, or a contact that is open, beside redundant constraints. Rounding must not mix their null directions."""
+    rng, worst = np.random.default_rng(seed), 0.0
+    for _ in range(50):
+        root, B, x0 = rng.normal(size=(4, 4)), rng.normal(size=(2, 4)), rng.normal(size=4)
+        M, f = np.eye(4) + 0.2 * root @ root.T, rng.normal(size=4)
+        G = np.stack([B[0], B[1], rng.normal(size=2) @ B, 0 * B[0], rng.integers(2) * rng.normal(size=4)])[rng.permutation(5)]
+        found = _solved(M, G, f, G @ x0)
+        whole = np.block([[M, -G.T], [G, np.zeros((5, 5))]])
+        x = np.linalg.lstsq(whole, np.concatenate([f, G @ x0]), rcond=1e-10)[0][:4]
+        multipliers = np.linalg.pinv(G.T, rcond=1e-10) @ (M @ x - f)
+        worst = max(worst, np.max(np.abs(found[0] - x)), np.max(np.abs(found[1] - multipliers)))
+    assert worst < 1e-10
+
+
+@jax.jit
+def _solved(M, G, f, c):
+    return saddle_point(lx.MatrixLinearOperator(M), G, f, c)[:2]
