@@ -41,7 +41,8 @@ def animate(
 
     Between the samples q is interpolated, as by `Trajectory.at`. The limits of the axes are fixed by the whole motion; a machine that
     travels far is best shown in a moving frame, by points without its travel. A mode is shown to first order, with the phases of its
-    shape and without its decay, over the faint mechanism at rest; one that does not oscillate goes to and fro. `plot.mode_shapes` draws several, still.
+    shape and without its decay, over the faint mechanism at rest; one that does not oscillate goes to and fro. `plot.mode_shapes`
+    draws several, still.
 
     **Arguments:**
 

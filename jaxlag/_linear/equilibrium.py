@@ -190,7 +190,7 @@ def _found(system: System, q: PyTree, qdot: PyTree, params: PyTree, t: Any, stat
     if not is_known:
         return Equilibrium(*found[:6], None, f"not known under `{'jit' if values is None else 'vmap'}`", ())
     stiffness, kind = stability(system, values)
-    shown = None if stiffness is None else without_derivative(stiffness, (found.q, given))
+    shown = None if stiffness is None else without_derivative(stiffness, given)
     return Equilibrium(*found[:6], shown, kind, undecided(values, names))
 
 

@@ -143,7 +143,7 @@ class _Family:
         """q, q̇, `params` and the states of first order, of which A is a function."""
         moved = self.at(value, params)
         if callable(self.q) or callable(self.qdot):
-            return *_state(self.q, self.qdot, self.t, moved), moved, self.states
+            return *given_state(self.q, self.qdot, self.t, moved), moved, self.states
         found = self._found(value, params)
         return found.q, found.qdot, moved, found.states
 
@@ -154,7 +154,7 @@ class _Family:
     def _linearised(self, value: Any, params: PyTree) -> LinearSystem:
         params = self.at(value, params)
         if callable(self.q) or callable(self.qdot):
-            q, qdot = _state(self.q, self.qdot, self.t, params)
+            q, qdot = given_state(self.q, self.qdot, self.t, params)
             return linearise(self.system, q, qdot, params, t=self.t, states=self.states)
         return linearise(self.system, self._found(value, params), params=params)
 
@@ -171,7 +171,7 @@ class _Family:
         return found
 
 
-def _state(q, qdot, t, params):
+def given_state(q: Any, qdot: Any, t: Any, params: PyTree) -> tuple[PyTree, PyTree]:
     """The steady state that functions give."""
     q, qdot = (call(of, f"`{name}`", params, t=t) if callable(of) else of for of, name in ((q, "q"), (qdot, "qdot")))
     return state(q, jax.tree.map(lambda x: 0.0 * jnp.asarray(x), q) if qdot is None else qdot)
@@ -180,12 +180,13 @@ def _state(q, qdot, t, params):
 def _spectrum(at: float, A: np.ndarray, zeros: list[int]) -> Spectrum:
     """All eigenvalues but those that are zero at every value."""
     A, basis = without_zeros(A, zeros)
-    values, vectors, bound = map(np.asarray, _eigen(A))
+    values, vectors, bound = map(np.asarray, eigen_and_rounding(A))
     return Spectrum(at, values, basis @ vectors, bound)
 
 
 @compiled
-def _eigen(A):
+def eigen_and_rounding(A: Float[Array, "d d"]) -> tuple[Array, Array, Array]:
+    """Eigenvalues, eigenvectors as columns, and how far rounding moves each eigenvalue."""
     values, vectors = eigen(A)
     return values, vectors, rounding(A, vectors)
 

@@ -13,26 +13,32 @@ CURE = "Look for a steady state by `equilibrium` or `steady`, or take it all the
 
 def refuse_unsteady(found: Matrices, later: Callable[[float], Matrices], names: Sequence[str]) -> None:
     """Raises where q̈ or ż is not zero, or A is another one a little later; `names` are those of the coordinates and states."""
-    if not is_concrete(found):
-        return
+    if is_concrete(found) and (reason := why_unsteady(found, later, names)):
+        raise ValueError(f"{reason} {DEFINED if reason == UNDEFINED else CURE}")
+
+
+def why_unsteady(found: Matrices, later: Callable[[float], Matrices], names: Sequence[str]) -> str:
+    """What is not steady, in a sentence; nothing where all is."""
     left, allowed, A = (np.asarray(x) for x in (found.steadiness.left, found.steadiness.allowed, found.rates.by_state))
     if not (found.steadiness.determined and np.all(np.isfinite(A)) and np.all(np.isfinite(left))):
-        raise ValueError(UNDEFINED)
+        return UNDEFINED
     if np.any(np.abs(left) > allowed):
         i = int(np.argmax(np.abs(left) / np.where(allowed > 0, allowed, np.finfo(A.dtype).tiny)))
-        raise ValueError(f"`q` and `qdot` must be a steady state, but {names[i]!r} accelerates or changes by {left[i]:.4g}. {CURE}")
-    slowest = float(np.max(np.abs(np.linalg.eigvals(A)), initial=0.0))
-    then = np.asarray(later(0.1 / slowest if slowest > 0 else 1.0).rates.by_state)
+        return f"`q` and `qdot` must be a steady state, but {names[i]!r} accelerates or changes by {left[i]:.4g}."
+    then = np.asarray(later(a_little(A)).rates.by_state)
     tolerance = np.finfo(A.dtype).eps ** 0.375 * np.max(np.abs(A), axis=1, keepdims=True, initial=0.0)
     changed = np.abs(then - A) > tolerance + np.finfo(A.dtype).eps ** 0.5 * np.max(np.abs(A), initial=0.0)
-    if np.any(changed):
-        raise ValueError(f"`q` and `qdot` must be a motion along which nothing changes, but what the system does near it does. {CURE}")
+    return "`q` and `qdot` must be a motion along which nothing changes, but what the system does near it does." if np.any(changed) else ""
 
 
-UNDEFINED = (
-    "`q` and `qdot` must be a state at which the motion and its derivatives are finite and determined, but they are not. "
-    "`examine` says which coordinate is without inertia or which function is not finite."
-)
+def a_little(A: np.ndarray) -> float:
+    """A time that is short for the fastest that the system does."""
+    fastest = float(np.max(np.abs(np.linalg.eigvals(A)), initial=0.0)) if np.all(np.isfinite(A)) else 0.0
+    return 0.1 / fastest if fastest > 0 else 1.0
+
+
+UNDEFINED = "`q` and `qdot` must be a state at which the motion and its derivatives are finite and determined, but they are not."
+DEFINED = "`examine` says which coordinate is without inertia or which function is not finite."
 
 
 def moved_on(at, step):

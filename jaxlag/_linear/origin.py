@@ -1,0 +1,30 @@
+"""The state near which a system is linear."""
+
+from typing import Any
+
+import equinox as eqx
+import numpy as np
+from jaxtyping import Array, PyTree
+
+from .._motion.provenance import put_together, taken_apart
+
+
+class Origin(eqx.Module):
+    """The time, the state and the params at which all deviations are zero. What is not an array in params is kept apart, so that a batch
+    consists of arrays only.
+    """
+
+    t: Any
+    q: PyTree
+    qdot: PyTree
+    numbers: list[Array | np.ndarray]
+    rest: tuple = eqx.field(static=True)
+
+    @classmethod
+    def of(cls, t: Any, q: PyTree, qdot: PyTree, params: PyTree) -> "Origin":
+        return cls(t, q, qdot, *taken_apart(params))
+
+    @property
+    def params(self) -> PyTree:
+        """The params, put together again."""
+        return put_together(self.numbers, self.rest)
