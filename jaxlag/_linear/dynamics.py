@@ -10,9 +10,9 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, PyTree
 
+from .._mechanics.contact import in_current_mode
 from .._mechanics.lagrange import imbalance, velocity_residual
 from .._mechanics.saddle_point import Sound, constrained_acceleration
-from .._mechanics.stick_slip import in_current_mode
 from .._model.flat import Flat, StatesAt, bind
 from .._model.injection import call
 from .._model.signal import at_time

@@ -10,11 +10,11 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float, PyTree
 
+from .._mechanics.contact import in_current_mode
 from .._mechanics.lagrange import applied_force, constraint_rows
 from .._mechanics.projection import off_constraints
 from .._mechanics.pseudo_inverse import CLEAR
 from .._mechanics.saddle_point import augmented
-from .._mechanics.stick_slip import in_current_mode
 from .._model.flat import StatesAt
 from .._model.state_values import start_values
 from .._model.system import System

@@ -9,9 +9,9 @@ from jaxtyping import Array, Float, PyTree
 from .._model.flat import Flat, rows_by_name
 from .._model.system import EXPLICIT_TIME, System
 from .._model.validation import at_state
+from .contact import in_current_mode
 from .lagrange import constraint_rows
 from .saddle_point import constrained_acceleration
-from .stick_slip import in_current_mode
 
 
 def powers(

@@ -291,9 +291,3 @@ class Regularised:
             return lambda t, q, v, multipliers: D(t, q, v, multipliers, extent(t, q, v))
 
         return flat._replace(dissipations={name: smooth(D) for name, D in elements.potentials.items()})
-
-
-def in_current_mode(flat: Flat, t, q, v) -> Flat:
-    """The system in the mode that holds at this state; without dry friction, the system itself."""
-    elements = find_elements(flat, t, q, v)
-    return flat if elements is None else in_mode(flat, elements, first_mode(flat, elements, t, q, v).sigma)

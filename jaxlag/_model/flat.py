@@ -23,7 +23,10 @@ class Flat(NamedTuple):
     lagrangian: Callable[..., Float[Array, ""]]  # L(t, q, v)
     dissipations: dict[str, Callable[..., Float[Array, ""]]]  # D(t, q, v, λ)
     forces: dict[str, Callable[..., Float[Array, " n"]]]  # Q(t, q, v, λ)
-    holonomic: Callable[..., Float[Array, " h"]]  # g(t, q)
+    holonomic: Callable[..., Float[Array, " h"]]  # g(t, q), and zeros of the contacts that are open
+    bilateral: Callable[..., Float[Array, " b"]]  # g(t, q) alone
+    gaps: Callable[..., Float[Array, " c"]]  # of all contacts, (t, q)
+    restitution: Callable[..., Float[Array, " c"]]  # e(t, speeds of approach)
     nonholonomic: Callable[..., Float[Array, " k"]]  # a(t, q, v)
     position: Callable[..., PyTree]  # x(t, q) of a position map
     unravel: Callable[[Float[Array, " n"]], PyTree]
@@ -32,8 +35,10 @@ class Flat(NamedTuple):
     updates: Callable[..., dict[str, PyTree]]  # u(t, q, v) of the sampled ones
     needs_multipliers: bool
     holonomic_names: tuple[str, ...]
+    contacts: tuple[str, ...]
     terms: tuple[str, ...]
     rows: int  # of G, those of the user's constraints
+    rows_of_bilateral: int  # of those, the first, of `holonomic` alone
     held: dict[str, np.ndarray] = {}  # noqa: RUF012 - rows of G beyond those, with which a dissipation term sticks
 
 
@@ -56,6 +61,9 @@ def bind(system: System, like: PyTree, params: PyTree, states: StatesAt | None =
         dissipations={name: partial(bound.dissipation, (name, D)) for name, D in system.dissipation},
         forces={name: partial(bound.force, (name, Q)) for name, Q in system.force},
         holonomic=bound.holonomic,
+        bilateral=bound.bilateral,
+        gaps=bound.gaps,
+        restitution=bound.restitution,
         nonholonomic=bound.nonholonomic,
         position=bound.position,
         unravel=bound.unravel,
@@ -63,9 +71,11 @@ def bind(system: System, like: PyTree, params: PyTree, states: StatesAt | None =
         state_rates=bound.state_rates,
         updates=bound.updates,
         needs_multipliers=any(asks_for(function, "multipliers") for _, function in (*system.dissipation, *system.force)),
-        holonomic_names=tuple(name for name, _ in system.holonomic),
+        holonomic_names=tuple(name for name, _ in (*system.holonomic, *system.unilateral)),
+        contacts=tuple(name for name, _ in system.unilateral),
         terms=system.terms,
         rows=bound.rows,
+        rows_of_bilateral=bound.rows_of_bilateral,
     )
 
 
@@ -84,6 +94,8 @@ class _Bound:
         ]
         residuals, self.unravel_residuals = ravel_pytree([jax.tree.map(lambda s: jnp.zeros(s.shape, zero.dtype), s) for s in shapes])
         self.rows = residuals.size
+        bilateral = jax.tree.leaves(shapes[: len(system.holonomic)])
+        self.rows_of_bilateral = sum(int(np.prod(s.shape)) for s in bilateral)
 
     def value(self, slot, term, t, q, v, **more):
         """What one of the user's functions returns."""
@@ -106,8 +118,24 @@ class _Bound:
         given = self.value("force", term, t, q, v, multipliers=self.unravel_multipliers(multipliers))
         return flat_like(self.zeros, role("force", term[0]), given)
 
-    def holonomic(self, t, q):
+    def bilateral(self, t, q):
         return self._residuals("holonomic", t, q, None)
+
+    def gaps(self, t, q):
+        return self._residuals("unilateral", t, q, None)
+
+    def holonomic(self, t, q):
+        return jnp.concatenate([self.bilateral(t, q), jnp.zeros(len(self.system.unilateral), q.dtype)])
+
+    def restitution(self, t, speeds):
+        def of_one(name, given, speed):
+            if not callable(given):
+                return jnp.asarray(given, speed.dtype)
+            e = call(given, f"`restitution` of {name!r}", at_time(self.params, t), speed=speed)
+            return jnp.clip(jnp.asarray(e, speed.dtype), 0, 1)
+
+        found = [of_one(*term, speed) for term, speed in zip(self.system.restitution, speeds, strict=True)]
+        return jnp.concatenate([jnp.zeros(0, speeds.dtype), *(e[None] for e in found)])
 
     def nonholonomic(self, t, q, v):
         return self._residuals("nonholonomic", t, q, v)

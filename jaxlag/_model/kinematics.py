@@ -11,11 +11,12 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 
 from .._program.jit import is_concrete
+from .contact import Contact
 from .flat import flat_like
 from .injection import asks_for, call, check_function, needs
 from .numbers import numbers
 from .states import Sampled, State, values_at
-from .system import CONSTRAINT_SLOTS, System, Terms, role
+from .system import System, Terms, role
 
 
 def rate(coordinate: Callable) -> Callable:
@@ -117,7 +118,9 @@ def substitute(system: System, coordinates: Callable) -> System:
         pulled("lagrangian", _PulledBack),
         dissipation=pulled("dissipation", _PulledBack),
         force=pulled("force", _PulledForce),
-        **{slot: pulled(slot, _PulledBack if has_velocity else _PulledPosition) for slot, has_velocity in CONSTRAINT_SLOTS.items()},
+        holonomic=pulled("holonomic", _PulledPosition),
+        unilateral={name: Contact(gap, dict(system.restitution)[name]) for name, gap in pulled("unilateral", _PulledPosition).items()},
+        nonholonomic=pulled("nonholonomic", _PulledBack),
         one_sided=system.one_sided,
         states={name: _pulled_state(state, coordinates) for name, state in system.states},
     )

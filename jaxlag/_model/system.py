@@ -4,14 +4,19 @@ import dataclasses
 from collections.abc import Callable, Collection, Mapping
 from typing import Any
 
+from .contact import Contact
 from .injection import check_function, needs
 from .pickling import picklable, unpickled
 from .states import Named, Sampled, State, states_of
 
 Terms = tuple[tuple[str, Callable], ...]
 Slot = Any  # a function, a mapping from names to functions, or None: `_terms` checks it
-SLOTS = ("lagrangian", "dissipation", "force", "holonomic", "nonholonomic")
-CONSTRAINT_SLOTS = {"holonomic": False, "nonholonomic": True}  # in the order of the rows of G; whether velocities are given to it
+SLOTS = ("lagrangian", "dissipation", "force", "holonomic", "unilateral", "nonholonomic")
+CONSTRAINT_SLOTS = {
+    "holonomic": False,
+    "unilateral": False,
+    "nonholonomic": True,
+}  # in the order of the rows of G; whether velocities are given to it
 EXPLICIT_TIME = "time"  # the name, among the powers, of the energy that enters through explicit time in L
 
 
@@ -34,14 +39,16 @@ class System:
       a force may be omitted.
     - `holonomic`: g(t, q), an array of any shape or a pytree of arrays, kept at zero.
     - `nonholonomic`: a(t, q, q̇), likewise, affine in q̇, kept at zero.
+    - `unilateral`: gaps g(t, q) ≥ 0 of contacts, each a real number, or `Contact(gap, restitution)`: a table, a stop, a slack string.
+      λ ≥ 0 pushes along +∇g while g = 0, and is 0 where the contact is open; where it closes there is an impact.
     - `one_sided`: a name or names of holonomic constraints that push and never pull, as a table does: g ≥ 0 and λ ≥ 0, where λ > 0 pushes
       along +∇g. The motion is computed with g = 0 all the same; where λ < 0 the contact would have opened, and `Trajectory.pulling()`, the
       printed trajectory, `examine` and `plot.forces` report it.
     - `states`: by name, states beside q: `State(rate)`, of first order, ż = rate(…), or `Sampled(update, every)`, which changes at
       sample times alone, as in a digital controller.
 
-    **Fields:** `lagrangian`, `dissipation`, `force`, `holonomic` and `nonholonomic`, each a tuple of (name, function); `one_sided`, a
-    tuple of names; `states`, a tuple of (name, state).
+    **Fields:** `lagrangian`, `dissipation`, `force`, `holonomic`, `unilateral` and `nonholonomic`, each a tuple of (name, function);
+    `restitution`, a tuple of (name, number or function); `one_sided`, a tuple of names; `states`, a tuple of (name, state).
 
     Any consistent set of units. Functions may return plain numbers, integers or lists, which become floating arrays. A system is
     immutable, hashable and compared by its functions. Create it once: one created again from new functions is compiled again. What was
@@ -67,7 +74,9 @@ class System:
     dissipation: Terms
     force: Terms
     holonomic: Terms
+    unilateral: Terms
     nonholonomic: Terms
+    restitution: tuple[tuple[str, Any], ...]
     one_sided: tuple[str, ...]
     states: Named
 
@@ -78,11 +87,15 @@ class System:
         dissipation: Slot = None,
         force: Slot = None,
         holonomic: Slot = None,
+        unilateral: Slot | Contact = None,
         nonholonomic: Slot = None,
         one_sided: Any = (),  # a name, or a collection of names
         states: Mapping[str, State | Sampled] | None = None,
     ):
-        for slot, given in zip(SLOTS, (lagrangian, dissipation, force, holonomic, nonholonomic), strict=True):
+        contacts = _contacts(unilateral)
+        gaps = {name: contact.gap for name, contact in contacts.items()}
+        object.__setattr__(self, "restitution", tuple((name, contact.restitution) for name, contact in contacts.items()))
+        for slot, given in zip(SLOTS, (lagrangian, dissipation, force, holonomic, gaps, nonholonomic), strict=True):
             object.__setattr__(self, slot, _terms(slot, given))
         if not self.lagrangian:
             raise TypeError("`lagrangian` must be a function L(q, qdot), but none was given. Pass at least the kinetic energy.")
@@ -100,8 +113,9 @@ class System:
                 raise ValueError(f"`one_sided` must name holonomic constraints, but holds {name!r}. There are {there}.")
         object.__setattr__(self, "one_sided", tuple(name for name in known if name in given))
         object.__setattr__(self, "states", states_of(states))
-        for label, function in ((role("holonomic", name), g) for name, g in self.holonomic):
-            _check_position(label, function, dict(self.states))
+        for slot in ("holonomic", "unilateral"):
+            for name, function in getattr(self, slot):
+                _check_position(role(slot, name), function, dict(self.states))
 
     def __copy__(self) -> "System":
         return self
@@ -111,7 +125,8 @@ class System:
 
     def __reduce__(self) -> Any:
         references = {slot: {name: picklable(f, role(slot, name)) for name, f in getattr(self, slot)} for slot in SLOTS}
-        return _unpickled, (references, self.one_sided, dict(self.states))
+        restitution = {name: picklable(e, f"`restitution` of {name!r}") if callable(e) else e for name, e in self.restitution}
+        return _unpickled, (references, self.one_sided, dict(self.states), restitution)
 
     def __repr__(self) -> str:
         def listed(slot: str, terms: Terms) -> str:
@@ -133,9 +148,24 @@ class System:
         return (*(name for name, _ in (*self.dissipation, *self.force)), *self.constraints, EXPLICIT_TIME)
 
 
-def _unpickled(references: dict[str, dict[str, Any]], one_sided: tuple[str, ...], states: dict[str, Any] | None = None) -> System:
+def _unpickled(references, one_sided, states=None, restitution=None) -> System:
     slots = {slot: {name: unpickled(f) for name, f in terms.items()} for slot, terms in references.items()}
-    return System(**slots, one_sided=one_sided, states=states)
+    contacts = {name: Contact(slots["unilateral"][name], unpickled(e)) for name, e in (restitution or {}).items()}
+    return System(**slots | {"unilateral": contacts}, one_sided=one_sided, states=states)
+
+
+def _contacts(given: Any) -> dict[str, Contact]:
+    """The contacts by name."""
+    if given is None:
+        return {}
+    terms = dict(given) if isinstance(given, Mapping) else {"unilateral": given}
+    for name, term in terms.items():
+        if not isinstance(term, Contact) and not callable(term):
+            raise TypeError(
+                f"`unilateral` must hold gaps g(t, q) or `Contact`s, but it holds {term!r} under {name!r}. Write e.g. "
+                "`unilateral={'table': lambda q: q['y']}`."
+            )
+    return {name: term if isinstance(term, Contact) else Contact(term) for name, term in terms.items()}
 
 
 def _check_position(label: str, function: Callable, states: dict[str, State | Sampled]) -> None:

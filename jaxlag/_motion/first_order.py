@@ -10,20 +10,18 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, PyTree
 
+from .._mechanics.contact import contact_rows, gap_scales, in_contact
 from .._mechanics.friction_elements import FrictionElements
 from .._mechanics.power import energy_exchange, listed_powers
 from .._mechanics.projection import Baumgarte, NoStabilisation, Projection
 from .._mechanics.saddle_point import SaddlePoint, Sound, constrained_acceleration
 from .._mechanics.stick_slip import (
-    Mode,
     Regularised,
     StickSlip,
-    first_mode,
     friction,
     friction_by_term,
     in_mode,
     redirected,
-    select_mode,
     slip_of,
     sticking,
 )
@@ -35,7 +33,7 @@ from .._program.jit import jitted
 from .._program.scalarise import scalarised
 from .interval_inputs import called_elsewhere, pieces_at, warn_of_delays
 from .protocol import Arguments
-from .state_vector import Evidence, Parts, Sample, Start, Violation
+from .state_vector import Evidence, Parts, Sample, Violation
 
 PROJECTION = "projection"  # name of the work that projection does
 NEGLIGIBLE = 1e7  # times the tolerance, compared with which a slip of a thousand tolerances is negligible
@@ -51,7 +49,7 @@ class Formulation(NamedTuple):
 
 @dataclasses.dataclass(frozen=True)
 class EquationsOfMotion:
-    """The `FirstOrderSystem` of one motion, and what locates the transitions of dry friction."""
+    """The `FirstOrderSystem` of one motion, in the mode of friction and contact that its y holds."""
 
     system: System
     like: Layout  # of q
@@ -61,12 +59,13 @@ class EquationsOfMotion:
     elsewhere: frozenset[int] = frozenset()  # signals that are asked for at other times than the present
     states: Layout = NOTHING  # of first order, by name
     sampled: Layout = NOTHING  # states that change at sample times
+    contacts: int = 0
 
     @classmethod
     def of(cls, system: System, q0: PyTree, formulation: Formulation, params: PyTree, at: StatesAt) -> "EquationsOfMotion":
         """Looks for dry friction at the start, in shapes alone."""
         z, u = (Layout.of({name: at.values[name] for name in of}) for of in (of_first_order(system), sampled(system)))
-        alone = cls(system, Layout.of(q0), formulation, states=z, sampled=u)
+        alone = cls(system, Layout.of(q0), formulation, states=z, sampled=u, contacts=len(system.unilateral))
         if broken_signals(params):
             elsewhere = called_elsewhere(lambda params: _values(bind(system, q0, params, at), *at[1:]), params)
             warn_of_delays(params, elsewhere)
@@ -88,7 +87,7 @@ class EquationsOfMotion:
 
     def mode(self, t, parts: Parts, args: Arguments) -> tuple[Flat, Flat, FrictionElements | None]:
         """The system, the system in its mode σ, and its elements of dry friction where there are any."""
-        flat, treatment = self.flat_at(args.params, self.states_of(t, parts)), self.formulation.friction
+        flat, treatment = in_contact(self.flat_at(args.params, self.states_of(t, parts)), parts.closed > 0), self.formulation.friction
         q, v, sigma = parts.q, parts.v, parts.sigma
         if not self.rows:
             return flat, treatment.smoothed(flat, t, q, v), None
@@ -98,6 +97,11 @@ class EquationsOfMotion:
             slow = slip_of(elements, t, q, v, jnp.full_like(v, args.scales.slow))
             elements = elements._replace(near_rest=jax.lax.stop_gradient(jnp.where(elements.is_vector, slow, 0)))
         return flat, in_mode(flat, elements, sigma), elements
+
+    @property
+    def modes(self) -> int:
+        """How many elements of dry friction and contacts change their modes."""
+        return self.elements + self.contacts
 
     @property
     def works(self) -> tuple[str, ...]:
@@ -131,33 +135,29 @@ class EquationsOfMotion:
     def parts(self, y) -> Parts:
         """y, taken apart."""
         beside = self.states.size, self.sampled.size, len(self.works)
-        sizes = [self.size, self.size, *beside, self.rows, self.elements, min(self.elements, 1)]
-        return Parts(*jnp.split(y, np.cumsum(sizes)))
+        sizes = [self.size, self.size, *beside, self.rows, self.elements, min(self.elements, 1), self.elements, *[self.contacts] * 5]
+        return Parts(*jnp.split(y, np.cumsum(sizes)[:-1]))
 
     @property
     def projection(self) -> Projection | None:
         """What puts steps back on the constraints, and on s = 0 where friction sticks, if anything has to."""
         chosen = self.formulation.stabilisation.projection()
-        if self.rows:
+        if self.modes:
             return chosen or Projection()
         return chosen if self.system.constraints else None
 
-    def start(self, at: StatesAt, params) -> Start:
-        """y at the start, on the constraints already: the sampled states are updated there."""
+    def at_start(self, at: StatesAt, params) -> Parts:
+        """y at the start, apart from its mode, on the constraints already: the sampled states are updated there."""
         _, t, q, v = at
         args, zeros = Arguments(params), lambda size: jnp.zeros(size, q.dtype)
         z, u = (ravelled({name: at.values[name] for name in of.shapes}, q.dtype) for of in (self.states, self.sampled))
         of_friction = map(zeros, (self.elements, min(self.elements, 1), self.elements))
-        parts = Parts(q, v, z, u, zeros(len(self.works)), zeros(self.rows) + 1, *of_friction)  # with slip, for the time being
+        of_contact = zeros(self.contacts), zeros(self.contacts), zeros(self.contacts) + t, *map(zeros, (self.contacts, self.contacts))
+        parts = Parts(q, v, z, u, zeros(len(self.works)), zeros(self.rows) + 1, *of_friction, *of_contact)  # with slip, for the time being
         if self.sampled.size:
             y = self.updated(t, parts.y, args, [True] * len(self.sampled_names))
             parts = self.parts(self.projected(t, y, args) if self.projection else y)._replace(works=parts.works)
-        flat, _, elements = self.mode(t, parts, args)
-        if elements is None:
-            return Start(parts.y, jnp.array(True), jnp.array(True))
-        mode = first_mode(flat, elements, t, parts.q, parts.v)
-        parts = parts._replace(sigma=mode.sigma, held=mode.held.astype(q.dtype))
-        return Start(self.projected(t, parts.y, args), mode.consistent, ~jnp.any(mode.bound < 0))
+        return parts
 
     def updated(self, t, y, args: Arguments, due: Sequence[Bool[Array, ""] | bool]) -> Float[Array, " y"]:
         """y after an update of the sampled states that are `due`, each of which sees the values before."""
@@ -180,28 +180,15 @@ class EquationsOfMotion:
         """The root mean square."""
         return root_mean_square(error)
 
-    def margins(self, t, y, args, start):
-        """Per element of dry friction, the margin of its mode, negative beyond its end; and then its bound.
-
-        The mode and the sampled states are those of `start`, y at the start of the step: what these alone determine is computed once.
-        """
-        here, there = self.parts(y), self.parts(start)
-        still = {"u": there.u, "held": there.held} | ({"sigma": there.sigma} if self.rows == self.elements else {})  # others may turn
-        return _margins(self, t, here._replace(**still), args)
-
-    def changed(self, t, y, args, ended):
-        """y in the mode that follows when those of the elements `ended` end; whether there is one; whether slip has come to rest."""
-        return _changed(self, t, y, args, ended)
-
     def exhausted(self, y):
         """Whether there were more transitions than allowed."""
-        return self.parts(y).transitions[0] > self.formulation.friction.max_transitions
+        return jnp.any(self.parts(y).transitions > self.formulation.friction.max_transitions)
 
     def sample(self, t, y, params, tolerances) -> tuple[Sample, Evidence]:
         """One sample, from y on the constraints."""
         rtol, atol = tolerances
         parts = self.parts(y)
-        q, v, _, _, works, sigma, held, transitions, time_stuck = parts
+        q, v, works, sigma, held = parts.q, parts.v, parts.works, parts.sigma, parts.held
         flat, mode, elements = self.mode(t, parts, Arguments(params))
         states = self.states_of(t, parts).values
         friction_states, counts, violation = {}, {}, Violation(jnp.zeros(0), jnp.zeros(0))
@@ -215,10 +202,14 @@ class EquationsOfMotion:
             scale = jnp.where(stuck, jnp.abs(found.bound) + load, slip_of(elements, t, q, v, NEGLIGIBLE * (rtol * jnp.abs(v) + atol)))
             excess = jnp.where(held > 0, 0, -found.margin)
             violation = Violation(jnp.concatenate([excess, -found.bound]), jnp.concatenate([scale, jnp.abs(found.bound)]))
-            counts = {"transitions": transitions[0], "time_stuck": time_stuck}
+            counts = {"transitions": parts.transitions[0], "time_stuck": parts.time_stuck}
         named = dict(zip(self.works, works, strict=True)) if self.works else None
+        if self.contacts:
+            violation = violation.beside(*_contact_violation(flat, t, parts, multipliers, rtol, atol))
+        of_contact = parts.closed > 0, parts.impacts, parts.changed, parts.impulse
+        contacts = {name: of_one for name, *of_one in zip(flat.contacts, *of_contact, strict=True)}
         unraveled = flat.unravel(q), flat.unravel(v), flat.unravel(qddot), flat.unravel_multipliers(multipliers)
-        return Sample(*unraveled, dict(states), named, friction_states, counts), Evidence(sound, jax.lax.stop_gradient(violation))
+        return Sample(*unraveled, dict(states), named, friction_states, contacts, counts), Evidence(sound, jax.lax.stop_gradient(violation))
 
 
 def _values(flat: Flat, t, q, v):
@@ -226,18 +217,19 @@ def _values(flat: Flat, t, q, v):
     multipliers = jnp.zeros(flat.rows, v.dtype)
     given = [D(t, q, v, multipliers) for D in (*flat.dissipations.values(), *flat.forces.values())]
     of_states = flat.state_rates(t, q, v), flat.updates(t, q, v)
-    return flat.lagrangian(t, q, v), flat.holonomic(t, q), flat.nonholonomic(t, q, v), given, of_states
+    return flat.lagrangian(t, q, v), flat.bilateral(t, q), flat.gaps(t, q), flat.nonholonomic(t, q, v), given, of_states
 
 
 @jitted  # so that diffrax's many calls trace it once
 def _rates(equations: EquationsOfMotion, t, y, args):
     parts = equations.parts(y)
-    q, v, _, u, works, sigma, held, transitions, time_stuck = parts
+    q, v, works, sigma, held = parts.q, parts.v, parts.works, parts.sigma, parts.held
     flat, mode, elements = equations.mode(t, parts, args)
     qddot, rates = equations.acceleration(mode, t, q, v).x, ravelled(flat.state_rates(t, q, v), y.dtype)
     powers = listed_powers(mode, t, q, v) if equations.works else works
-    stuck = time_stuck if elements is None else jnp.maximum(sticking(elements, sigma).astype(y.dtype), held)
-    return Parts(v, qddot, rates, 0 * u, powers, 0 * sigma, 0 * held, 0 * transitions, stuck).y
+    stuck = parts.time_stuck if elements is None else jnp.maximum(sticking(elements, sigma).astype(y.dtype), held)
+    resting = Parts(*(jnp.zeros_like(part) for part in parts))
+    return resting._replace(q=v, v=qddot, z=rates, works=powers, time_stuck=stuck).y
 
 
 @jitted
@@ -249,34 +241,12 @@ def _updated(equations: EquationsOfMotion, t, y, args, due):
     return parts._replace(u=ravelled(changed, y.dtype)).y
 
 
-@jitted
-def _margins(equations: EquationsOfMotion, t, parts, args):
-    q, v, sigma, held = parts.q, parts.v, parts.sigma, parts.held
-    flat, _, elements = equations.mode(t, parts, args)
-    assert elements is not None  # asked of systems with dry friction alone
-    found = friction(flat, elements, sigma, t, q, v)
-    return jnp.concatenate([jnp.where(held > 0, 1, found.margin), found.bound])
-
-
-@jitted
-def _changed(equations: EquationsOfMotion, t, y, args, ended):
-    parts = equations.parts(y)
-    q, v, sigma, held = parts.q, parts.v, parts.sigma, parts.held
-    flat, _, elements = equations.mode(t, parts, args)
-    assert elements is not None
-    stuck = sticking(elements, sigma) | (held > 0)
-    slow = elements.norms(elements.slip(t, q, v)) <= slip_of(elements, t, q, v, args.scales.error(v))
-    mode = select_mode(flat, elements, t, q, v, sigma, stuck | ended | slow, ended & stuck)
-    y = in_other_mode(elements, parts, mode).y
-    return equations.projected(t, y, args), mode.consistent, jnp.all(~ended | stuck | slow)
-
-
-def in_other_mode(elements: FrictionElements, parts: Parts, mode: Mode) -> Parts:
-    """y in another mode, and its transitions counted: what begins or ceases to slip, or slips another way, where there is friction."""
-    of, sigma, held = elements.element_of_row, parts.sigma, parts.held
-    before, after = jnp.where((held > 0)[of], 0, sigma), jnp.where(mode.held[of], 0, mode.sigma)
-    changes = jnp.sum((elements.norms(after - before) > 0.5) & (mode.bound != 0))
-    return parts._replace(sigma=mode.sigma, held=mode.held.astype(held.dtype), transitions=parts.transitions + changes)
+def _contact_violation(flat, t, parts, multipliers, rtol, atol):
+    """Of each contact, how far it is inside of its obstacle or pulls."""
+    closed, forces = parts.closed > 0, contact_rows(flat, multipliers)
+    allowed = gap_scales(flat, t, parts.q, parts.v, NEGLIGIBLE * (rtol * jnp.abs(parts.q) + atol), parts.v).gap
+    scale = jnp.where(closed, jnp.max(jnp.abs(multipliers), initial=0.0), allowed)
+    return jnp.where(closed, -forces, -flat.gaps(t, parts.q)), scale
 
 
 @jitted

@@ -50,7 +50,7 @@ def _guarantees(
     numbers = jax.tree.leaves((sample.qddot, sample.multipliers))
     finite = jnp.all(jnp.stack([jnp.all(jnp.isfinite(leaf.reshape(len(ts), -1)), axis=1) for leaf in numbers]), axis=0)
     guarantees = [(finite, RESULTS.undefined)]
-    if equations.rows:
+    if equations.modes:
         excess, scale = evidence.violation
         within = excess <= LITTLE * scale + LITTLE**1.5 * jnp.max(jnp.where(jnp.isfinite(scale), scale, 0), axis=0, keepdims=True)
         guarantees.append((jnp.all(within, axis=1), RESULTS.missed))

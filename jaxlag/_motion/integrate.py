@@ -21,6 +21,7 @@ from .._model.signal import broken_signals, moves_smoothly
 from .._program.single_kernel import in_one_kernel
 from .first_order import EquationsOfMotion, Formulation
 from .interval_loop import integrated
+from .mode_changes import started
 from .progress import Bar
 from .protocol import Arguments, FirstOrderSystem
 from .results import RESULTS, from_diffrax
@@ -99,13 +100,16 @@ class Initial(NamedTuple):
 def initialised(equations: EquationsOfMotion, at: StatesAt, params) -> Initial:
     """The start, put on the constraints."""
     _, t0, q, v = at
-    nearest = nearest_state(equations.flat_at(params, at), t0, q, v)
-    start = equations.start(at._replace(q=nearest.q, v=nearest.v), params)
+    flat = equations.flat_at(params, at)
+    nearest = nearest_state(flat._replace(holonomic=flat.bilateral), t0, q, v)
+    start = started(equations, at._replace(q=nearest.q, v=nearest.v), params)
     moved = jax.lax.stop_gradient(jnp.max(jnp.abs(jnp.concatenate([nearest.q - q, nearest.v - v]))))
     conditions = (
         *((period > 0, RESULTS.no_period) for period in equations.periods(params)),
         (start.has_mode, RESULTS.no_friction),
         (start.has_bounds, RESULTS.negative_bound),
+        (start.is_outside, RESULTS.inside_obstacle),
+        (start.dissipates, RESULTS.energy_gained),
         (nearest.reached, RESULTS.impossible_start),
         (nearest.affine, RESULTS.not_affine),
         (nearest.determined, RESULTS.no_inertia),
@@ -165,7 +169,7 @@ def _wrapped(options, equations, projected, adjoint):
             solver = dataclasses.replace(solver, reverse=False)
         elif isinstance(solver, dfx.AbstractRungeKutta) and solver.scan_kind is None:
             solver = dataclasses.replace(solver, scan_kind="lax")  # as diffrax does for a solver that is not wrapped
-    if isinstance(equations, EquationsOfMotion) and equations.rows:
+    if isinstance(equations, EquationsOfMotion) and equations.modes:
         return StickSlipSolver(solver, projected, equations.controlled, equations, reverse=not isinstance(adjoint, dfx.ForwardMode))
     if projected is not None or options.formulation.works:
         return ProjectedSolver(solver, projected, equations.controlled)
@@ -219,7 +223,7 @@ class Variations(NamedTuple):
 def is_variational(equations: FirstOrderSystem, options: SolverOptions, varying_params, params) -> bool:
     """Whether the derivative of the motion is that of the variational equations: no mode, jump or implicit stage within a step."""
     smooth = not has_nodes(equations, params) and moves_smoothly(varying_params, params)
-    return not equations.rows and is_explicit(options.solver) and smooth
+    return not equations.modes and is_explicit(options.solver) and smooth
 
 
 class Meter(dfx.TextProgressMeter):

@@ -6,7 +6,8 @@ from .._mechanics.power import energy_exchange
 from .._mechanics.stick_slip import select_mode, slip_of
 from .._model.system import EXPLICIT_TIME
 from .._program.jit import jitted
-from .first_order import EquationsOfMotion, in_other_mode
+from .first_order import EquationsOfMotion
+from .mode_changes import in_other_mode
 from .protocol import Arguments
 
 

@@ -58,8 +58,8 @@ class FirstOrderSystem(Protocol):
     """ẏ = f(t, y) on a manifold, as the integration sees it."""
 
     @property
-    def rows(self) -> int:
-        """How many slip velocities stick and slip; 0 where the right-hand side is smooth."""
+    def modes(self) -> int:
+        """How many elements of dry friction and contacts change their modes; 0 where the right-hand side is smooth."""
 
     @property
     def controlled(self) -> int:
@@ -84,7 +84,7 @@ class AugmentedSystem(abc.ABC):
     """A smooth `FirstOrderSystem` whose y has one more axis, its last: of variations, or of the members of a batch."""
 
     equations: FirstOrderSystem
-    rows = 0
+    modes = 0
 
     @property
     def controlled(self) -> int:

@@ -40,6 +40,13 @@ class RESULTS(dfx.RESULTS):  # pyright: ignore
         "no mode of sliding and sticking is consistent with the friction forces it causes, or more than one is (Painlevé's paradox). "
         "Lower the coefficient of friction, or give the contact its compliance."
     )
+    inside_obstacle = (
+        "`q0` must lie outside of all obstacles, but a gap of `unilateral` is negative there. Start outside, or on the contact, g = 0."
+    )
+    energy_gained = (
+        "an impact gained energy, as Newton's law of restitution may where impacts are coupled by friction (Kane's paradox) or by several "
+        "contacts of different restitution. Lower `restitution` or the coefficient of friction."
+    )
     chattering = (
         "friction changed between sliding and sticking more than `max_transitions` times: it chatters. "
         "Allow more with `friction=StickSlip(max_transitions=...)`, or smooth it with `friction=Regularised(width)`."
@@ -77,6 +84,7 @@ OF_THE_INPUT = (
     RESULTS.impossible_start,
     RESULTS.not_affine,
     RESULTS.negative_bound,
+    RESULTS.inside_obstacle,
 )
 OF_THE_STEPS = (RESULTS.max_steps_reached, RESULTS.dt_min_reached)  # which other numerical settings may cure
 

@@ -160,10 +160,10 @@ def _at(system, t, q0, qdot0, params):
 
 def _share_steps(common_steps, equations, params, own):
     signals = [leaf for leaf in jax.tree.leaves(own, is_leaf=is_signal) if is_signal(leaf) and jax.tree.leaves(leaf)]
-    obstacle = equations.rows or equations.sampled.size or signals or jump_times(params, float) is not None
+    obstacle = equations.modes or equations.sampled.size or signals or jump_times(params, float) is not None
     if common_steps and obstacle:
         raise ValueError(
-            "`common_steps` must be False where dry friction, a jumping input or an update ends steps at its own time, or signals differ, "
+            "`common_steps` must be False where dry friction, a contact, a jumping input or an update ends steps at its own time, or signals differ, "
             "but is True. Leave it out."
         )
     return common_steps is not False and not obstacle

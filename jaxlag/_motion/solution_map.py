@@ -22,7 +22,7 @@ from .integrate import SolverOptions, Variations, has_nodes, initialised, is_var
 from .protocol import Arguments, Scales
 from .provenance import Provenance
 from .state_vector import Sample
-from .trajectory import FrictionState, Trajectory
+from .trajectory import ContactState, FrictionState, Trajectory
 from .variational import derived, pushforward, split_varying
 
 
@@ -180,4 +180,5 @@ def trajectory_of(system: System, options: SolverOptions, params: PyTree, ts, sa
     friction = {name: FrictionState(*of_term) for name, of_term in shown.friction.items()}
     provenance = Provenance.of(system, params, options.formulation.friction)
     state, counts = (shown.q, shown.qdot, shown.qddot, shown.multipliers), unchanging.stats | shown.counts
-    return Trajectory(ts, *state, unchanging.result, counts, shown.works, friction, provenance, shown.states)
+    contacts = {name: ContactState(*of_one) for name, of_one in shown.contacts.items()}
+    return Trajectory(ts, *state, unchanging.result, counts, shown.works, friction, provenance, shown.states, contacts)

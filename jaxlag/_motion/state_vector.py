@@ -1,9 +1,10 @@
 """y, the state that is integrated, and what of it is a sample of a motion.
 
     y = (q, q̇, states of first order, sampled states, work of each term,
-         σ of each slip, which elements others hold at their bound, number of transitions, time stuck)
+         σ of each slip, which elements others hold at their bound, number of transitions, time stuck,
+         of each contact: whether it is closed, its impacts, when it changed, how long it was open before, its impulses)
 
-Works are present where they were asked for, the last four where D is nonsmooth.
+Works are present where they were asked for, the four of friction where D is nonsmooth, the last five where there are contacts.
 """
 
 from typing import NamedTuple
@@ -26,6 +27,11 @@ class Parts(NamedTuple):
     held: Float[Array, " e"]  # 1 or 0
     transitions: Float[Array, " 0|1"]
     time_stuck: Float[Array, " e"]
+    closed: Float[Array, " c"]  # 1 or 0
+    impacts: Float[Array, " c"]
+    changed: Float[Array, " c"]
+    flight: Float[Array, " c"]
+    impulse: Float[Array, " c"]
 
     @property
     def y(self) -> Float[Array, " y"]:
@@ -34,18 +40,26 @@ class Parts(NamedTuple):
 
 
 class Start(NamedTuple):
-    """y at the start; whether a friction mode is consistent with its forces; whether no bound is negative."""
+    """y at the start; whether a friction mode is consistent with its forces; whether no bound is negative; whether it lies outside of all
+    obstacles; whether an impact there takes energy.
+    """
 
     y: Float[Array, " y"]
     has_mode: Bool[Array, ""]
     has_bounds: Bool[Array, ""]
+    is_outside: Bool[Array, ""]
+    dissipates: Bool[Array, ""]
 
 
 class Violation(NamedTuple):
-    """How far a sample lies beyond the end of its friction mode, and the scale on which that is small; two per element."""
+    """How far a sample lies beyond the end of its mode, and the scale on which that is small; two per element, one per contact."""
 
     excess: Float[Array, " m"]
     scale: Float[Array, " m"]
+
+    def beside(self, excess: Float[Array, " c"], scale: Float[Array, " c"]) -> "Violation":
+        """With some more."""
+        return Violation(jnp.concatenate([self.excess, excess]), jnp.concatenate([self.scale, scale]))
 
 
 class Sample(NamedTuple):
@@ -58,6 +72,7 @@ class Sample(NamedTuple):
     states: dict[str, PyTree]
     works: dict[str, Array] | None
     friction: dict[str, tuple[Array, Array]]
+    contacts: dict[str, tuple[Array, Array, Array, Array]]
     counts: dict[str, Array]
 
 

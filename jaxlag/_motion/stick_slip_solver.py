@@ -11,6 +11,7 @@ import numpy as np
 
 from .._program.jit import jitted
 from .first_order import EquationsOfMotion
+from .mode_changes import changed, exact_slopes, margins
 from .results import RESULTS, under_diffrax
 from .runge_kutta import ExplicitRungeKutta
 from .step_monitor import Seen, first_end, is_hidden
@@ -53,14 +54,15 @@ class Piece(NamedTuple):
 
 
 class Cut(NamedTuple):
-    """Where a step is cut: the time, and Newton's next estimate of it; y there in the next mode, and whether that mode is consistent;
-    whether the pieces on both sides can be used.
+    """Where a step is cut: the time, and Newton's next estimate of it; y there in the next mode, whether that mode is consistent, and
+    whether an impact there took energy; whether the pieces on both sides can be used.
     """
 
     time: Any
     estimate: Any
     y: Any
     consistent: Any
+    dissipates: Any
     usable: Any
 
 
@@ -105,8 +107,8 @@ class StickSlipSolver(ProjectedSolver):
         piece = lambda *given: Piece(*ProjectedSolver.step(self, terms, *given[:3], args, *given[3:]))
         given = t0, t1, y0, solver_state, jnp.asarray(made_jump)
         nothing = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), jax.eval_shape(piece, *given))
-        no, zeros = jnp.array(False), jnp.zeros(self.equations.elements, y0.dtype)
-        uncut = Split(nothing, nothing, Cut(t1, t1, y0, no, no), Seen(no, no, no, jnp.asarray(t1, y0.dtype), zeros))
+        no, zeros = jnp.array(False), jnp.zeros(self.equations.modes, y0.dtype)
+        uncut = Split(nothing, nothing, Cut(t1, t1, y0, no, no, no), Seen(no, no, no, jnp.asarray(t1, y0.dtype), zeros))
 
         run = functools.partial(self._run, piece, given, args)
         _, split = self._phases(run, (jnp.array(0), uncut))
@@ -144,7 +146,8 @@ class StickSlipSolver(ProjectedSolver):
 
     def _locate(self, split: Split, done: Piece, end, t0, t1, args, last) -> Split:
         """A Newton step for the time at which the mode ends, from the margins at the end of the piece; after the last, the next mode."""
-        value, slope = self.equations.margins(end, done.y, args, done.y)[: self.equations.elements], split.seen.slope
+        value = margins(self.equations, end, done.y, args, done.y)[: self.equations.modes]
+        slope = exact_slopes(self.equations, end, done.y, args, split.seen.slope)
         falling = slope < 0
         until = jnp.where(falling, jnp.abs(value) / jnp.where(falling, -slope, 1), jnp.inf)
         nearest = jax.lax.stop_gradient(jnp.argmin(until))
@@ -157,8 +160,11 @@ class StickSlipSolver(ProjectedSolver):
 
     def _change(self, split: Split, ended, args) -> Split:
         """With the state in the mode that follows when those of the elements `ended` end."""
-        y, consistent, at_rest = self.equations.changed(split.cut.time, split.first.y, args, ended)
-        return split._replace(cut=split.cut._replace(y=y, consistent=consistent, usable=split.cut.usable & at_rest))
+        found = changed(self.equations, split.cut.time, split.first.y, args, ended)
+        cut = split.cut._replace(
+            y=found.y, consistent=found.consistent, dissipates=found.dissipates, usable=split.cut.usable & found.at_rest
+        )
+        return split._replace(cut=cut)
 
     def _joined(self, split: Split, t0, t1, y0, args):
         """What diffrax asks of a step, from its pieces."""
@@ -172,6 +178,8 @@ class StickSlipSolver(ProjectedSolver):
         error = jnp.where(is_hidden(rates, _nodes(self.solver), t0, t1, y0, args.scales), jnp.inf, error)
         consistent = ~ended | cut.consistent | ~cut.usable
         result = dfx.RESULTS.where(consistent, dfx.RESULTS.successful, under_diffrax(RESULTS.no_friction))
+        dissipates = ~ended | cut.dissipates | ~cut.usable
+        result = dfx.RESULTS.where(dissipates, result, under_diffrax(RESULTS.energy_gained))
         result = dfx.RESULTS.where(seen.negative & ~shrinking, under_diffrax(RESULTS.negative_bound), result)
         result = dfx.RESULTS.where(self.equations.exhausted(second.y), under_diffrax(RESULTS.chattering), result)
         result = dfx.RESULTS.where(first.result == dfx.RESULTS.successful, result, first.result)
@@ -183,8 +191,8 @@ class StickSlipSolver(ProjectedSolver):
         """What is seen of the margins along a piece, on its dense output."""
         t0, t1, dense, args = jax.lax.stop_gradient((t0, t1, dense, args))
         path = self.solver.interpolation_cls(t0=t0, t1=t1, **dense)
-        margins = lambda t, y, start: self.equations.margins(t, y, args, start)
-        return first_end(margins, path.evaluate, t0, t1, self.equations.elements, args.scales, exactly)
+        of = lambda t, y, start: margins(self.equations, t, y, args, start)
+        return first_end(of, path.evaluate, t0, t1, self.equations.modes, args.scales, exactly)
 
 
 def _nodes(solver) -> np.ndarray:

@@ -32,6 +32,17 @@ class FrictionState(eqx.Module):
     sticking: Bool[Array, "..."]
 
 
+class ContactState(eqx.Module):
+    """A contact along a motion: whether it is `closed`; the number of its `impacts` so far; when it last `changed`, by an impact, by opening
+    or by closing; the sum of the `impulse`s of its impacts.
+    """
+
+    closed: Bool[Array, "*members T"]
+    impacts: Float[Array, "*members T"]
+    changed: Float[Array, "*members T"]
+    impulse: Float[Array, "*members T"]
+
+
 class Instant(eqx.Module):
     """A motion at one of its samples: the time `t`, and `q`, `qdot`, `qddot`, `multipliers` and `states` there, e.g. to continue from."""
 
@@ -72,6 +83,7 @@ class Trajectory(eqx.Module):
     - `ts`: the times; `q`, `qdot`, `qddot`: structured like q0; `multipliers`: λ by the constraint's name; `states`: by name.
     - `result`: `RESULTS.successful`, or the reason of failure; samples that were not reached are NaN.
     - `friction`: by the name of the dissipation term, the `force` on its slip velocities and whether they are `sticking`.
+    - `contacts`: by the name of the unilateral constraint, whether it is `closed`, its `impacts`, when it `changed`, its `impulse`s.
     - `works`: what `work()` returns, where the motion was computed with `works=True`.
     - `stats`: `num_steps`, `num_accepted_steps`, `num_rejected_steps`; `start_moved`, how far the initial state was projected;
       `reached`, the time to which the motion was computed. With dry friction, at each sample and since the start: `transitions`, how
@@ -90,6 +102,7 @@ class Trajectory(eqx.Module):
     friction: dict[str, FrictionState]
     provenance: Provenance | Recorded
     states: dict[str, PyTree] = dataclasses.field(default_factory=dict)
+    contacts: dict[str, ContactState] = dataclasses.field(default_factory=dict)
 
     @property
     def succeeded(self) -> Any:
@@ -161,7 +174,7 @@ class Trajectory(eqx.Module):
         if isinstance(provenance, Recorded):
             provenance = dataclasses.replace(provenance, energies=chosen(provenance.energies), slip=chosen(provenance.slip))
         *motion, states = chosen((self.ts, self.q, self.qdot, self.qddot, self.multipliers, self.states))
-        return Trajectory(*motion, self.result, counts, works, chosen(self.friction), provenance, states)
+        return Trajectory(*motion, self.result, counts, works, chosen(self.friction), provenance, states, chosen(self.contacts))
 
     def at(self, ts: Any) -> Interpolated:
         r"""The motion at other times, one or an array of them, interpolated between the samples by their q, q̇ and q̈.

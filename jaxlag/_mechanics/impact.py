@@ -1,0 +1,114 @@
+"""Impact: velocities that jump where contacts close.
+
+    M (q̇⁺ − q̇⁻) = GᵀΛ + friction,   ġ⁺ + e min(ġ⁻, 0) ≥ 0,  Λ ≥ 0,  one of them zero      of the contacts that touch
+                                     ġ⁺ = 0 and a⁺ = 0                                     of all other constraints
+
+Friction takes the impulses for the forces it follows: D is homogeneous in them. So an impact is the acceleration of a system at rest in a
+time of its own, in which q̇⁺ stands for q̈ and Λ for λ, and the laws of contact and friction are those of `contact` and `stick_slip`.
+Source: Glocker, Set-Valued Force Laws, chapter 10; Pfeiffer & Glocker, Multibody Dynamics with Unilateral Contacts, chapter 8.
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from .._model.flat import Flat, rows_by_name
+from .contact import contact_rows, gap_rates, in_contact, select_closed
+from .friction_elements import FrictionElements
+from .lagrange import constraint_rows, inertia
+from .saddle_point import constrained_acceleration
+from .stick_slip import friction, friction_by_term, select_mode
+
+RISE = 1e-9  # of the energy exchanged, by which an impact may raise it by rounding
+
+
+class Impact(NamedTuple):
+    """q̇ after an impact; the impulses of the contacts; the work of each constraint and dissipation term; whether the laws of contact and
+    friction have a solution; whether it takes energy and gives none.
+    """
+
+    v: Float[Array, " n"]
+    impulses: Float[Array, " c"]
+    works: dict[str, Float[Array, ""]]
+    consistent: Bool[Array, ""]
+    dissipates: Bool[Array, ""]
+
+
+def impact(flat: Flat, elements: FrictionElements | None, t, q, v, near: Bool[Array, " c"], e: Float[Array, " c"]) -> Impact:
+    """The impact of the contacts that are `near`, some of which approach; `e`: their restitution."""
+    approach = gap_rates(flat, t, q, v)
+    fast, of_impact = _in_fast_time(flat, elements, t, q, v, e * jnp.minimum(approach, 0))
+    zero, origin = jnp.zeros_like(t), jnp.zeros_like(q)
+    everywhere = None if of_impact is None else jnp.ones(of_impact.size, bool)
+
+    def mode_of(fast):
+        sigma = jnp.zeros(of_impact.element_of_row.size, v.dtype)
+        return select_mode(fast, of_impact, zero, origin, origin, sigma, everywhere, ~everywhere)
+
+    chosen = select_closed(fast, of_impact, zero, origin, origin, near, mode_of)
+    with_closed = in_contact(fast, chosen.closed)
+    if of_impact is None:
+        after, multipliers, _ = constrained_acceleration(with_closed, zero, origin, origin)
+        lost, rubbed = jnp.zeros((), v.dtype), {}
+    else:
+        sigma, held = chosen.mode.sigma, chosen.mode.held
+        found = friction(with_closed, of_impact, sigma, zero, origin, origin)
+        after, multipliers = found.qddot, found.multipliers
+        lost = found.force @ (elements.slip(t, q, v) + elements.slip(t, q, after))
+        rubbed = friction_by_term(of_impact, sigma, held, zero, origin, origin, found)
+    impulses = contact_rows(flat, multipliers)
+    departure = gap_rates(flat, t, q, after)
+    given = impulses @ (approach + departure) + lost
+    exchanged = jnp.abs(impulses) @ (jnp.abs(approach) + jnp.abs(departure))
+    dissipates = jax.lax.stop_gradient(given <= RISE * exchanged)
+    return Impact(after, impulses, _works(flat, elements, t, q, (v + after) / 2, multipliers, rubbed), chosen.consistent, dissipates)
+
+
+def _works(flat, elements, t, q, mean, multipliers, rubbed):
+    """Of each impulse, its product with the mean of the rates before and after."""
+    _, G, _ = constraint_rows(in_contact(flat, jnp.ones(len(flat.contacts), bool)), t, q, mean)
+    works = {name: multipliers[rows] @ (G[rows] @ mean) for name, rows in rows_by_name(flat).items()}
+    if elements is None:
+        return works
+    _, rate = jax.jvp(lambda v: elements.slip(t, q, v), (mean,), (mean,))
+    return works | {name: jnp.ravel(force) @ rate[elements.rows_of_term[name]] for name, (force, _) in rubbed.items()}
+
+
+def no_impact(flat: Flat, elements: FrictionElements | None, v) -> Impact:
+    """That of nothing: q̇ stays as it is."""
+    yes, none = jnp.array(True), jnp.zeros((), v.dtype)
+    terms = {} if elements is None else elements.rows_of_term
+    return Impact(v, jnp.zeros(len(flat.contacts), v.dtype), {name: none for name in (*rows_by_name(flat), *terms)}, yes, yes)
+
+
+def _in_fast_time(flat, elements, t, q, v, returned):
+    """The system of an impact: x stands for a change of q, its acceleration from rest for q̇⁺."""
+    M = inertia(flat, t, q, v)[0]
+    momentum = M.mv(v)
+    rates = lambda v: (jax.jvp(flat.bilateral, (t, q), (jnp.ones_like(t), v))[1], gap_rates(flat, t, q, v), flat.nonholonomic(t, q, v))
+    drift = rates(jnp.zeros_like(v))
+    along = lambda x: jax.jvp(rates, (jnp.zeros_like(v),), (x,))[1]  # affine in q̇
+    fast = flat._replace(
+        lagrangian=lambda s, x, w: w @ M.mv(w) / 2 + momentum @ x,
+        bilateral=lambda s, x: along(x)[0] + s**2 / 2 * drift[0],
+        gaps=lambda s, x: along(x)[1] + s**2 / 2 * (drift[1] + returned),
+        nonholonomic=lambda s, x, w: along(w)[2] + s * drift[2],
+        dissipations={},
+        forces={},
+    )
+    fast = fast._replace(holonomic=lambda s, x: jnp.concatenate([fast.bilateral(s, x), jnp.zeros_like(drift[1])]))
+    if elements is None:
+        return fast._replace(needs_multipliers=False), None
+    at_rest = elements.slip(t, q, jnp.zeros_like(v))
+
+    def slip(s, x, w):
+        return jax.jvp(lambda v: elements.slip(t, q, v), (jnp.zeros_like(v),), (w,))[1] + s * at_rest
+
+    def impulsive(D):
+        """D of the impulses: what does not follow them is finite, and has no part in an impact."""
+        return lambda s, x, w, impulses, u: D(t, q, v, impulses, u) - D(t, q, v, jnp.zeros_like(impulses), u)
+
+    potentials = {name: impulsive(D) for name, D in elements.potentials.items()}
+    return fast, elements._replace(slip=slip, potentials=potentials, near_rest=0.0)

@@ -1,0 +1,199 @@
+"""What ends a mode of friction and contact, and what follows it: the impact, the contacts that stay closed, what slides and what sticks."""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from .._mechanics.contact import (
+    ROUNDING,
+    contact_rows,
+    gap_rates,
+    gap_scales,
+    on_contact,
+    roundings,
+    select_closed,
+)
+from .._mechanics.friction_elements import FrictionElements
+from .._mechanics.impact import Impact, impact, no_impact
+from .._mechanics.stick_slip import Mode, first_mode, friction, select_mode, slip_of, sticking
+from .._model.flat import Flat, StatesAt
+from .._program.jit import jitted
+from .first_order import EquationsOfMotion
+from .protocol import Arguments
+from .state_vector import Parts, Start
+
+CONVERGED = 1e-9  # of the motion, the time that infinitely many impacts may yet take when they are summed up
+
+
+class Change(NamedTuple):
+    """y behind the end of a mode; whether a mode is consistent there, whether an impact took energy, whether slip had come to rest."""
+
+    y: Float[Array, " y"]
+    consistent: Bool[Array, ""]
+    dissipates: Bool[Array, ""]
+    at_rest: Bool[Array, ""]
+
+
+def margins(equations: EquationsOfMotion, t, y, args: Arguments, start) -> Float[Array, " 2m"]:
+    """Per element of dry friction and per contact, the margin of its mode, negative beyond its end; and then the bounds of friction.
+
+    The mode and the sampled states are those of `start`, y at the start of the step: what these alone determine is computed once.
+    """
+    here, there = equations.parts(y), equations.parts(start)
+    still = {"u": there.u, "held": there.held, "closed": there.closed}
+    if equations.rows == equations.elements:  # others may turn
+        still["sigma"] = there.sigma
+    return _margins(equations, t, here._replace(**still), args)
+
+
+@jitted
+def _margins(equations: EquationsOfMotion, t, parts: Parts, args):
+    q, v, sigma, held = parts.q, parts.v, parts.sigma, parts.held
+    flat, _, elements = equations.mode(t, parts, args)
+    if elements is None:
+        closed = parts.closed > 0
+        forces = jax.lax.cond(
+            jnp.any(closed),
+            lambda: contact_rows(flat, equations.acceleration(flat, t, q, v).multipliers),
+            lambda: jnp.zeros_like(parts.closed),
+        )
+        return jnp.concatenate([_contact_margins(flat, t, q, closed, forces), jnp.ones_like(parts.closed)])
+    found = friction(flat, elements, sigma, t, q, v)
+    of_contacts = _contact_margins(flat, t, q, parts.closed > 0, contact_rows(flat, found.multipliers))
+    of_elements = jnp.where(held > 0, 1, found.margin)
+    return jnp.concatenate([of_elements, of_contacts, found.bound, jnp.ones_like(parts.closed)])
+
+
+def _contact_margins(flat: Flat, t, q, closed, forces):
+    """The force of a closed contact, the gap of an open one: with some of their rounding, since both begin at zero."""
+    rounding = gap_scales(flat, t, q, q, roundings(q), q).gap
+    little = ROUNDING * jnp.finfo(q.dtype).eps * jnp.max(jnp.abs(jax.lax.stop_gradient(forces)), initial=0.0)
+    return jnp.where(closed, forces + little, flat.gaps(t, q) + rounding)
+
+
+def exact_slopes(equations: EquationsOfMotion, t, y, args: Arguments, slopes: Float[Array, " m"]) -> Float[Array, " m"]:
+    """Slopes of the margins, those of open contacts made exact: the rate ġ, which is small among many impacts, is no difference of gaps."""
+    if not equations.contacts:
+        return slopes
+    parts = equations.parts(y)
+    flat, _, _ = equations.mode(t, parts, args)
+    rates = jnp.where(parts.closed > 0, slopes[equations.elements :], gap_rates(flat, t, parts.q, parts.v))
+    return jax.lax.stop_gradient(jnp.concatenate([slopes[: equations.elements], rates]))
+
+
+@jitted
+def changed(equations: EquationsOfMotion, t, y, args: Arguments, ended: Bool[Array, " m"]) -> Change:
+    """y in the mode that follows when those of the elements and contacts `ended` end."""
+    assert args.scales is not None  # ends are located
+    parts = equations.parts(y)
+    flat, _, elements = equations.mode(t, parts, args)
+    of_friction, of_contact = ended[: equations.elements], ended[equations.elements :]
+    if not equations.contacts:
+        assert elements is not None
+        stuck, slow = sticking(elements, parts.sigma) | (parts.held > 0), _slow(elements, t, parts, args.scales.error(parts.v))
+        mode = select_mode(flat, elements, t, parts.q, parts.v, parts.sigma, stuck | of_friction | slow, of_friction & stuck)
+        after = equations.projected(t, in_other_mode(elements, parts, mode).y, args)
+        return Change(after, mode.consistent, jnp.array(True), jnp.all(~of_friction | stuck | slow))
+    errors = args.scales.error(parts.q), args.scales.error(parts.v)
+    return behind_contact(equations, t, parts, args, of_friction, of_contact, errors)
+
+
+def _slow(elements: FrictionElements, t, parts: Parts, errors):
+    """Which elements slip by no more than errors of the velocities amount to."""
+    return elements.norms(elements.slip(t, parts.q, parts.v)) <= slip_of(elements, t, parts.q, parts.v, errors)
+
+
+def behind_contact(equations: EquationsOfMotion, t, parts: Parts, args: Arguments, of_friction, of_contact, errors, anew=False) -> Change:
+    """y behind the end of modes of friction and contact; `errors` of positions and velocities, within which contacts touch and slip rests.
+
+    `anew`: whether what slides and what sticks follows from the motion alone, as it does behind an impact.
+    """
+    flat, _, elements = equations.mode(t, parts, args)
+    closed, q, before = parts.closed > 0, parts.q, parts.v
+    scales = gap_scales(flat, t, q, before, errors[0], roundings(before))
+    near = closed | of_contact | (jax.lax.stop_gradient(flat.gaps(t, q)) <= scales.gap)
+    opening = of_contact & closed
+    hits = near & ~opening & (gap_rates(flat, t, q, before) < -scales.rate)
+    is_impact = jnp.any(hits)
+    duration = jnp.inf if args.scales is None else args.scales.duration
+    remaining, converged = _last_impacts(t, parts, hits & of_contact, duration)
+    e = jnp.where(converged, 0, flat.restitution(t, jnp.maximum(-gap_rates(flat, t, q, before), 0)))
+
+    def struck():
+        there = on_contact(flat, t, q, before, closed | hits)
+        return there, impact(flat, elements, t, there, before, near & ~opening, e)
+
+    q, found = jax.lax.cond(is_impact, struck, lambda: (q, no_impact(flat, elements, before)))
+    if equations.works:
+        does = jnp.stack([jnp.asarray(found.works.get(name, 0.0), before.dtype) for name in equations.works])
+        parts = parts._replace(works=parts.works + does)
+    parts = parts._replace(q=q, v=found.v, **_counted(t, parts, hits, opening, found, jnp.where(converged, remaining, 0)))
+    resting = near & ~opening & (jnp.abs(gap_rates(flat, t, q, found.v)) <= scales.rate)
+    if elements is None:
+        chosen = select_closed(flat, None, t, q, found.v, resting, lambda flat: None)
+        slow, stuck = jnp.ones_like(of_friction), jnp.ones_like(of_friction)
+    else:
+        stuck, slow = sticking(elements, parts.sigma) | (parts.held > 0), _slow(elements, t, parts, errors[1])
+        slip = elements.slip(t, q, found.v)
+        size = elements.norms(slip)[elements.element_of_row]
+        anew = is_impact | anew
+        at_rest = jnp.where(anew, slow, stuck | of_friction | slow)
+        along = jnp.where(anew, slip / jnp.where(size > 0, size, 1), parts.sigma)
+        given = along, at_rest, of_friction & stuck & ~anew
+        chosen = select_closed(flat, elements, t, q, found.v, resting, lambda flat: select_mode(flat, elements, t, q, found.v, *given))
+        parts = in_other_mode(elements, parts, chosen.mode)
+    changes = (chosen.closed != closed) & ~hits
+    parts = parts._replace(closed=chosen.closed.astype(q.dtype), changed=jnp.where(changes, t, parts.changed))
+    at_rest = jnp.all(~of_friction | stuck | slow) | anew
+    return Change(equations.projected(t, parts.y, args), chosen.consistent & found.consistent, found.dissipates, at_rest)
+
+
+def _last_impacts(t, parts: Parts, hits, duration):
+    """Of each contact, the time that the impacts that are still to come will take, flights that shrink by one ratio; and whether that is
+    next to nothing, so that this impact may stand for them all.
+    """
+    flight, before = t - parts.changed, parts.flight
+    ratio = flight / jnp.where(before > 0, before, 1)
+    shrinks = (before > 0) & (ratio < 1) & (parts.impacts >= 2)
+    remaining = flight * ratio / jnp.where(shrinks, 1 - ratio, 1)
+    return remaining, hits & shrinks & (remaining < CONVERGED * duration)
+
+
+def _counted(t, parts: Parts, hits, opening, found: Impact, remaining):
+    """What is kept of each contact, behind an impact or an opening."""
+    return {
+        "impacts": parts.impacts + hits,
+        "changed": jnp.where(hits, t + remaining, parts.changed),
+        "flight": jnp.where(hits, t - parts.changed, jnp.where(opening, 0, parts.flight)),
+        "impulse": parts.impulse + found.impulses,
+    }
+
+
+def in_other_mode(elements: FrictionElements, parts: Parts, mode: Mode) -> Parts:
+    """y in another mode, and its transitions counted: what begins or ceases to slip, or slips another way, where there is friction."""
+    of, sigma, held = elements.element_of_row, parts.sigma, parts.held
+    before, after = jnp.where((held > 0)[of], 0, sigma), jnp.where(mode.held[of], 0, mode.sigma)
+    changes = jnp.sum((elements.norms(after - before) > 0.5) & (mode.bound != 0))
+    return parts._replace(sigma=mode.sigma, held=mode.held.astype(held.dtype), transitions=parts.transitions + changes)
+
+
+def started(equations: EquationsOfMotion, at: StatesAt, params) -> Start:
+    """y at the start, in the mode that holds there: what touches and approaches has an impact."""
+    parts, args, t = equations.at_start(at, params), Arguments(params), at.t
+    flat, _, elements = equations.mode(t, parts, args)
+    yes = jnp.array(True)
+    if equations.contacts:
+        near = 1 + jnp.abs(jax.lax.stop_gradient(parts.q))
+        inside = gap_scales(flat, t, parts.q, parts.v, jnp.finfo(near.dtype).eps ** 0.5 * near, parts.v).gap
+        is_outside = jnp.all(flat.gaps(t, parts.q) >= -inside)
+        errors = roundings(near), roundings(1 + jnp.abs(jax.lax.stop_gradient(parts.v)))
+        of_contact = flat.gaps(t, parts.q) <= 0
+        change = behind_contact(equations, t, parts, args, jnp.zeros(equations.elements, bool), of_contact, errors, anew=True)
+        return Start(change.y, change.consistent, yes, is_outside, change.dissipates)
+    if elements is None:
+        return Start(parts.y, yes, yes, yes, yes)
+    mode = first_mode(flat, elements, t, parts.q, parts.v)
+    parts = parts._replace(sigma=mode.sigma, held=mode.held.astype(parts.q.dtype))
+    return Start(equations.projected(t, parts.y, args), mode.consistent, ~jnp.any(mode.bound < 0), yes, yes)
