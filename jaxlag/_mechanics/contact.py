@@ -7,7 +7,6 @@ ordinary one, with or without dry friction, so the rest of the package need not 
 Source: Pfeiffer & Glocker, Multibody Dynamics with Unilateral Contacts, chapters 5 and 6; Glocker, Set-Valued Force Laws, chapter 10.
 """
 
-from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
@@ -18,8 +17,9 @@ from .._model.flat import Flat
 from .friction_elements import FrictionElements, find_elements
 from .lagrange import inertia, position_residual
 from .saddle_point import constrained_acceleration, reach_of, saddle_point
-from .stick_slip import Mode, first_mode, friction, in_mode
+from .stick_slip import Mode, first_mode, in_mode, sticking
 
+OUTWARDS = 6  # Newton steps that put a start on its obstacle
 ROUNDING = 1e4  # times eps, what counts as rounding of a gap, its rate, its acceleration and its force
 
 
@@ -29,7 +29,12 @@ def in_contact(flat: Flat, closed: Bool[Array, " c"]) -> Flat:
     def holonomic(t, q):
         return jnp.concatenate([flat.bilateral(t, q), jnp.where(closed, flat.gaps(t, q), 0)])
 
-    return flat._replace(holonomic=holonomic) if flat.contacts else flat
+    return flat._replace(holonomic=holonomic, closed=closed) if flat.contacts else flat
+
+
+def free(flat: Flat) -> Flat:
+    """The system without its contacts: fewer rows, those of the other constraints."""
+    return flat._replace(holonomic=flat.bilateral, closed=None)
 
 
 def contact_rows(flat: Flat, multipliers: Float[Array, " m"]) -> Float[Array, " c"]:
@@ -54,6 +59,14 @@ def on_contact(flat: Flat, t, q, v, closed: Bool[Array, " c"]) -> Float[Array, "
     return q + saddle_point(inertia(flat, t, q, v)[0], G, jnp.zeros_like(q), -g, reach_of(q)).x
 
 
+def outside(flat: Flat, t, q, v) -> Float[Array, " n"]:
+    """q, put on the obstacles that it lies inside of."""
+    if not flat.contacts:
+        return q
+    inside = flat.gaps(t, q) < 0
+    return jax.lax.scan(lambda q, _: (on_contact(flat, t, q, v, inside), None), q, length=OUTWARDS)[0]
+
+
 class GapScales(NamedTuple):
     """Of each contact, the gap and the rate of approach that errors of positions and velocities amount to."""
 
@@ -73,7 +86,46 @@ def roundings(x: Float[Array, " n"]) -> Float[Array, " n"]:
     return eps * jnp.abs(jax.lax.stop_gradient(x)) + eps**2
 
 
-class Closed(NamedTuple):
+class Contacts(NamedTuple):
+    """Contacts with g = 0 and ġ = 0, to choose the closed ones from: those chosen so far, how often they changed, and what of their forces
+    and accelerations counts as rounding.
+
+    All candidates are closed at first. One by one, the contact that pulls most opens, and where none pulls, the one that goes deepest
+    closes, until none pulls and none goes deeper. If that takes long, they change in the order of their numbers, which ends without
+    friction in any case (Murty, Linear Complementarity, chapter 4).
+    """
+
+    candidates: Bool[Array, " c"]
+    closed: Bool[Array, " c"]
+    turn: Any
+    force: Float[Array, " c"]
+    acceleration: Float[Array, " c"]
+
+    @classmethod
+    def of(cls, flat: Flat, t, q, v, candidates: Bool[Array, " c"]) -> "Contacts":
+        """All candidates closed."""
+        return cls(candidates, candidates, jnp.array(0), *jax.lax.stop_gradient(_scales(flat, t, q, v)))
+
+    def applied_to(self, flat: Flat) -> Flat:
+        """The system with those that are closed."""
+        return in_contact(flat, self.closed)
+
+    def unloaded(self, bound: Float[Array, " e"]) -> Bool[Array, " e"]:
+        """Which elements no force loads while a contact is open."""
+        return (bound == 0) & ~jnp.all(self.closed)
+
+    def next(self, flat: Flat, t, q, v, qddot, multipliers, agreed: Any = True) -> tuple["Contacts", Bool[Array, ""]]:
+        """Other ones, where a contact pulls or, the friction being `agreed` on, goes deeper; and whether there was any."""
+        size = len(flat.contacts)
+        pull = jnp.where(self.closed, -contact_rows(flat, multipliers) - self.force, -jnp.inf)
+        deeper = jnp.where(agreed & self.candidates & ~self.closed, -gap_accelerations(flat, t, q, v, qddot) - self.acceleration, -jnp.inf)
+        in_order = jnp.where((pull > 0) | (deeper > 0), size - jnp.arange(size, dtype=v.dtype), 0)
+        excess = jnp.where(self.turn > 2 * size, in_order, jnp.where(jnp.any(pull > 0), pull, deeper))
+        flips = (jnp.arange(size) == jnp.argmax(excess)) & (excess > 0)
+        return self._replace(closed=self.closed ^ flips, turn=self.turn + 1), jnp.any(flips)
+
+
+class Chosen(NamedTuple):
     """Which contacts are closed; the mode of friction with them, where there is any; whether forces and accelerations are consistent."""
 
     closed: Bool[Array, " c"]
@@ -81,50 +133,19 @@ class Closed(NamedTuple):
     consistent: Bool[Array, ""]
 
 
-class _Search(NamedTuple):
-    turn: Any
-    closed: Bool[Array, " c"]
-    mode: Mode | None
-    changed: Bool[Array, ""]
-
-
-def select_closed(flat: Flat, elements: FrictionElements | None, t, q, v, candidates: Bool[Array, " c"], mode_of: Callable) -> Closed:
-    """Which of the `candidates`, contacts with g = 0 and ġ = 0, stay closed; `mode_of(flat)` is the mode of friction with some closed.
-
-    All candidates are closed at first. One by one, the contact that pulls most opens, and where none pulls, the one that goes deepest
-    closes, until none pulls and none goes deeper. If that takes long, they change in the order of their numbers, which ends without
-    friction in any case (Murty, Linear Complementarity, chapter 4).
-    """
+def select_closed(flat: Flat, t, q, v, candidates: Bool[Array, " c"]) -> Chosen:
+    """Which of the candidates are closed, without friction."""
     t, q, v = jax.lax.stop_gradient((t, q, v))
-    pull_scale, deep_scale = _scales(flat, t, q, v)
-    size = len(flat.contacts)
 
-    def solved(closed):
-        with_closed = in_contact(flat, closed)
-        if elements is None:
-            qddot, multipliers, _ = constrained_acceleration(with_closed, t, q, v)
-            return None, qddot, multipliers
-        mode = mode_of(with_closed)
-        found = friction(with_closed, elements, mode.sigma, t, q, v)
-        return mode, found.qddot, found.multipliers
+    def turn(carry):
+        contacts, _ = carry
+        qddot, multipliers, _ = constrained_acceleration(contacts.applied_to(flat), t, q, v)
+        return contacts.next(flat, t, q, v, qddot, multipliers)
 
-    def turn(search):
-        mode, qddot, multipliers = jax.lax.stop_gradient(solved(search.closed))
-        pull = jnp.where(search.closed, -contact_rows(flat, multipliers) - pull_scale, -jnp.inf)
-        deeper = jnp.where(candidates & ~search.closed, -gap_accelerations(flat, t, q, v, qddot) - deep_scale, -jnp.inf)
-        excess = jnp.where(jnp.any(pull > 0), pull, deeper)
-        in_order = jnp.where((pull > 0) | (deeper > 0), -jnp.arange(size, dtype=v.dtype) + size, 0)
-        excess = jnp.where(search.turn > 2 * size, in_order, excess)
-        flips = (jnp.arange(size) == jnp.argmax(excess)) & (excess > 0)
-        return _Search(search.turn + 1, search.closed ^ flips, mode, jnp.any(flips))
-
-    def going_on(search):
-        return search.changed & (search.turn < 4 * size + 2 ** size.bit_length() + 8)
-
-    mode = None if elements is None else jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), jax.eval_shape(mode_of, flat))
-    done = jax.lax.while_loop(going_on, turn, _Search(0, candidates, mode, jnp.array(True)))
-    consistent = ~done.changed if done.mode is None else ~done.changed & done.mode.consistent
-    return Closed(done.closed, done.mode, consistent)
+    most = 4 * len(flat.contacts) + 2 ** min(len(flat.contacts), 10)
+    start = Contacts.of(flat, t, q, v, candidates), jnp.any(candidates)
+    contacts, changes = jax.lax.while_loop(lambda carry: carry[1] & (carry[0].turn < most), turn, start)
+    return Chosen(contacts.closed, None, ~changes)
 
 
 def _scales(flat, t, q, v):
@@ -137,10 +158,16 @@ def _scales(flat, t, q, v):
     return eps * (G @ force) / jnp.where(size > 0, size, 1), eps * (G @ jnp.abs(free) + drift)
 
 
-def touching(flat: Flat, t, q, v, scales: GapScales) -> tuple[Bool[Array, " c"], Bool[Array, " c"]]:
-    """Which contacts touch, and which of these neither open nor close."""
-    near = jax.lax.stop_gradient(flat.gaps(t, q)) <= scales.gap
-    return near, near & (jnp.abs(gap_rates(flat, t, q, v)) <= scales.rate)
+def idle(flat: Flat, elements: FrictionElements, sigma: Float[Array, " r"], bound: Float[Array, " e"]) -> Bool[Array, " e"]:
+    """Which elements slip without a force while a contact is open: which way they do says nothing, and is found anew where it closes."""
+    if flat.closed is None:
+        return jnp.zeros(elements.size, bool)
+    return (bound == 0) & ~sticking(elements, sigma) & ~jnp.all(flat.closed)
+
+
+def touching(flat: Flat, t, q, v, scales: GapScales) -> Bool[Array, " c"]:
+    """Which contacts touch, and neither open nor close."""
+    return (flat.gaps(t, q) <= scales.gap) & (jnp.abs(gap_rates(flat, t, q, v)) <= scales.rate)
 
 
 def in_current_mode(flat: Flat, t, q, v) -> Flat:
@@ -149,10 +176,11 @@ def in_current_mode(flat: Flat, t, q, v) -> Flat:
     Contacts that touch and neither open nor close, to rounding, are closed where they push.
     """
     elements = find_elements(flat, t, q, v)
-    if flat.contacts:
-        scales = gap_scales(flat, t, q, v, roundings(q) + roundings(jnp.ones_like(q)), roundings(v) + roundings(jnp.ones_like(v)))
-        candidates = touching(flat, t, q, v, scales)[1]
-        chosen = select_closed(flat, elements, t, q, v, candidates, lambda flat: first_mode(flat, elements, t, q, v))
-        flat = in_contact(flat, chosen.closed)
-        return flat if chosen.mode is None else in_mode(flat, elements, chosen.mode.sigma)
-    return flat if elements is None else in_mode(flat, elements, first_mode(flat, elements, t, q, v).sigma)
+    if not flat.contacts:
+        return flat if elements is None else in_mode(flat, elements, first_mode(flat, elements, t, q, v)[0].sigma)
+    scales = gap_scales(flat, t, q, v, roundings(1 + jnp.abs(q)), roundings(1 + jnp.abs(v)))
+    candidates = touching(flat, t, q, v, scales)
+    if elements is None:
+        return in_contact(flat, select_closed(flat, t, q, v, candidates).closed)
+    mode, contacts = first_mode(flat, elements, t, q, v, Contacts.of(flat, t, q, v, candidates))
+    return in_mode(contacts.applied_to(flat), elements, mode.sigma)

@@ -15,7 +15,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from .._model.flat import Flat, rows_by_name
-from .contact import contact_rows, gap_rates, in_contact, select_closed
+from .contact import Contacts, contact_rows, gap_rates, in_contact, select_closed
 from .friction_elements import FrictionElements
 from .lagrange import constraint_rows, inertia
 from .saddle_point import constrained_acceleration
@@ -41,20 +41,16 @@ def impact(flat: Flat, elements: FrictionElements | None, t, q, v, near: Bool[Ar
     approach = gap_rates(flat, t, q, v)
     fast, of_impact = _in_fast_time(flat, elements, t, q, v, e * jnp.minimum(approach, 0))
     zero, origin = jnp.zeros_like(t), jnp.zeros_like(q)
-    everywhere = None if of_impact is None else jnp.ones(of_impact.size, bool)
-
-    def mode_of(fast):
-        sigma = jnp.zeros(of_impact.element_of_row.size, v.dtype)
-        return select_mode(fast, of_impact, zero, origin, origin, sigma, everywhere, ~everywhere)
-
-    chosen = select_closed(fast, of_impact, zero, origin, origin, near, mode_of)
-    with_closed = in_contact(fast, chosen.closed)
     if of_impact is None:
-        after, multipliers, _ = constrained_acceleration(with_closed, zero, origin, origin)
-        lost, rubbed = jnp.zeros((), v.dtype), {}
+        chosen = select_closed(fast, zero, origin, origin, near)
+        after, multipliers, _ = constrained_acceleration(in_contact(fast, chosen.closed), zero, origin, origin)
+        lost, rubbed, consistent = jnp.zeros((), v.dtype), {}, chosen.consistent
     else:
-        sigma, held = chosen.mode.sigma, chosen.mode.held
-        found = friction(with_closed, of_impact, sigma, zero, origin, origin)
+        everywhere, still = jnp.ones(of_impact.size, bool), jnp.zeros(of_impact.element_of_row.size, v.dtype)
+        contacts = Contacts.of(fast, zero, origin, origin, near)
+        mode, contacts = select_mode(fast, of_impact, zero, origin, origin, still, everywhere, ~everywhere, contacts)
+        sigma, held, consistent = mode.sigma, mode.held, mode.consistent
+        found = friction(contacts.applied_to(fast), of_impact, sigma, zero, origin, origin)
         after, multipliers = found.qddot, found.multipliers
         lost = found.force @ (elements.slip(t, q, v) + elements.slip(t, q, after))
         rubbed = friction_by_term(of_impact, sigma, held, zero, origin, origin, found)
@@ -63,7 +59,7 @@ def impact(flat: Flat, elements: FrictionElements | None, t, q, v, near: Bool[Ar
     given = impulses @ (approach + departure) + lost
     exchanged = jnp.abs(impulses) @ (jnp.abs(approach) + jnp.abs(departure))
     dissipates = jax.lax.stop_gradient(given <= RISE * exchanged)
-    return Impact(after, impulses, _works(flat, elements, t, q, (v + after) / 2, multipliers, rubbed), chosen.consistent, dissipates)
+    return Impact(after, impulses, _works(flat, elements, t, q, (v + after) / 2, multipliers, rubbed), consistent, dissipates)
 
 
 def _works(flat, elements, t, q, mean, multipliers, rubbed):

@@ -183,13 +183,23 @@ def constrained_acceleration(flat: Flat, t, q, v, feedback=None) -> SaddlePoint:
     c = -gamma if feedback is None else -gamma - feedback(flat, t, q, v)
     force = lambda multipliers: applied_force(flat, t, q, v, multipliers)
     if not flat.needs_multipliers:
-        return saddle_point(M, G, inertial + force(jnp.zeros_like(c)), c)
+        found = saddle_point(M, G, inertial + force(jnp.zeros_like(c)), c)
+        return found._replace(multipliers=_pushing(flat, found.multipliers))
     # The solution is affine in the force, which is part of it by λ: one solve says how.
     beside = lambda vector, matrix: jnp.concatenate([vector[:, None], matrix], axis=1)
     columns = saddle_point(M, G, beside(inertial, jnp.eye(v.size, dtype=v.dtype)), beside(c, jnp.zeros((c.size, v.size), v.dtype)))
     affine = lambda columns, force: columns[:, 0] + columns[:, 1:] @ force
-    multipliers = _self_consistent(lambda multipliers: affine(columns.multipliers, force(multipliers)), jnp.zeros_like(c))
+    reaction = lambda multipliers: affine(columns.multipliers, force(_pushing(flat, multipliers)))
+    multipliers = _pushing(flat, _self_consistent(reaction, jnp.zeros_like(c)))
     return SaddlePoint(affine(columns.x, force(multipliers)), multipliers, columns.sound)
+
+
+def _pushing(flat: Flat, multipliers):
+    """λ, that of an open contact zero and no rounding."""
+    if flat.closed is None:
+        return multipliers
+    start, end = flat.rows_of_bilateral, flat.rows_of_bilateral + len(flat.contacts)
+    return multipliers.at[start:end].set(jnp.where(flat.closed, multipliers[start:end], 0))
 
 
 def _self_consistent(reaction, start):

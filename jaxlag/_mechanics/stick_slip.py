@@ -96,9 +96,10 @@ class Mode(NamedTuple):
 
 
 class _Search(NamedTuple):
-    """The state of the search for a mode; slip rates without friction, the scale for others."""
+    """The state of the search for a mode, and for the closed contacts; slip rates without friction, the scale for others."""
 
     stage: Any
+    contacts: Any
     mode: Mode
     clearly: Bool[Array, " e"]  # broken away by more than rounding
     free_rate: Float[Array, " e"]
@@ -107,12 +108,40 @@ class _Search(NamedTuple):
 LOOSE, FIRST, NEXT, HOLD, DONE = range(5)  # stages of the search
 
 
-def select_mode(flat: Flat, elements: FrictionElements, t, q, v, sigma, at_rest: Bool[Array, " e"], breaking: Bool[Array, " e"]) -> Mode:
+class NoContact(NamedTuple):
+    """Contacts to choose from, where there are none."""
+
+    def applied_to(self, flat: Flat) -> Flat:
+        """The system with those that are closed."""
+        return flat
+
+    def unloaded(self, bound: Float[Array, " e"]) -> Bool[Array, " e"]:
+        """Which elements no open contact loads."""
+        return jnp.zeros(bound.size, bool)
+
+    def next(self, flat: Flat, t, q, v, qddot, multipliers, agreed: Any = True) -> tuple["NoContact", bool]:
+        """Other ones, where a contact pulls or, the friction being `agreed` on, goes deeper; and whether there was any."""
+        return self, False
+
+
+def select_mode(
+    flat: Flat,
+    elements: FrictionElements,
+    t,
+    q,
+    v,
+    sigma,
+    at_rest: Bool[Array, " e"],
+    breaking: Bool[Array, " e"],
+    contacts: Any = NoContact(),
+) -> tuple[Mode, Any]:
     """Mode selection where the elements `at_rest` have no slip; the others continue to slip along σ.
 
     All at rest stick, except those `breaking` away at their bound. One by one, the element farthest beyond its bound slips against its
     force, and one that would start backwards sticks again, until none is beyond its bound and none moves backwards. Of dependent
     elements some may be at their bound while others hold them: one of the possible shares, with the same motion for all.
+
+    Where one of the `contacts` pulls or goes deeper in the mode that was found, it changes and all begins anew.
     """
     of = elements.element_of_row
     t, q, v = jax.lax.stop_gradient((t, q, v))
@@ -123,45 +152,56 @@ def select_mode(flat: Flat, elements: FrictionElements, t, q, v, sigma, at_rest:
         mode, stage = search.mode, search.stage
         released = at_rest & ~sticking(elements, mode.sigma)
         freed = jnp.where(stage == LOOSE, at_rest, released & (stage == HOLD))
-        found = jax.lax.stop_gradient(friction(flat, elements, jnp.where(freed[of], loose, mode.sigma), t, q, v))
+        found = jax.lax.stop_gradient(
+            friction(search.contacts.applied_to(flat), elements, jnp.where(freed[of], loose, mode.sigma), t, q, v)
+        )
         rate = elements.norms(found.slip_rate)
 
         over = jnp.where(sticking(elements, mode.sigma), -found.margin, -jnp.inf)
-        beyond = _greatest(over, over > 0)
+        idle = search.contacts.unloaded(found.bound)  # let go at once, and for good: it has no part in what the others do
+        beyond = _greatest(over, (over > 0) & ~idle)
         backwards = -elements.sums(found.slip_rate * mode.sigma)
-        returning = _greatest(backwards, released & (backwards > jnp.where(search.clearly, 0, 1e-6 * search.free_rate)))
+        returning = _greatest(backwards, released & ~idle & (backwards > jnp.where(search.clearly, 0, 1e-6 * search.free_rate)))
         torn = _torn(elements, t, q, v, found, search.free_rate, over > -jnp.inf) & ~jnp.any(beyond)
         along = (over > -1e-6 * jnp.abs(found.bound)) & elements.are_shared  # those of a share break away together
-        leaving = jnp.where((stage == FIRST) & jnp.any(breaking), breaking | along, beyond | torn)
+        leaving = jnp.where((stage == FIRST) & jnp.any(breaking), breaking | along, beyond | torn) | (idle & (over > -jnp.inf))
         returning = returning & ~jnp.any(leaving)
         way = jnp.where((beyond | breaking | along)[of], -found.force, found.slip_rate)
         size = elements.norms(way)[of]
-        sigma = jnp.where(leaving[of], way / jnp.where(size > 0, size, 1), jnp.where(returning[of], 0, mode.sigma))
+        away = jnp.where(idle[of], 1, way / jnp.where(size > 0, size, 1))
+        sigma = jnp.where(leaving[of], away, jnp.where(returning[of], 0, mode.sigma))
         clearly = (search.clearly | (leaving & (over > 1e-6 * jnp.abs(found.bound)))) & ~returning
         in_current_mode = ~jnp.any(leaving | returning)
         agrees = in_current_mode & jnp.all(jnp.isfinite(found.force))
 
         all_slip = (stage == LOOSE) & ~jnp.any(at_rest)  # nothing to choose
         within = (stage == FIRST) | (stage == NEXT) | all_slip
-        last = all_slip | ~jnp.any(at_rest & ~sticking(elements, sigma))  # nothing that others may hold
+        last = all_slip | ~jnp.any(at_rest & ~idle & ~sticking(elements, sigma))  # nothing that others may hold
+        contacts, changes = search.contacts.next(flat, t, q, v, found.qddot, found.multipliers, agrees)
+        following = jnp.where(within, jnp.where(in_current_mode, jnp.where(last, DONE, HOLD), NEXT), jnp.where(stage == LOOSE, FIRST, DONE))
+        anew = within & changes
+        contacts = jax.tree.map(lambda new, old: jnp.where(anew, new, old), contacts, search.contacts)
         return _Search(
-            jnp.where(within, jnp.where(in_current_mode, jnp.where(last, DONE, HOLD), NEXT), jnp.where(stage == LOOSE, FIRST, DONE)),
+            jnp.where(anew, LOOSE, following),
+            contacts,
             Mode(
-                jnp.where(within, sigma, mode.sigma),
-                jnp.where(stage == HOLD, released & (rate <= 1e-6 * search.free_rate), mode.held),
-                jnp.where(within, agrees, mode.consistent),
+                jnp.where(anew, resting, jnp.where(within, sigma, mode.sigma)),
+                jnp.where(stage == HOLD, released & ~idle & (rate <= 1e-6 * search.free_rate), mode.held),
+                jnp.where(within, agrees & ~anew, mode.consistent),
                 jnp.where(within, found.bound, mode.bound),
             ),
-            jnp.where(within, clearly, search.clearly),
+            jnp.where(within, clearly & ~anew, search.clearly),
             jnp.where(stage == LOOSE, rate, search.free_rate),
         )
 
     nothing = jnp.zeros(elements.size, v.dtype)
     resting = jax.lax.stop_gradient(jnp.where(at_rest[of], 0, sigma))
-    start = _Search(jnp.array(LOOSE), Mode(resting, no, jnp.array(False), nothing), no, nothing)
+    start = _Search(jnp.array(LOOSE), contacts, Mode(resting, no, jnp.array(False), nothing), no, nothing)
     # Nothing here is differentiated, so that the loop may end by itself: a motion behind many jumps of an input takes a tenth less.
-    going_on = lambda carry: (carry[0] < 4 * elements.size + 6) & (carry[1].stage != DONE)
-    return jax.lax.while_loop(going_on, lambda carry: (carry[0] + 1, turn(carry[1])), (0, start))[1].mode
+    most = (4 * elements.size + 6) * (1 + 4 * len(jax.tree.leaves(contacts)) * flat.rows)
+    going_on = lambda carry: (carry[0] < most) & (carry[1].stage != DONE)
+    done = jax.lax.while_loop(going_on, lambda carry: (carry[0] + 1, turn(carry[1])), (0, start))[1]
+    return done.mode, done.contacts
 
 
 def _greatest(x, among):
@@ -176,13 +216,13 @@ def _torn(elements, t, q, v, found, free_rate, stuck):
     return _greatest(rate, stuck & (rate > 1e-6 * most) & (rate > 1e-9 * free_rate) & (most > 0))
 
 
-def first_mode(flat: Flat, elements: FrictionElements, t, q, v) -> Mode:
-    """The initial mode: what moves slips along its motion; what rests sticks or breaks away."""
+def first_mode(flat: Flat, elements: FrictionElements, t, q, v, contacts: Any = NoContact()) -> tuple[Mode, Any]:
+    """The initial mode: what moves slips along its motion; what rests sticks or breaks away. And the contacts chosen with it."""
     slip = jax.lax.stop_gradient(elements.slip(t, q, v))
     size = elements.norms(slip)
     at_rest = size <= slip_of(elements, t, q, v, 1e2 * jnp.finfo(v.dtype).eps * jnp.abs(v))
     sigma = slip / jnp.where(at_rest, 1, size)[elements.element_of_row]
-    return select_mode(flat, elements, t, q, v, sigma, at_rest, jnp.zeros_like(at_rest))
+    return select_mode(flat, elements, t, q, v, sigma, at_rest, jnp.zeros_like(at_rest), contacts)
 
 
 def slip_of(elements: FrictionElements, t, q, v, errors: Float[Array, " n"]) -> Float[Array, " e"]:

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
-from jaxtyping import Array, Float, PyTree
+from jaxtyping import Array, Bool, Float, PyTree
 
 from .injection import asks_for, call, described, needs
 from .signal import at_time
@@ -39,6 +39,7 @@ class Flat(NamedTuple):
     terms: tuple[str, ...]
     rows: int  # of G, those of the user's constraints
     rows_of_bilateral: int  # of those, the first, of `holonomic` alone
+    closed: Bool[Array, " c"] | None = None  # those of the contacts, where it was chosen
     held: dict[str, np.ndarray] = {}  # noqa: RUF012 - rows of G beyond those, with which a dissipation term sticks
 
 

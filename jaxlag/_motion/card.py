@@ -26,6 +26,10 @@ def card(motion: Any) -> str:
     rows.append(("steps", f"{steps.max()}, {rejected.max()} of them rejected{most}"))
     if motion.multipliers:
         rows.append(("start moved by", f"{np.max(motion.stats['start_moved']):.2g}"))
+    for name, contact in motion.contacts.items():
+        impacts, closed = np.asarray(contact.impacts)[..., -1], np.asarray(contact.closed)
+        times = int(np.nanmax(impacts, initial=0))
+        rows.append(("contact", f"{name!r}: {times} impact{'s' * (times != 1)}{most}, closed at {closed.sum()} of {closed.size} samples"))
     if motion.friction:
         transitions, stuck = (np.nan_to_num(motion.stats[name]) for name in ("transitions", "time_stuck"))  # NaN where not reached
         rows.append(("friction", f"{int(transitions.max())} transitions, stuck for {stuck.max():.4g}{most}"))

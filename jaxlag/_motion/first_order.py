@@ -2,15 +2,15 @@
 
 import dataclasses
 import functools
-from collections.abc import Sequence
-from typing import NamedTuple
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, PyTree
 
-from .._mechanics.contact import contact_rows, gap_scales, in_contact
+from .._mechanics.contact import contact_rows, free, gap_scales, idle, in_contact
 from .._mechanics.friction_elements import FrictionElements
 from .._mechanics.power import energy_exchange, listed_powers
 from .._mechanics.projection import Baumgarte, NoStabilisation, Projection
@@ -87,7 +87,7 @@ class EquationsOfMotion:
 
     def mode(self, t, parts: Parts, args: Arguments) -> tuple[Flat, Flat, FrictionElements | None]:
         """The system, the system in its mode σ, and its elements of dry friction where there are any."""
-        flat, treatment = in_contact(self.flat_at(args.params, self.states_of(t, parts)), parts.closed > 0), self.formulation.friction
+        flat, treatment = in_contact(self.flat_at(args.params, self.states_of(t, parts)), parts.closed > 0.5), self.formulation.friction
         q, v, sigma = parts.q, parts.v, parts.sigma
         if not self.rows:
             return flat, treatment.smoothed(flat, t, q, v), None
@@ -168,6 +168,10 @@ class EquationsOfMotion:
         feedback = self.formulation.stabilisation.feedback()
         return scalarised(lambda t, q, v: constrained_acceleration(mode, t, q, v, feedback))(t, q, v)
 
+    def where_closed(self, parts: Parts, function: Callable, otherwise: Callable) -> Any:
+        """`function()`, or `otherwise()` where there are contacts, but no friction, and all of them are open: at less cost."""
+        return jax.lax.cond(jnp.any(parts.closed > 0.5), function, otherwise) if self.contacts and not self.rows else function()
+
     def rates(self, t, y, args):
         """ẏ."""
         return _rates(self, t, y, args)
@@ -200,13 +204,13 @@ class EquationsOfMotion:
             friction_states = friction_by_term(elements, sigma, held > 0, t, q, v, found)
             stuck, load = sticking(elements, sigma), elements.norms(found.force)
             scale = jnp.where(stuck, jnp.abs(found.bound) + load, slip_of(elements, t, q, v, NEGLIGIBLE * (rtol * jnp.abs(v) + atol)))
-            excess = jnp.where(held > 0, 0, -found.margin)
+            excess = jnp.where((held > 0) | idle(flat, elements, sigma, found.bound), 0, -found.margin)
             violation = Violation(jnp.concatenate([excess, -found.bound]), jnp.concatenate([scale, jnp.abs(found.bound)]))
             counts = {"transitions": parts.transitions[0], "time_stuck": parts.time_stuck}
         named = dict(zip(self.works, works, strict=True)) if self.works else None
         if self.contacts:
             violation = violation.beside(*_contact_violation(flat, t, parts, multipliers, rtol, atol))
-        of_contact = parts.closed > 0, parts.impacts, parts.changed, parts.impulse
+        of_contact = parts.closed > 0.5, parts.impacts, parts.changed, parts.impulse
         contacts = {name: of_one for name, *of_one in zip(flat.contacts, *of_contact, strict=True)}
         unraveled = flat.unravel(q), flat.unravel(v), flat.unravel(qddot), flat.unravel_multipliers(multipliers)
         return Sample(*unraveled, dict(states), named, friction_states, contacts, counts), Evidence(sound, jax.lax.stop_gradient(violation))
@@ -225,7 +229,8 @@ def _rates(equations: EquationsOfMotion, t, y, args):
     parts = equations.parts(y)
     q, v, works, sigma, held = parts.q, parts.v, parts.works, parts.sigma, parts.held
     flat, mode, elements = equations.mode(t, parts, args)
-    qddot, rates = equations.acceleration(mode, t, q, v).x, ravelled(flat.state_rates(t, q, v), y.dtype)
+    qddot = equations.where_closed(parts, lambda: equations.acceleration(mode, t, q, v).x, lambda: equations.acceleration(free(mode), t, q, v).x)
+    rates = ravelled(flat.state_rates(t, q, v), y.dtype)
     powers = listed_powers(mode, t, q, v) if equations.works else works
     stuck = parts.time_stuck if elements is None else jnp.maximum(sticking(elements, sigma).astype(y.dtype), held)
     resting = Parts(*(jnp.zeros_like(part) for part in parts))
@@ -243,7 +248,7 @@ def _updated(equations: EquationsOfMotion, t, y, args, due):
 
 def _contact_violation(flat, t, parts, multipliers, rtol, atol):
     """Of each contact, how far it is inside of its obstacle or pulls."""
-    closed, forces = parts.closed > 0, contact_rows(flat, multipliers)
+    closed, forces = parts.closed > 0.5, contact_rows(flat, multipliers)
     allowed = gap_scales(flat, t, parts.q, parts.v, NEGLIGIBLE * (rtol * jnp.abs(parts.q) + atol), parts.v).gap
     scale = jnp.where(closed, jnp.max(jnp.abs(multipliers), initial=0.0), allowed)
     return jnp.where(closed, -forces, -flat.gaps(t, parts.q)), scale
@@ -253,10 +258,11 @@ def _contact_violation(flat, t, parts, multipliers, rtol, atol):
 def _projected(equations: EquationsOfMotion, t, y, args):
     parts = equations.parts(y)
     q, v, works, sigma = parts.q, parts.v, parts.works, parts.sigma
-    _, mode, elements = equations.mode(t, parts, args)
+    flat, mode, elements = equations.mode(t, parts, args)
     assert equations.projection is not None  # asked where there is something to keep
     projection = equations.projection
-    on_q, on_v = projection.project(mode, t, q, v)
+    of_none = (lambda: (q, v)) if flat.rows == equations.contacts else lambda: projection.project(free(mode), t, q, v)
+    on_q, on_v = equations.where_closed(parts, lambda: projection.project(mode, t, q, v), of_none)
     if equations.works:
         lift = energy_exchange(mode, t, on_q, on_v)[0] - energy_exchange(mode, t, q, v)[0]
         works = works.at[equations.works.index(PROJECTION)].add(lift)

@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, PyTree
 
+from .._mechanics.contact import outside
 from .._mechanics.projection import Baumgarte, NoStabilisation, Projection, nearest_state
 from .._mechanics.stick_slip import Regularised, StickSlip
 from .._model.flat import StatesAt
@@ -101,7 +102,7 @@ def initialised(equations: EquationsOfMotion, at: StatesAt, params) -> Initial:
     """The start, put on the constraints."""
     _, t0, q, v = at
     flat = equations.flat_at(params, at)
-    nearest = nearest_state(flat._replace(holonomic=flat.bilateral), t0, q, v)
+    nearest = nearest_state(flat._replace(holonomic=flat.bilateral), t0, outside(flat, t0, q, v), v)
     start = started(equations, at._replace(q=nearest.q, v=nearest.v), params)
     moved = jax.lax.stop_gradient(jnp.max(jnp.abs(jnp.concatenate([nearest.q - q, nearest.v - v]))))
     conditions = (

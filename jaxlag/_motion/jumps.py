@@ -37,6 +37,6 @@ def after_jump(equations: EquationsOfMotion, t, y0, y, before: Arguments, args: 
     size = elements.norms(slip)
     direction = slip / jnp.where(size > 0, size, 1)[elements.element_of_row]
     at_rest = size <= slip_of(elements, t, q, v, args.scales.error(v))
-    mode = select_mode(flat, elements, t, q, v, direction, at_rest, jnp.zeros_like(at_rest))
+    mode, _ = select_mode(flat, elements, t, q, v, direction, at_rest, jnp.zeros_like(at_rest))
     y = in_other_mode(elements, moved._replace(sigma=parts.sigma), mode).y
     return equations.projected(t, y, args), mode.consistent

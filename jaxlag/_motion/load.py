@@ -1,5 +1,6 @@
 """Motions and fits from files."""
 
+import dataclasses
 import json
 import zipfile
 from pathlib import Path
@@ -13,7 +14,7 @@ from .._mechanics.stick_slip import Regularised, StickSlip
 from .export import FORMAT, filled_outline
 from .provenance import Recorded
 from .results import result_of
-from .trajectory import FrictionState, Trajectory
+from .trajectory import ContactState, FrictionState, Trajectory
 
 
 def load(file: str | Path) -> Any:
@@ -74,8 +75,9 @@ def _motion(about, arrays):
     rate = lambda name: jax.tree.map(lambda leaf: jnp.asarray(arrays[name + leaf.removeprefix("q")]), like)
     kinds = {kind.__name__: kind for kind in (StickSlip, Regularised)}
     (friction,) = (kinds[name](**fields) for name, fields in about["friction"].items())
-    energy, friction_states = part("energy"), part("friction")
-    terms = list(dict.fromkeys(name.rpartition(".")[0] for name in friction_states))
+    energy, friction_states, of_contacts = part("energy"), part("friction"), part("contacts")
+    terms, contacts = (list(dict.fromkeys(name.rpartition(".")[0] for name in of)) for of in (friction_states, of_contacts))
+    fields = [field.name for field in dataclasses.fields(ContactState)]
     return Trajectory(
         ts=jnp.asarray(arrays["t"]),
         q=tree("q"),
@@ -87,5 +89,6 @@ def _motion(about, arrays):
         stats=part("stats"),
         works=part("works") if about["audit"] else None,
         friction={term: FrictionState(friction_states[f"{term}.force"], friction_states[f"{term}.sticking"]) for term in terms},
+        contacts={name: ContactState(*(of_contacts[f"{name}.{field}"] for field in fields)) for name in contacts},
         provenance=Recorded((energy["h"], energy["turned"]), part("slip"), tree("params"), tuple(about["one_sided"]), friction),
     )

@@ -8,9 +8,12 @@ from jaxtyping import Array, Bool, Float
 
 from .._mechanics.contact import (
     ROUNDING,
+    Chosen,
+    Contacts,
     contact_rows,
     gap_rates,
     gap_scales,
+    idle,
     on_contact,
     roundings,
     select_closed,
@@ -53,7 +56,7 @@ def _margins(equations: EquationsOfMotion, t, parts: Parts, args):
     q, v, sigma, held = parts.q, parts.v, parts.sigma, parts.held
     flat, _, elements = equations.mode(t, parts, args)
     if elements is None:
-        closed = parts.closed > 0
+        closed = parts.closed > 0.5
         forces = jax.lax.cond(
             jnp.any(closed),
             lambda: contact_rows(flat, equations.acceleration(flat, t, q, v).multipliers),
@@ -61,8 +64,8 @@ def _margins(equations: EquationsOfMotion, t, parts: Parts, args):
         )
         return jnp.concatenate([_contact_margins(flat, t, q, closed, forces), jnp.ones_like(parts.closed)])
     found = friction(flat, elements, sigma, t, q, v)
-    of_contacts = _contact_margins(flat, t, q, parts.closed > 0, contact_rows(flat, found.multipliers))
-    of_elements = jnp.where(held > 0, 1, found.margin)
+    of_contacts = _contact_margins(flat, t, q, parts.closed > 0.5, contact_rows(flat, found.multipliers))
+    of_elements = jnp.where((held > 0) | idle(flat, elements, sigma, found.bound), 1, found.margin)
     return jnp.concatenate([of_elements, of_contacts, found.bound, jnp.ones_like(parts.closed)])
 
 
@@ -79,7 +82,7 @@ def exact_slopes(equations: EquationsOfMotion, t, y, args: Arguments, slopes: Fl
         return slopes
     parts = equations.parts(y)
     flat, _, _ = equations.mode(t, parts, args)
-    rates = jnp.where(parts.closed > 0, slopes[equations.elements :], gap_rates(flat, t, parts.q, parts.v))
+    rates = jnp.where(parts.closed > 0.5, slopes[equations.elements :], gap_rates(flat, t, parts.q, parts.v))
     return jax.lax.stop_gradient(jnp.concatenate([slopes[: equations.elements], rates]))
 
 
@@ -93,7 +96,7 @@ def changed(equations: EquationsOfMotion, t, y, args: Arguments, ended: Bool[Arr
     if not equations.contacts:
         assert elements is not None
         stuck, slow = sticking(elements, parts.sigma) | (parts.held > 0), _slow(elements, t, parts, args.scales.error(parts.v))
-        mode = select_mode(flat, elements, t, parts.q, parts.v, parts.sigma, stuck | of_friction | slow, of_friction & stuck)
+        mode, _ = select_mode(flat, elements, t, parts.q, parts.v, parts.sigma, stuck | of_friction | slow, of_friction & stuck)
         after = equations.projected(t, in_other_mode(elements, parts, mode).y, args)
         return Change(after, mode.consistent, jnp.array(True), jnp.all(~of_friction | stuck | slow))
     errors = args.scales.error(parts.q), args.scales.error(parts.v)
@@ -111,7 +114,7 @@ def behind_contact(equations: EquationsOfMotion, t, parts: Parts, args: Argument
     `anew`: whether what slides and what sticks follows from the motion alone, as it does behind an impact.
     """
     flat, _, elements = equations.mode(t, parts, args)
-    closed, q, before = parts.closed > 0, parts.q, parts.v
+    closed, q, before = parts.closed > 0.5, parts.q, parts.v
     scales = gap_scales(flat, t, q, before, errors[0], roundings(before))
     near = closed | of_contact | (jax.lax.stop_gradient(flat.gaps(t, q)) <= scales.gap)
     opening = of_contact & closed
@@ -132,18 +135,19 @@ def behind_contact(equations: EquationsOfMotion, t, parts: Parts, args: Argument
     parts = parts._replace(q=q, v=found.v, **_counted(t, parts, hits, opening, found, jnp.where(converged, remaining, 0)))
     resting = near & ~opening & (jnp.abs(gap_rates(flat, t, q, found.v)) <= scales.rate)
     if elements is None:
-        chosen = select_closed(flat, None, t, q, found.v, resting, lambda flat: None)
+        chosen = select_closed(flat, t, q, found.v, resting)
         slow, stuck = jnp.ones_like(of_friction), jnp.ones_like(of_friction)
     else:
         stuck, slow = sticking(elements, parts.sigma) | (parts.held > 0), _slow(elements, t, parts, errors[1])
         slip = elements.slip(t, q, found.v)
         size = elements.norms(slip)[elements.element_of_row]
-        anew = is_impact | anew
+        anew = is_impact | anew | jnp.any(of_contact & ~closed)
         at_rest = jnp.where(anew, slow, stuck | of_friction | slow)
         along = jnp.where(anew, slip / jnp.where(size > 0, size, 1), parts.sigma)
         given = along, at_rest, of_friction & stuck & ~anew
-        chosen = select_closed(flat, elements, t, q, found.v, resting, lambda flat: select_mode(flat, elements, t, q, found.v, *given))
-        parts = in_other_mode(elements, parts, chosen.mode)
+        mode, contacts = select_mode(flat, elements, t, q, found.v, *given, Contacts.of(flat, t, q, found.v, resting))
+        chosen = Chosen(contacts.closed, mode, mode.consistent)
+        parts = in_other_mode(elements, parts, mode)
     changes = (chosen.closed != closed) & ~hits
     parts = parts._replace(closed=chosen.closed.astype(q.dtype), changed=jnp.where(changes, t, parts.changed))
     at_rest = jnp.all(~of_friction | stuck | slow) | anew
@@ -194,6 +198,6 @@ def started(equations: EquationsOfMotion, at: StatesAt, params) -> Start:
         return Start(change.y, change.consistent, yes, is_outside, change.dissipates)
     if elements is None:
         return Start(parts.y, yes, yes, yes, yes)
-    mode = first_mode(flat, elements, t, parts.q, parts.v)
+    mode, _ = first_mode(flat, elements, t, parts.q, parts.v)
     parts = parts._replace(sigma=mode.sigma, held=mode.held.astype(parts.q.dtype))
     return Start(equations.projected(t, parts.y, args), mode.consistent, ~jnp.any(mode.bound < 0), yes, yes)

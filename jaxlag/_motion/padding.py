@@ -47,9 +47,9 @@ def _padded(rows: Any) -> np.ndarray:
 def without_padding(t: Trajectory, length: int) -> Trajectory:
     """The motion without the samples that were added."""
     counts = {name: count for name, count in t.stats.items() if name in COUNTED}
-    parts = t.ts, t.q, t.qdot, t.qddot, t.multipliers, t.works, t.friction, counts, t.states
-    *state, works, friction, counts, states = _first(parts, length)
-    return Trajectory(*state, t.result, t.stats | counts, works, friction, t.provenance, states)
+    parts = t.ts, t.q, t.qdot, t.qddot, t.multipliers, t.works, t.friction, counts, t.states, t.contacts
+    *state, works, friction, counts, states, contacts = _first(parts, length)
+    return Trajectory(*state, t.result, t.stats | counts, works, friction, t.provenance, states, contacts)
 
 
 @jitted

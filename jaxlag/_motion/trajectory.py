@@ -209,10 +209,10 @@ class Trajectory(eqx.Module):
 
     def to_dict(self) -> dict[str, np.ndarray]:
         """All samples as NumPy arrays by flat names: "t", "q.x", "qdot.x", "qddot.x", "multipliers.rod", "states.z",
-        "friction.brake.force", "friction.brake.sticking", "works.brake"; "q" where q is one array.
+        "friction.brake.force", "friction.brake.sticking", "contacts.floor.closed", "works.brake"; "q" where q is one array.
         """
         states = dict(q=self.q, qdot=self.qdot, qddot=self.qddot, multipliers=self.multipliers, states=self.states)
-        return arrays_of(t=self.ts, **states, friction=self.friction, works=self.works)
+        return arrays_of(t=self.ts, **states, friction=self.friction, contacts=self.contacts, works=self.works)
 
     def to_dataframe(self, frame: Callable | None = None) -> Any:
         """A table with a row for each sample and the columns of `to_dict`, "r[0]", "r[1]", … of an array; `jl.Experiment.from_dataframe`
