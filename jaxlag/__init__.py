@@ -10,7 +10,7 @@ from ._paper.linearised_result import LinearisedEquations as LinearisedEquations
 from ._paper.result import Equations as Equations
 from ._paper.to_sympy import to_sympy as to_sympy
 from ._mechanics.examine import Examination as Examination, examine as examine
-from ._mechanics.stick_slip import Regularised as Regularised, StickSlip as StickSlip
+from ._mechanics.friction_treatment import Regularised as Regularised, StickSlip as StickSlip
 from ._fit.assess import (
     Comparison as Comparison,
     Information as Information,

@@ -13,6 +13,7 @@ from jaxtyping import PyTree
 from .._model.deprecation import renamed
 from .._model.numbers import count
 from .._model.system import System
+from .._model.validation import without_contacts
 from .._motion.progress import Steps, compiling
 from .experiment import Experiment, measured
 from .lead_in import Regress, inside_bounds, led_in
@@ -115,6 +116,8 @@ def fit(
     problem, experiments = _checked_problem(system, experiments, params, free, bounds, priors, loss, method is None, numerics)
     steps = max_steps or (100 if method is None else 1000)
     line = Steps(steps) if progress else None
+    if segments > 1:
+        without_contacts(system, "`fit` with `segments`")
     of_segments = cut(problem, recordings, segments) if segments > 1 else Segments(problem, tuple(range(len(recordings))), ())
     with compiling("the fit", progress):
         try:

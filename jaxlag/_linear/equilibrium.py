@@ -14,7 +14,7 @@ from .._model.numbers import number
 from .._model.paths import entry_names, is_within
 from .._model.state_values import given_states
 from .._model.system import System
-from .._model.validation import coordinates, parameters, state
+from .._model.validation import coordinates, parameters, state, without_contacts
 from .._program.jit import is_concrete, seen
 from .not_differentiated import without_derivative
 from .rest import Search, steady_state
@@ -173,6 +173,7 @@ def _entries(q, names, label):
 
 def _found(system: System, q: PyTree, qdot: PyTree, params: PyTree, t: Any, states: PyTree, search: Search) -> Equilibrium:
     """The result of a search, and of one in which friction holds, where there is no other."""
+    without_contacts(system, "`equilibrium` and `steady`")
     if search.stable and system.force:
         terms = ", ".join(repr(name) for name, _ in system.force)
         raise ValueError(f"`stable` must be False where forces are not from L, but there are {terms}. Write their potential into L.")

@@ -15,7 +15,7 @@ from .._model.numbers import number
 from .._model.paths import entry_names, is_within
 from .._model.state_values import Layout, given_states, of_first_order, sampled, start_values
 from .._model.system import System
-from .._model.validation import coordinates, parameters, state
+from .._model.validation import coordinates, parameters, state, without_contacts
 from .._motion.trajectory import Trajectory
 from .._program.jit import is_concrete, seen
 from .dynamics import dynamics_of
@@ -88,6 +88,7 @@ def linearise(
     if hasattr(q, "qdot"):  # an equilibrium, an instant, a trajectory
         t, states = getattr(q, "ts" if along else "t", t), q.states if states is None else states
         q, qdot = q.q, q.qdot
+    without_contacts(system, "`linearise`")
     q = coordinates(q, "q")
     q, qdot = state(q, jax.tree.map(jnp.zeros_like, q) if qdot is None else qdot)
     dtype = jax.tree.leaves(q)[0].dtype

@@ -15,7 +15,7 @@ from .._model.numbers import number, numbers
 from .._model.paths import leaf_names
 from .._model.state_values import given_states, sampled
 from .._model.system import System
-from .._model.validation import coordinates, parameters, state
+from .._model.validation import coordinates, parameters, state, without_contacts
 from .._program.jit import compiled, is_concrete, seen
 from .branches import Spectrum, Transition, finer, followed
 from .crossing import Crossing, located, moving
@@ -112,6 +112,7 @@ class _Family:
     """A steady state and its linear system, by the value of a parameter."""
 
     def __init__(self, system: System, q: Any, qdot: Any, params: PyTree, over: str, t: Any, states: PyTree, first: float):
+        without_contacts(system, "`root_locus`")
         self.system, self.q, self.qdot, self.over = system, q, qdot, over
         like = q if not callable(q) else call(q, "`q`", params, t=0.0)
         like = coordinates(like, "q")

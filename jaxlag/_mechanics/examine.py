@@ -14,7 +14,7 @@ from .._model.state_values import given_states
 from .._model.system import System
 from .._model.validation import at_state, checked, coordinates, state
 from .._program.scalarise import scalarised
-from .contact import in_current_mode
+from .contact import in_contact, in_current_mode
 from .friction_elements import unread_friction
 from .lagrange import applied_force, constraint_rows, inertia, position_residual, velocity_residual
 from .saddle_point import augmented, constrained_acceleration
@@ -31,7 +31,7 @@ class Examination:
     - `smallest_inertia`: the least eigenvalue of M on the motions that the constraints allow.
     - `dissipated`: the least of q̇·∂D/∂q̇ near the state, a power, by term.
     - `time_constants`: 1/|eigenvalue| of the linearised motion, the fastest and the slowest, with the states beside q held.
-    - `findings`: sentences with the cure.
+    - `findings`: sentences with the cure. `contacts`: which contacts are closed, by name.
     """
 
     coordinates: tuple[str, ...]
@@ -46,12 +46,14 @@ class Examination:
     time_constants: tuple[float, float]
     findings: tuple[str, ...]
     states: tuple[str, ...] = ()
+    contacts: dict[str, bool] = dataclasses.field(default_factory=dict)
 
     def __repr__(self) -> str:
         fastest, slowest = self.time_constants
         rows = [
             ("coordinates", ", ".join(self.coordinates)),
             *([("states", ", ".join(self.states))] if self.states else []),
+            *((f"contact {name!r}", "closed" if closed else "open") for name, closed in self.contacts.items()),
             ("degrees of freedom", str(self.degrees_of_freedom)),
             ("constraint rows", f"{self.rows}, of rank {self.rank}"),
             ("smallest inertia", f"{self.smallest_inertia:.3g}"),
@@ -95,14 +97,15 @@ def examine(system: System, q: PyTree, qdot: PyTree, params: PyTree = None, *, t
     rank = G.shape[1] - N.shape[1]
     inertia_on_N = np.linalg.eigvalsh(N.T @ M @ N) if N.shape[1] else np.zeros(0)
     smallest = float(inertia_on_N[0]) if inertia_on_N.size else float("inf")
-    redundant = _redundant_rows(G, rows, eps)
+    contacts = {name: bool(closed) for (name, _), closed in zip(system.unilateral, found["closed"], strict=True)}
+    redundant = _redundant_rows(G, {name: of for name, of in rows.items() if contacts.get(name, True)}, eps)
     largest = lambda named: {name: float(np.max(np.abs(value), initial=0.0)) for name, value in named.items()}
     constants = _time_constants(found, N) if np.all(np.isfinite(found["A"])) else (float("nan"), float("nan"))
     numbers = {
         "coordinates": leaf_names(q),
         "degrees_of_freedom": N.shape[1],
         "rank": rank,
-        "rows": G.shape[0],
+        "rows": G.shape[0] - sum(not closed for closed in contacts.values()),
         "redundant": redundant,
         "off_position": largest(found["position"]),
         "off_velocity": largest(found["velocity"]),
@@ -121,7 +124,7 @@ def examine(system: System, q: PyTree, qdot: PyTree, params: PyTree = None, *, t
         *_pulling(system, found["multipliers"]),
         *_unread_friction(system, q, qdot, params, t, states),
     ]
-    return Examination(**numbers, findings=tuple(findings), states=tuple(name for name, _ in system.states))
+    return Examination(**numbers, findings=tuple(findings), states=tuple(name for name, _ in system.states), contacts=contacts)
 
 
 def _unread_friction(system, q, qdot, params, t, states):
@@ -206,8 +209,10 @@ def _findings(numbers, defect, dtype):
 
 def _measure(flat: Flat, t, q, v):
     """Everything that needs derivatives, in one compiled program."""
-    _, G, _ = constraint_rows(flat, t, q, v)
     mode = in_current_mode(flat, t, q, v)
+    closed = mode.closed if flat.contacts else jnp.zeros(0, bool)
+    flat = in_contact(flat, closed)
+    _, G, _ = constraint_rows(flat, t, q, v)
     beside = jnp.linspace(-0.1, 0.1, q.size, dtype=q.dtype)
     around = jnp.stack([jnp.zeros_like(beside), beside, -beside[::-1]])
     multipliers, defects = jax.vmap(lambda near: _defects(mode, t, q + near, v + near))(around)
@@ -221,6 +226,7 @@ def _measure(flat: Flat, t, q, v):
     psi, _, _ = constraint_rows(flat, t, q, v)
     return {
         "M": inertia(flat, t, q, v)[0].as_matrix(),
+        "closed": closed,
         "G": G,
         "A": jax.jacfwd(rates)(jnp.concatenate([q, v])),
         "not_affine_in": not_affine_in(flat, t, q, v),

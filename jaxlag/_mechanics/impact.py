@@ -19,14 +19,14 @@ from .contact import Contacts, contact_rows, gap_rates, in_contact, select_close
 from .friction_elements import FrictionElements
 from .lagrange import constraint_rows, inertia
 from .saddle_point import constrained_acceleration
-from .stick_slip import friction, friction_by_term, select_mode
+from .stick_slip import bounds, friction, friction_by_term, select_mode
 
 RISE = 1e-9  # of the energy exchanged, by which an impact may raise it by rounding
 
 
 class Impact(NamedTuple):
     """q̇ after an impact; the impulses of the contacts; the work of each constraint and dissipation term; whether the laws of contact and
-    friction have a solution; whether it takes energy and gives none.
+    friction have a solution; whether it takes energy and gives none; whether friction is homogeneous in the impulses it follows.
     """
 
     v: Float[Array, " n"]
@@ -34,6 +34,7 @@ class Impact(NamedTuple):
     works: dict[str, Float[Array, ""]]
     consistent: Bool[Array, ""]
     dissipates: Bool[Array, ""]
+    impulsive: Bool[Array, ""]
 
 
 def impact(flat: Flat, elements: FrictionElements | None, t, q, v, near: Bool[Array, " c"], e: Float[Array, " c"]) -> Impact:
@@ -41,10 +42,10 @@ def impact(flat: Flat, elements: FrictionElements | None, t, q, v, near: Bool[Ar
     approach = gap_rates(flat, t, q, v)
     fast, of_impact = _in_fast_time(flat, elements, t, q, v, e * jnp.minimum(approach, 0))
     zero, origin = jnp.zeros_like(t), jnp.zeros_like(q)
-    if of_impact is None:
+    if elements is None or of_impact is None:
         chosen = select_closed(fast, zero, origin, origin, near)
         after, multipliers, _ = constrained_acceleration(in_contact(fast, chosen.closed), zero, origin, origin)
-        lost, rubbed, consistent = jnp.zeros((), v.dtype), {}, chosen.consistent
+        lost, rubbed, consistent, impulsive = jnp.zeros((), v.dtype), {}, chosen.consistent, jnp.array(True)
     else:
         everywhere, still = jnp.ones(of_impact.size, bool), jnp.zeros(of_impact.element_of_row.size, v.dtype)
         contacts = Contacts.of(fast, zero, origin, origin, near)
@@ -54,12 +55,21 @@ def impact(flat: Flat, elements: FrictionElements | None, t, q, v, near: Bool[Ar
         after, multipliers = found.qddot, found.multipliers
         lost = found.force @ (elements.slip(t, q, v) + elements.slip(t, q, after))
         rubbed = friction_by_term(of_impact, sigma, held, zero, origin, origin, found)
+        twice = bounds(of_impact, sigma, zero, origin, origin, 2 * multipliers)
+        impulsive = jnp.all(jnp.abs(twice - 2 * found.bound) <= RISE * (jnp.abs(twice) + jnp.abs(found.bound)))
     impulses = contact_rows(flat, multipliers)
     departure = gap_rates(flat, t, q, after)
     given = impulses @ (approach + departure) + lost
     exchanged = jnp.abs(impulses) @ (jnp.abs(approach) + jnp.abs(departure))
     dissipates = jax.lax.stop_gradient(given <= RISE * exchanged)
-    return Impact(after, impulses, _works(flat, elements, t, q, (v + after) / 2, multipliers, rubbed), consistent, dissipates)
+    return Impact(
+        after,
+        impulses,
+        _works(flat, elements, t, q, (v + after) / 2, multipliers, rubbed),
+        consistent,
+        dissipates,
+        jax.lax.stop_gradient(impulsive),
+    )
 
 
 def _works(flat, elements, t, q, mean, multipliers, rubbed):
@@ -76,7 +86,7 @@ def no_impact(flat: Flat, elements: FrictionElements | None, v) -> Impact:
     """That of nothing: q̇ stays as it is."""
     yes, none = jnp.array(True), jnp.zeros((), v.dtype)
     terms = {} if elements is None else elements.rows_of_term
-    return Impact(v, jnp.zeros(len(flat.contacts), v.dtype), {name: none for name in (*rows_by_name(flat), *terms)}, yes, yes)
+    return Impact(v, jnp.zeros(len(flat.contacts), v.dtype), {name: none for name in (*rows_by_name(flat), *terms)}, yes, yes, yes)
 
 
 def _in_fast_time(flat, elements, t, q, v, returned):

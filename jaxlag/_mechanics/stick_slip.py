@@ -7,7 +7,6 @@ In each mode the system is an ordinary one, so the rest of the package need not 
 Source: Pfeiffer & Glocker, Multibody Dynamics with Unilateral Contacts, chapters 5 and 6.
 """
 
-import dataclasses
 from typing import Any, NamedTuple
 
 import jax
@@ -16,9 +15,8 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from .._model.flat import Flat
-from .._model.numbers import count, number
 from .._program.scalarise import scalarised
-from .friction_elements import FrictionElements, find_elements
+from .friction_elements import FrictionElements
 from .load_sharing import shared
 from .saddle_point import constrained_acceleration
 
@@ -73,9 +71,8 @@ def _friction(flat, elements, sigma, t, q, v, feedback):
     stuck, of = sticking(elements, sigma), elements.element_of_row
     qddot, multipliers, _ = constrained_acceleration(in_mode(flat, elements, sigma), t, q, v, feedback)
     slip, slip_rate = jax.jvp(elements.slip, (t, q, v), (jnp.ones_like(t), v, qddot))
-    total = lambda u: sum(D(t, q, v, multipliers, u) for D in elements.potentials.values())
-    extent, pull = jax.vjp(lambda slip: _extent(elements, sigma, slip), slip)
-    bound = jax.grad(total)(extent)
+    pull = jax.vjp(lambda slip: _extent(elements, sigma, slip), slip)[1]
+    bound = bounds(elements, sigma, t, q, v, multipliers)
     held = multipliers[flat.rows :]
     left = bound - elements.norms(held)
     if elements.are_shared:
@@ -84,6 +81,12 @@ def _friction(flat, elements, sigma, t, q, v, feedback):
     going = elements.sums(sigma * slip) + 1e-6 * elements.near_rest
     margin = jnp.where(stuck, left + 1e2 * jnp.finfo(v.dtype).eps * jnp.abs(bound), going)
     return Friction(qddot, multipliers, force, slip_rate, bound, margin)
+
+
+def bounds(elements: FrictionElements, sigma, t, q, v, multipliers) -> Float[Array, " e"]:
+    """∂D/∂u: what friction is where an element slips, and what it does not exceed where it sticks."""
+    total = lambda u: sum(D(t, q, v, multipliers, u) for D in elements.potentials.values())
+    return jax.grad(total)(_extent(elements, sigma, elements.slip(t, q, v)))
 
 
 class Mode(NamedTuple):
@@ -250,84 +253,3 @@ def friction_by_term(elements: FrictionElements, sigma, held, t, q, v, found: Fr
         shape = () if rows.size == 1 else (rows.size,)
         forces[name] = (share[of[rows]] * found.force[rows]).reshape(shape), stuck[of[rows]].reshape(shape)
     return forces
-
-
-@dataclasses.dataclass(frozen=True)
-class StickSlip:
-    """Exact Coulomb friction: sticking, stopping, breaking away at the bound. The default.
-
-    Each nonsmooth term μN|s| of D slips with the force −μN sign(s), and sticks, as a constraint s = 0, while the constraint force stays
-    within ±μN. The times of the transitions between the two are located to rounding and differentiated.
-
-    Elements that can share a load in more than one way, as the legs of a plate can, hold it as long as one way is possible; the motion
-    is the same for all of them. The reported forces are then one possible share: for slip velocities of several components the one that
-    minimises the largest utilisation, for others that of least norm until one reaches its bound. The share is not differentiated.
-
-    **Arguments:** `max_transitions`: limit on changes of mode, beyond which the motion is reported as chattering.
-
-    **Raises:** `TypeError` or `ValueError` where `max_transitions` is not a whole number of 0 or more.
-
-    **Source:** Pfeiffer & Glocker, Multibody Dynamics with Unilateral Contacts, chapters 5 and 6; for shares Moreau, Application of
-    convex analysis to some problems of dry friction (1979).
-
-    ```python
-    import jaxlag as jl
-    jl.StickSlip(max_transitions=100)
-    ```
-    """
-
-    max_transitions: int = 10_000
-
-    def __post_init__(self):
-        count(self.max_transitions, "`max_transitions`", least=0, cure="The default is 10_000.")
-
-    def elements(self, flat: Flat, t: Any, q: Float[Array, " n"], v: Float[Array, " n"]) -> FrictionElements | None:
-        """What sticks and slips."""
-        return find_elements(flat, t, q, v)
-
-    def smoothed(self, flat: Flat, t: Any, q: Float[Array, " n"], v: Float[Array, " n"]) -> Flat:
-        """The system itself: without elements that stick there is nothing to smooth."""
-        return flat
-
-
-@dataclasses.dataclass(frozen=True)
-class Regularised:
-    """Regularised dry friction: |s| becomes √(s² + w²) − w, with the force −F s/√(s² + w²).
-
-    It cannot hold a load: under a force f < F it creeps at the velocity w f/√(F² − f²), that is w/√3 at half the bound. It also makes
-    the equations stiff, with a time constant of m w/F.
-
-    **Arguments:** `width`: the velocity w, in the units of s.
-
-    **Raises:** `TypeError` or `ValueError` where `width` is not a positive number.
-
-    **Source:** Armstrong-Hélouvry, Dupont & Canudas de Wit, Automatica 30 (1994) 1083-1138.
-
-    ```python
-    import jaxlag as jl
-    jl.Regularised(width=1e-4)
-    ```
-    """
-
-    width: float
-
-    def __post_init__(self):
-        width = number(self.width, "`width`", positive=True, cure="Take some thousandths of the velocities that occur.")
-        object.__setattr__(self, "width", float(width))
-
-    def elements(self, flat: Flat, t: Any, q: Float[Array, " n"], v: Float[Array, " n"]) -> None:
-        """None: nothing sticks."""
-
-    def smoothed(self, flat: Flat, t: Any, q: Float[Array, " n"], v: Float[Array, " n"]) -> Flat:
-        """The system with smooth friction."""
-        elements = find_elements(flat, t, q, v)
-        if elements is None:
-            return flat
-
-        def extent(t, q, v):
-            return jnp.sqrt(elements.sums(elements.slip(t, q, v) ** 2) + self.width**2) - self.width
-
-        def smooth(D):
-            return lambda t, q, v, multipliers: D(t, q, v, multipliers, extent(t, q, v))
-
-        return flat._replace(dissipations={name: smooth(D) for name, D in elements.potentials.items()})

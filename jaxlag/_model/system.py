@@ -148,7 +148,7 @@ class System:
         return (*(name for name, _ in (*self.dissipation, *self.force)), *self.constraints, EXPLICIT_TIME)
 
 
-def _unpickled(references, one_sided, states=None, restitution=None) -> System:
+def _unpickled(references: Any, one_sided: Any, states: Any = None, restitution: Any = None) -> System:
     slots = {slot: {name: unpickled(f) for name, f in terms.items()} for slot, terms in references.items()}
     contacts = {name: Contact(slots["unilateral"][name], unpickled(e)) for name, e in (restitution or {}).items()}
     return System(**slots | {"unilateral": contacts}, one_sided=one_sided, states=states)

@@ -177,6 +177,15 @@ def _check_state_names(system, q, params):
         raise ValueError(f"`states` must not have a state named {name!r}, but has one, and so has q. Rename the state.")
 
 
+def without_contacts(system: System, label: str) -> None:
+    """Refuses systems whose contacts open and close, where these must not."""
+    for name, _ in system.unilateral:
+        raise ValueError(
+            f"`system` must have no contacts that open and close in {label}, but has {name!r}. "
+            "State those that stay closed as `holonomic`, and leave out the others."
+        )
+
+
 def at_state(core: Callable[..., Any], system: System, q: Any, qdot: Any, params: Any, t: Any, states: Any = None) -> Any:
     """`core(flat, t, q, v)` of the checked system at a state given by the user; compiled once for each `core` and `system`."""
     q, qdot = state(q, qdot)

@@ -5,7 +5,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from .._mechanics.stick_slip import Regularised
+from .._mechanics.friction_treatment import Regularised
 from .._model.paths import leaf_names
 from .._program.jit import is_concrete
 from .results import reason_of

@@ -12,12 +12,11 @@ from jaxtyping import Array, Bool, Float, PyTree
 
 from .._mechanics.contact import contact_rows, free, gap_scales, idle, in_contact
 from .._mechanics.friction_elements import FrictionElements
+from .._mechanics.friction_treatment import Regularised, StickSlip
 from .._mechanics.power import energy_exchange, listed_powers
 from .._mechanics.projection import Baumgarte, NoStabilisation, Projection
 from .._mechanics.saddle_point import SaddlePoint, Sound, constrained_acceleration
 from .._mechanics.stick_slip import (
-    Regularised,
-    StickSlip,
     friction,
     friction_by_term,
     in_mode,
@@ -71,6 +70,8 @@ class EquationsOfMotion:
             warn_of_delays(params, elsewhere)
             alone = dataclasses.replace(alone, elsewhere=elsewhere)
         elements = formulation.friction.elements(alone.flat_at(params, at), *at[1:])
+        if system.unilateral:
+            _check_impacts(alone.flat_at(params, at), elements, formulation.friction)
         return alone if elements is None else dataclasses.replace(alone, rows=elements.element_of_row.size, elements=elements.size)
 
     def flat(self, params: PyTree, at: StatesAt) -> Flat:
@@ -211,9 +212,25 @@ class EquationsOfMotion:
         if self.contacts:
             violation = violation.beside(*_contact_violation(flat, t, parts, multipliers, rtol, atol))
         of_contact = parts.closed > 0.5, parts.impacts, parts.changed, parts.impulse
-        contacts = {name: of_one for name, *of_one in zip(flat.contacts, *of_contact, strict=True)}
+        contacts = dict(zip(flat.contacts, zip(*of_contact, strict=True), strict=True))
         unraveled = flat.unravel(q), flat.unravel(v), flat.unravel(qddot), flat.unravel_multipliers(multipliers)
         return Sample(*unraveled, dict(states), named, friction_states, contacts, counts), Evidence(sound, jax.lax.stop_gradient(violation))
+
+
+def _check_impacts(flat: Flat, elements: FrictionElements | None, treatment) -> None:
+    """Refuses friction whose impulses are not solved for."""
+    if not flat.needs_multipliers:
+        return
+    if isinstance(treatment, Regularised):
+        raise ValueError(
+            "`friction` must be `StickSlip()` where contacts rub, whose impacts take the impulses for the forces, but is `Regularised`. "
+            "Leave it out."
+        )
+    if elements is not None and np.any(elements.is_vector):
+        raise ValueError(
+            "`dissipation` must rub along single directions where an impact may multiply its normal force, but holds the norm of a slip "
+            "velocity of several components, whose direction in an impact is not solved for. Move in a plane, or leave out `unilateral`."
+        )
 
 
 def _values(flat: Flat, t, q, v):
@@ -229,7 +246,8 @@ def _rates(equations: EquationsOfMotion, t, y, args):
     parts = equations.parts(y)
     q, v, works, sigma, held = parts.q, parts.v, parts.works, parts.sigma, parts.held
     flat, mode, elements = equations.mode(t, parts, args)
-    qddot = equations.where_closed(parts, lambda: equations.acceleration(mode, t, q, v).x, lambda: equations.acceleration(free(mode), t, q, v).x)
+    of = lambda flat: lambda: equations.acceleration(flat, t, q, v).x
+    qddot = equations.where_closed(parts, of(mode), of(free(mode)))
     rates = ravelled(flat.state_rates(t, q, v), y.dtype)
     powers = listed_powers(mode, t, q, v) if equations.works else works
     stuck = parts.time_stuck if elements is None else jnp.maximum(sticking(elements, sigma).astype(y.dtype), held)

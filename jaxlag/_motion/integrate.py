@@ -14,8 +14,8 @@ import numpy as np
 from jaxtyping import Array, Bool, PyTree
 
 from .._mechanics.contact import outside
+from .._mechanics.friction_treatment import Regularised, StickSlip
 from .._mechanics.projection import Baumgarte, NoStabilisation, Projection, nearest_state
-from .._mechanics.stick_slip import Regularised, StickSlip
 from .._model.flat import StatesAt
 from .._model.numbers import count, number
 from .._model.signal import broken_signals, moves_smoothly
@@ -111,6 +111,7 @@ def initialised(equations: EquationsOfMotion, at: StatesAt, params) -> Initial:
         (start.has_bounds, RESULTS.negative_bound),
         (start.is_outside, RESULTS.inside_obstacle),
         (start.dissipates, RESULTS.energy_gained),
+        (start.impulsive, RESULTS.not_impulsive),
         (nearest.reached, RESULTS.impossible_start),
         (nearest.affine, RESULTS.not_affine),
         (nearest.determined, RESULTS.no_inertia),

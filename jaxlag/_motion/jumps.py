@@ -7,7 +7,7 @@ from .._mechanics.stick_slip import select_mode, slip_of
 from .._model.system import EXPLICIT_TIME
 from .._program.jit import jitted
 from .first_order import EquationsOfMotion
-from .mode_changes import in_other_mode
+from .mode_changes import behind_contact, in_other_mode
 from .protocol import Arguments
 
 
@@ -27,6 +27,13 @@ def after_jump(equations: EquationsOfMotion, t, y0, y, before: Arguments, args: 
         lift = energy_exchange(flat, t, parts.q, parts.v)[0] - energy_exchange(earlier, t, parts.q, parts.v)[0]
         parts = parts._replace(works=parts.works.at[equations.works.index(EXPLICIT_TIME)].add(lift))
     slipping = parts._replace(sigma=jnp.ones_like(parts.sigma))
+    if equations.contacts:
+        assert args.scales is not None  # contacts are located
+        moved = equations.parts(equations.projected(t, parts.y, args))
+        errors = args.scales.error(moved.q), args.scales.error(moved.v)
+        nothing = jnp.zeros(equations.elements, bool), jnp.zeros(equations.contacts, bool)
+        change = behind_contact(equations, t, moved, args, *nothing, errors, anew=True)
+        return change.y, change.consistent & change.dissipates & change.impulsive
     held = equations.projection is not None and equations.system.constraints
     moved = equations.parts(equations.projected(t, slipping.y, args)) if held else slipping
     if elements is None:

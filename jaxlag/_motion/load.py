@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from .._mechanics.stick_slip import Regularised, StickSlip
+from .._mechanics.friction_treatment import Regularised, StickSlip
 from .export import FORMAT, filled_outline
 from .provenance import Recorded
 from .results import result_of

@@ -31,11 +31,14 @@ CONVERGED = 1e-9  # of the motion, the time that infinitely many impacts may yet
 
 
 class Change(NamedTuple):
-    """y behind the end of a mode; whether a mode is consistent there, whether an impact took energy, whether slip had come to rest."""
+    """y behind the end of a mode; whether a mode is consistent there, whether an impact took energy and followed from impulses, whether
+    slip had come to rest.
+    """
 
     y: Float[Array, " y"]
     consistent: Bool[Array, ""]
     dissipates: Bool[Array, ""]
+    impulsive: Bool[Array, ""]
     at_rest: Bool[Array, ""]
 
 
@@ -54,12 +57,12 @@ def margins(equations: EquationsOfMotion, t, y, args: Arguments, start) -> Float
 @jitted
 def _margins(equations: EquationsOfMotion, t, parts: Parts, args):
     q, v, sigma, held = parts.q, parts.v, parts.sigma, parts.held
-    flat, _, elements = equations.mode(t, parts, args)
+    flat, mode, elements = equations.mode(t, parts, args)
     if elements is None:
         closed = parts.closed > 0.5
         forces = jax.lax.cond(
             jnp.any(closed),
-            lambda: contact_rows(flat, equations.acceleration(flat, t, q, v).multipliers),
+            lambda: contact_rows(flat, equations.acceleration(mode, t, q, v).multipliers),
             lambda: jnp.zeros_like(parts.closed),
         )
         return jnp.concatenate([_contact_margins(flat, t, q, closed, forces), jnp.ones_like(parts.closed)])
@@ -98,7 +101,7 @@ def changed(equations: EquationsOfMotion, t, y, args: Arguments, ended: Bool[Arr
         stuck, slow = sticking(elements, parts.sigma) | (parts.held > 0), _slow(elements, t, parts, args.scales.error(parts.v))
         mode, _ = select_mode(flat, elements, t, parts.q, parts.v, parts.sigma, stuck | of_friction | slow, of_friction & stuck)
         after = equations.projected(t, in_other_mode(elements, parts, mode).y, args)
-        return Change(after, mode.consistent, jnp.array(True), jnp.all(~of_friction | stuck | slow))
+        return Change(after, mode.consistent, jnp.array(True), jnp.array(True), jnp.all(~of_friction | stuck | slow))
     errors = args.scales.error(parts.q), args.scales.error(parts.v)
     return behind_contact(equations, t, parts, args, of_friction, of_contact, errors)
 
@@ -151,7 +154,7 @@ def behind_contact(equations: EquationsOfMotion, t, parts: Parts, args: Argument
     changes = (chosen.closed != closed) & ~hits
     parts = parts._replace(closed=chosen.closed.astype(q.dtype), changed=jnp.where(changes, t, parts.changed))
     at_rest = jnp.all(~of_friction | stuck | slow) | anew
-    return Change(equations.projected(t, parts.y, args), chosen.consistent & found.consistent, found.dissipates, at_rest)
+    return Change(equations.projected(t, parts.y, args), chosen.consistent & found.consistent, found.dissipates, found.impulsive, at_rest)
 
 
 def _last_impacts(t, parts: Parts, hits, duration):
@@ -195,9 +198,9 @@ def started(equations: EquationsOfMotion, at: StatesAt, params) -> Start:
         errors = roundings(near), roundings(1 + jnp.abs(jax.lax.stop_gradient(parts.v)))
         of_contact = flat.gaps(t, parts.q) <= 0
         change = behind_contact(equations, t, parts, args, jnp.zeros(equations.elements, bool), of_contact, errors, anew=True)
-        return Start(change.y, change.consistent, yes, is_outside, change.dissipates)
+        return Start(change.y, change.consistent, yes, is_outside, change.dissipates, change.impulsive)
     if elements is None:
-        return Start(parts.y, yes, yes, yes, yes)
+        return Start(parts.y, yes, yes, yes, yes, yes)
     mode, _ = first_mode(flat, elements, t, parts.q, parts.v)
     parts = parts._replace(sigma=mode.sigma, held=mode.held.astype(parts.q.dtype))
-    return Start(equations.projected(t, parts.y, args), mode.consistent, ~jnp.any(mode.bound < 0), yes, yes)
+    return Start(equations.projected(t, parts.y, args), mode.consistent, ~jnp.any(mode.bound < 0), yes, yes, yes)

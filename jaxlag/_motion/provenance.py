@@ -5,7 +5,7 @@ import jax
 import numpy as np
 from jaxtyping import Array, PyTree
 
-from .._mechanics.stick_slip import Regularised, StickSlip
+from .._mechanics.friction_treatment import Regularised, StickSlip
 from .._model.system import System
 
 

@@ -47,6 +47,10 @@ class RESULTS(dfx.RESULTS):  # pyright: ignore
         "an impact gained energy, as Newton's law of restitution may where impacts are coupled by friction (Kane's paradox) or by several "
         "contacts of different restitution. Lower `restitution` or the coefficient of friction."
     )
+    not_impulsive = (
+        "`dissipation` must be homogeneous in the force of a contact that it follows, as mu * multipliers['table'] * |v| is, for an impact to "
+        "say what its friction is, but is not. Write it so."
+    )
     chattering = (
         "friction changed between sliding and sticking more than `max_transitions` times: it chatters. "
         "Allow more with `friction=StickSlip(max_transitions=...)`, or smooth it with `friction=Regularised(width)`."
@@ -85,6 +89,7 @@ OF_THE_INPUT = (
     RESULTS.not_affine,
     RESULTS.negative_bound,
     RESULTS.inside_obstacle,
+    RESULTS.not_impulsive,
 )
 OF_THE_STEPS = (RESULTS.max_steps_reached, RESULTS.dt_min_reached)  # which other numerical settings may cure
 

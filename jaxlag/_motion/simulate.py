@@ -7,8 +7,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, PyTree
 
+from .._mechanics.friction_treatment import Regularised, StickSlip
 from .._mechanics.projection import Baumgarte, NoStabilisation, Projection
-from .._mechanics.stick_slip import Regularised, StickSlip
 from .._model.deprecation import renamed
 from .._model.state_values import given_states
 from .._model.system import System

@@ -13,8 +13,8 @@ from jax.flatten_util import ravel_pytree
 from jax.sharding import Mesh, PartitionSpec
 from jaxtyping import Array, PyTree
 
+from .._mechanics.friction_treatment import Regularised, StickSlip
 from .._mechanics.projection import Baumgarte, NoStabilisation, Projection
-from .._mechanics.stick_slip import Regularised, StickSlip
 from .._model.deprecation import renamed
 from .._model.flat import StatesAt
 from .._model.paths import is_within, leaf_names
@@ -163,8 +163,8 @@ def _share_steps(common_steps, equations, params, own):
     obstacle = equations.modes or equations.sampled.size or signals or jump_times(params, float) is not None
     if common_steps and obstacle:
         raise ValueError(
-            "`common_steps` must be False where dry friction, a contact, a jumping input or an update ends steps at its own time, or signals differ, "
-            "but is True. Leave it out."
+            "`common_steps` must be False where dry friction, a contact, a jumping input or an update ends steps at its own time, or "
+            "signals differ, but is True. Leave it out."
         )
     return common_steps is not False and not obstacle
 

@@ -41,7 +41,7 @@ class Parts(NamedTuple):
 
 class Start(NamedTuple):
     """y at the start; whether a friction mode is consistent with its forces; whether no bound is negative; whether it lies outside of all
-    obstacles; whether an impact there takes energy.
+    obstacles; whether an impact there takes energy, and follows from impulses.
     """
 
     y: Float[Array, " y"]
@@ -49,6 +49,7 @@ class Start(NamedTuple):
     has_bounds: Bool[Array, ""]
     is_outside: Bool[Array, ""]
     dissipates: Bool[Array, ""]
+    impulsive: Bool[Array, ""]
 
 
 class Violation(NamedTuple):

@@ -55,7 +55,7 @@ class Piece(NamedTuple):
 
 class Cut(NamedTuple):
     """Where a step is cut: the time, and Newton's next estimate of it; y there in the next mode, whether that mode is consistent, and
-    whether an impact there took energy; whether the pieces on both sides can be used.
+    whether an impact there took energy and followed from impulses; whether the pieces on both sides can be used.
     """
 
     time: Any
@@ -63,6 +63,7 @@ class Cut(NamedTuple):
     y: Any
     consistent: Any
     dissipates: Any
+    impulsive: Any
     usable: Any
 
 
@@ -108,7 +109,7 @@ class StickSlipSolver(ProjectedSolver):
         given = t0, t1, y0, solver_state, jnp.asarray(made_jump)
         nothing = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), jax.eval_shape(piece, *given))
         no, zeros = jnp.array(False), jnp.zeros(self.equations.modes, y0.dtype)
-        uncut = Split(nothing, nothing, Cut(t1, t1, y0, no, no, no), Seen(no, no, no, jnp.asarray(t1, y0.dtype), zeros))
+        uncut = Split(nothing, nothing, Cut(t1, t1, y0, no, no, no, no), Seen(no, no, no, jnp.asarray(t1, y0.dtype), zeros))
 
         run = functools.partial(self._run, piece, given, args)
         _, split = self._phases(run, (jnp.array(0), uncut))
@@ -161,9 +162,8 @@ class StickSlipSolver(ProjectedSolver):
     def _change(self, split: Split, ended, args) -> Split:
         """With the state in the mode that follows when those of the elements `ended` end."""
         found = changed(self.equations, split.cut.time, split.first.y, args, ended)
-        cut = split.cut._replace(
-            y=found.y, consistent=found.consistent, dissipates=found.dissipates, usable=split.cut.usable & found.at_rest
-        )
+        fine = {"consistent": found.consistent, "dissipates": found.dissipates, "impulsive": found.impulsive}
+        cut = split.cut._replace(y=found.y, **fine, usable=split.cut.usable & found.at_rest)
         return split._replace(cut=cut)
 
     def _joined(self, split: Split, t0, t1, y0, args):
@@ -178,8 +178,8 @@ class StickSlipSolver(ProjectedSolver):
         error = jnp.where(is_hidden(rates, _nodes(self.solver), t0, t1, y0, args.scales), jnp.inf, error)
         consistent = ~ended | cut.consistent | ~cut.usable
         result = dfx.RESULTS.where(consistent, dfx.RESULTS.successful, under_diffrax(RESULTS.no_friction))
-        dissipates = ~ended | cut.dissipates | ~cut.usable
-        result = dfx.RESULTS.where(dissipates, result, under_diffrax(RESULTS.energy_gained))
+        for passed, reason in ((cut.dissipates, RESULTS.energy_gained), (cut.impulsive, RESULTS.not_impulsive)):
+            result = dfx.RESULTS.where(~ended | passed | ~cut.usable, result, under_diffrax(reason))
         result = dfx.RESULTS.where(seen.negative & ~shrinking, under_diffrax(RESULTS.negative_bound), result)
         result = dfx.RESULTS.where(self.equations.exhausted(second.y), under_diffrax(RESULTS.chattering), result)
         result = dfx.RESULTS.where(first.result == dfx.RESULTS.successful, result, first.result)

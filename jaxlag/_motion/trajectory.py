@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
-from jaxtyping import Array, Bool, Float, PyTree
+from jaxtyping import Array, Float, PyTree
 
 from .._mechanics.friction_elements import find_elements
 from .._mechanics.power import energy_exchange
@@ -21,54 +21,9 @@ from .._program.jit import compiled, is_concrete
 from .card import card
 from .export import arrays_of, frame_of, outline, write_arrays
 from .interpolation import Moving, between
+from .moments import ContactState, FrictionState, Instant, Interpolated
 from .provenance import Provenance, Recorded
 from .results import RESULTS, names_of
-
-
-class FrictionState(eqx.Module):
-    """Dry friction along a motion: the `force` on each slip velocity, also while it sticks, and whether it is `sticking`."""
-
-    force: Float[Array, "..."]
-    sticking: Bool[Array, "..."]
-
-
-class ContactState(eqx.Module):
-    """A contact along a motion: whether it is `closed`; the number of its `impacts` so far; when it last `changed`, by an impact, by opening
-    or by closing; the sum of the `impulse`s of its impacts.
-    """
-
-    closed: Bool[Array, "*members T"]
-    impacts: Float[Array, "*members T"]
-    changed: Float[Array, "*members T"]
-    impulse: Float[Array, "*members T"]
-
-
-class Instant(eqx.Module):
-    """A motion at one of its samples: the time `t`, and `q`, `qdot`, `qddot`, `multipliers` and `states` there, e.g. to continue from."""
-
-    t: Float[Array, ""]
-    q: PyTree
-    qdot: PyTree
-    qddot: PyTree
-    multipliers: dict[str, PyTree]
-    states: dict[str, PyTree]
-
-
-class Interpolated(eqx.Module):
-    """A motion at other times `ts`, from `Trajectory.at`.
-
-    - `q`, `qdot`, `qddot`: structured like q0, with the axes of `ts` first. NaN outside the motion.
-    - `q_error`, `qdot_error`: error estimates, from how well interpolation reproduces samples that are left out: where the motion
-      is smooth, some 64 and 18 times too large.
-    """
-
-    ts: Float[Array, "..."]
-    q: PyTree
-    qdot: PyTree
-    qddot: PyTree
-    q_error: PyTree
-    qdot_error: PyTree
-
 
 COUNTED = ("transitions", "time_stuck")  # entries of `stats` that have the samples as first axis, counted from the start
 

@@ -16,7 +16,7 @@ from .._mechanics.lagrange import applied_force, constraint_rows, inertia
 from .._model.flat import Flat, StatesAt, bind, rows_by_name
 from .._model.state_values import of_first_order, ravelled, sampled, start_values
 from .._model.system import System
-from .._model.validation import check, coordinates, parameters
+from .._model.validation import check, coordinates, parameters, without_contacts
 from .._program.expressions import Algebra, filled
 from .._program.interpreter import evaluate
 from .derivation import Steps, SymbolicSystem
@@ -56,6 +56,7 @@ def trace_system(
     system: System, q: SymbolTree, params: SymbolTree, states: States, positive: Collection[str]
 ) -> tuple[SymbolicSystem, dict[str, PyTree]]:
     """L, D, Q, g, a and what drives the states of a system as formulas, and the indices of each constraint's multipliers."""
+    without_contacts(system, "`equations`")
     like = coordinates(q.example, "q")
     values = parameters(params.example, like)
     check(system, jnp.zeros((), jax.tree.leaves(like)[0].dtype), like, like, values, states.tree.numbers)
