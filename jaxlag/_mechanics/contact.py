@@ -14,9 +14,10 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from .._model.flat import Flat
+from .._program.scalarise import scalarised
 from .friction_elements import FrictionElements, find_elements
 from .lagrange import inertia, position_residual
-from .saddle_point import constrained_acceleration, reach_of, saddle_point
+from .saddle_point import SaddlePoint, constrained_acceleration, reach_of, saddle_point
 from .stick_slip import Mode, first_mode, in_mode, sticking
 
 OUTWARDS = 6  # Newton steps that put a start on its obstacle
@@ -55,8 +56,12 @@ def gap_accelerations(flat: Flat, t, q, v, qddot) -> Float[Array, " c"]:
 
 def on_contact(flat: Flat, t, q, v, closed: Bool[Array, " c"]) -> Float[Array, " n"]:
     """q, put on these contacts where it is but for rounding, and so are its derivatives: of many impacts they would add up."""
-    g, G = position_residual(in_contact(flat, closed), t, q)
-    return q + saddle_point(inertia(flat, t, q, v)[0], G, jnp.zeros_like(q), -g, reach_of(q)).x
+
+    def put(t, q, v, closed):
+        g, G = position_residual(in_contact(flat, closed), t, q)
+        return q + saddle_point(inertia(flat, t, q, v)[0], G, jnp.zeros_like(q), -g, reach_of(q)).x
+
+    return scalarised(put)(t, q, v, closed)
 
 
 def outside(flat: Flat, t, q, v) -> Float[Array, " n"]:
@@ -104,7 +109,8 @@ class Contacts(NamedTuple):
     @classmethod
     def of(cls, flat: Flat, t, q, v, candidates: Bool[Array, " c"]) -> "Contacts":
         """All candidates closed."""
-        return cls(candidates, candidates, jnp.array(0), *jax.lax.stop_gradient(_scales(flat, t, q, v)))
+        scales = scalarised(lambda t, q, v: _scales(flat, t, q, v))(t, q, v)
+        return cls(candidates, candidates, jnp.array(0), *jax.lax.stop_gradient(scales))
 
     def applied_to(self, flat: Flat) -> Flat:
         """The system with those that are closed."""
@@ -125,6 +131,11 @@ class Contacts(NamedTuple):
         return self._replace(closed=self.closed ^ flips, turn=self.turn + 1), jnp.any(flips)
 
 
+def accelerated(flat: Flat, t, q, v) -> SaddlePoint:
+    """q̈ and λ, in scalars where there are few."""
+    return scalarised(lambda t, q, v: constrained_acceleration(flat, t, q, v))(t, q, v)
+
+
 class Chosen(NamedTuple):
     """Which contacts are closed; the mode of friction with them, where there is any; whether forces and accelerations are consistent."""
 
@@ -139,7 +150,7 @@ def select_closed(flat: Flat, t, q, v, candidates: Bool[Array, " c"]) -> Chosen:
 
     def turn(carry):
         contacts, _ = carry
-        qddot, multipliers, _ = constrained_acceleration(contacts.applied_to(flat), t, q, v)
+        qddot, multipliers, _ = accelerated(contacts.applied_to(flat), t, q, v)
         return contacts.next(flat, t, q, v, qddot, multipliers)
 
     most = 4 * len(flat.contacts) + 2 ** min(len(flat.contacts), 10)

@@ -15,10 +15,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from .._model.flat import Flat, rows_by_name
-from .contact import Contacts, contact_rows, gap_rates, in_contact, select_closed
+from .contact import Contacts, accelerated, contact_rows, gap_rates, in_contact, select_closed
 from .friction_elements import FrictionElements
 from .lagrange import constraint_rows, inertia
-from .saddle_point import constrained_acceleration
 from .stick_slip import bounds, friction, friction_by_term, select_mode
 
 RISE = 1e-9  # of the energy exchanged, by which an impact may raise it by rounding
@@ -44,7 +43,7 @@ def impact(flat: Flat, elements: FrictionElements | None, t, q, v, near: Bool[Ar
     zero, origin = jnp.zeros_like(t), jnp.zeros_like(q)
     if elements is None or of_impact is None:
         chosen = select_closed(fast, zero, origin, origin, near)
-        after, multipliers, _ = constrained_acceleration(in_contact(fast, chosen.closed), zero, origin, origin)
+        after, multipliers, _ = accelerated(in_contact(fast, chosen.closed), zero, origin, origin)
         lost, rubbed, consistent, impulsive = jnp.zeros((), v.dtype), {}, chosen.consistent, jnp.array(True)
     else:
         everywhere, still = jnp.ones(of_impact.size, bool), jnp.zeros(of_impact.element_of_row.size, v.dtype)

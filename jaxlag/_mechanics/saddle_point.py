@@ -199,7 +199,8 @@ def _pushing(flat: Flat, multipliers):
     if flat.closed is None:
         return multipliers
     start, end = flat.rows_of_bilateral, flat.rows_of_bilateral + len(flat.contacts)
-    return multipliers.at[start:end].set(jnp.where(flat.closed, multipliers[start:end], 0))
+    before, of_contacts, behind = jnp.split(multipliers, [start, end])
+    return jnp.concatenate([before, jnp.where(flat.closed, of_contacts, 0), behind])
 
 
 def _self_consistent(reaction, start):

@@ -180,7 +180,7 @@ def _wrapped(options, equations, projected, adjoint):
 
 def has_nodes(equations: FirstOrderSystem, params: PyTree) -> bool:
     """Whether steps end where an input jumps or bends, or a state is updated."""
-    return isinstance(equations, EquationsOfMotion) and bool(equations.sampled.size or broken_signals(params))
+    return isinstance(equations, EquationsOfMotion) and bool(equations.contacts or equations.sampled.size or broken_signals(params))
 
 
 def on_nodes(

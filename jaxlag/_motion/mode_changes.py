@@ -1,5 +1,6 @@
 """What ends a mode of friction and contact, and what follows it: the impact, the contacts that stay closed, what slides and what sticks."""
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import jax
@@ -23,6 +24,7 @@ from .._mechanics.impact import Impact, impact, no_impact
 from .._mechanics.stick_slip import Mode, first_mode, friction, select_mode, slip_of, sticking
 from .._model.flat import Flat, StatesAt
 from .._program.jit import jitted
+from .._program.time_bounds import bounds_over_time
 from .first_order import EquationsOfMotion
 from .protocol import Arguments
 from .state_vector import Parts, Start
@@ -42,7 +44,7 @@ class Change(NamedTuple):
     at_rest: Bool[Array, ""]
 
 
-def margins(equations: EquationsOfMotion, t, y, args: Arguments, start) -> Float[Array, " 2m"]:
+def margins(equations: EquationsOfMotion, t, y, args: Arguments, start) -> Float[Array, " k"]:
     """Per element of dry friction and per contact, the margin of its mode, negative beyond its end; and then the bounds of friction.
 
     The mode and the sampled states are those of `start`, y at the start of the step: what these alone determine is computed once.
@@ -77,6 +79,35 @@ def _contact_margins(flat: Flat, t, q, closed, forces):
     rounding = gap_scales(flat, t, q, q, roundings(q), q).gap
     little = ROUNDING * jnp.finfo(q.dtype).eps * jnp.max(jnp.abs(jax.lax.stop_gradient(forces)), initial=0.0)
     return jnp.where(closed, forces + little, flat.gaps(t, q) + rounding)
+
+
+class Approach(NamedTuple):
+    """What is known of the gaps along the path of a step: whether all contacts stay open from one time to another, and of the margins of all
+    modes, whether they may be negative between two times.
+    """
+
+    stay_open: Callable
+    may_close: Callable
+
+
+def approach(equations: EquationsOfMotion, path: Callable, t, y, args: Arguments) -> Approach | None:
+    """Bounds of the gaps and of their rates, within which a gap that rises or falls all the time is seen at the ends; None if there are none."""
+    closed = equations.parts(y).closed > 0.5
+
+    def gaps(t):
+        parts = equations.parts(path(t))
+        return equations.flat_at(args.params, equations.states_of(t, parts)).gaps(t, parts.q)
+
+    of_gaps = bounds_over_time(gaps, t)
+    of_rates = bounds_over_time(lambda t: jax.jvp(gaps, (t,), (jnp.ones_like(t),))[1], t)
+    if of_gaps is None or of_rates is None:
+        return None
+
+    def may_close(start, end):
+        (low, _), (falls, rises) = of_gaps(start, end), of_rates(start, end)
+        return jnp.concatenate([jnp.zeros(equations.elements, bool), ~closed & (low < 0) & (falls < 0) & (rises > 0)])
+
+    return Approach(lambda start, end: jnp.all(~closed & (of_gaps(start, end)[0] > 0)), may_close)
 
 
 def exact_slopes(equations: EquationsOfMotion, t, y, args: Arguments, slopes: Float[Array, " m"]) -> Float[Array, " m"]:

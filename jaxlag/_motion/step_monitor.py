@@ -1,7 +1,7 @@
 """Monitoring a step, so that no end of a mode and no pulse is missed.
 
 A mode may end and begin again between two samples of a step in two ways. What follows the state is smooth on a step, so a dip shows in
-the slopes at the samples on both sides of it. What follows time alone, such as a load that comes as a pulse, need not show at all:
+the slopes at the samples on both sides of it; a gap, which may be as rough as an obstacle, is bounded along the path. What follows time alone, such as a load that comes as a pulse, need not show at all:
 bounds of it over the whole interval (`_program.time_bounds`) say by how much it may have changed there. Wherever a margin may have been
 used up, samples are closer.
 """
@@ -61,14 +61,19 @@ class _Search(NamedTuple):
     largest: Float[Array, " m"]
 
 
-def first_end(margins: Callable, path: Callable, t0, t1, elements: int, scales: Any, exactly: Any = True) -> Seen:
+def first_end(
+    margins: Callable, path: Callable, t0, t1, elements: int, scales: Any, exactly: Any = True, between: Callable | None = None
+) -> Seen:
     """When the first of `margins(t, y, start)` turns negative along a `path`; the elements' bounds come after their margins, and count.
 
     `start` is y at the start, where what stays as it is along the path may be taken from. Not `exactly`: only whether there is an end.
+    `between(low, high)` are those of the elements' margins that may be negative between two times, for all that is known of them.
     """
     of_time_alone = time_dependence(lambda t, y: margins(t, y, y), t0, path(t0))
     look, near = _looking(margins, path, t0, t1, of_time_alone), NEAR * scales.rounding
     brief = jnp.maximum(BRIEF * scales.duration, near)
+    none = np.zeros(elements, bool)
+    hides = lambda low, high: jnp.concatenate([none if between is None else between(low, high), none])
     if of_time_alone is not None and not of_time_alone.is_bounded:
         brief = jnp.maximum(brief, jnp.minimum(UNBOUNDED * scales.duration, scales.spacing))
 
@@ -79,10 +84,11 @@ def first_end(margins: Callable, path: Callable, t0, t1, elements: int, scales: 
         ts = jnp.where(np.arange(ts.size) == ts.size - 1, high, ts)
         part = jnp.diff(ts)[:, None]
         value, slope, change = look(ts)
+        hidden = jax.vmap(hides)(ts[:-1], ts[1:])
         largest = jnp.maximum(largest, jnp.max(jnp.abs(value), axis=0))
         value = value + (np.where(np.arange(2 * elements) < elements, 0, 1e-9) * largest)[None]  # a bound of zero is none that is negative
         beyond = jnp.any(value[1:] < 0, axis=1)
-        doubtful = jnp.any(_dips(value, slope, part) & (part > near) | (value[:-1] + value[1:] < change) & (part > brief), axis=1)
+        doubtful = jnp.any(_dips(value, slope, part) & (part > near) | (hidden | (value[:-1] + value[1:] < change)) & (part > brief), axis=1)
         wanted = beyond | (doubtful & ~found)
         i = jnp.where(jnp.any(wanted), jnp.argmax(wanted), LOOKS - 1)  # the end itself may be beyond by rounding alone
         onward = ~found & ~jnp.any(wanted)

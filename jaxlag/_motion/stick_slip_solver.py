@@ -11,7 +11,7 @@ import numpy as np
 
 from .._program.jit import jitted
 from .first_order import EquationsOfMotion
-from .mode_changes import changed, exact_slopes, margins
+from .mode_changes import approach, changed, exact_slopes, margins
 from .results import RESULTS, under_diffrax
 from .runge_kutta import ExplicitRungeKutta
 from .step_monitor import Seen, first_end, is_hidden
@@ -191,8 +191,13 @@ class StickSlipSolver(ProjectedSolver):
         """What is seen of the margins along a piece, on its dense output."""
         t0, t1, dense, args = jax.lax.stop_gradient((t0, t1, dense, args))
         path = self.solver.interpolation_cls(t0=t0, t1=t1, **dense)
-        of = lambda t, y, start: margins(self.equations, t, y, args, start)
-        return first_end(of, path.evaluate, t0, t1, self.equations.modes, args.scales, exactly)
+        of, modes = lambda t, y, start: margins(self.equations, t, y, args, start), self.equations.modes
+        between = approach(self.equations, path.evaluate, t0, path.evaluate(t0), args) if self.equations.contacts else None
+        watched = lambda: first_end(of, path.evaluate, t0, t1, modes, args.scales, exactly, between and between.may_close)
+        if between is None or self.equations.elements:
+            return watched()
+        no = jnp.array(False)
+        return jax.lax.cond(between.stay_open(t0, t1), lambda: Seen(no, no, no, t1, jnp.zeros(modes, t1.dtype)), watched)
 
 
 def _nodes(solver) -> np.ndarray:

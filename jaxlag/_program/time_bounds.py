@@ -61,6 +61,14 @@ def time_dependence(function: Callable, t: Array, y: Array) -> TimeDependence | 
     return TimeDependence(phi, bounds, rest, all(_has_bounds(step.equation) for step in before_y if of_t.intersection(step.results)))
 
 
+def bounds_over_time(function: Callable, t: Array) -> Callable[..., Interval] | None:
+    """Bounds of `function(t)`, an array, from one time to another; None where part of it has none."""
+    found = time_dependence(lambda t, _: function(t), t, t)
+    if found is None:
+        return lambda start, end: (function(start), function(start))
+    return (lambda start, end: found.bounds(start, end)[0]) if found.is_bounded else None
+
+
 MAX_ITERATIONS = 100  # of a loop that is bounded; a search in a table takes twenty for a million elements
 T, Y = 0, 1  # the numbers of the arguments among all quantities
 
