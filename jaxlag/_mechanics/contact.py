@@ -120,10 +120,14 @@ class Contacts(NamedTuple):
         """Which elements no force loads while a contact is open."""
         return (bound == 0) & ~jnp.all(self.closed)
 
-    def next(self, flat: Flat, t, q, v, qddot, multipliers, agreed: Any = True) -> tuple["Contacts", Bool[Array, ""]]:
-        """Other ones, where a contact pulls or, the friction being `agreed` on, goes deeper; and whether there was any."""
+    def next(
+        self, flat: Flat, t, q, v, qddot, multipliers, agreed: Any = True, hopeless: Any = False
+    ) -> tuple["Contacts", Bool[Array, ""]]:
+        """Other ones, where the friction is `agreed` on and a contact pulls or goes deeper; and whether there was any. If agreement
+        is `hopeless`, what pulls opens as well.
+        """
         size = len(flat.contacts)
-        pull = jnp.where(self.closed, -contact_rows(flat, multipliers) - self.force, -jnp.inf)
+        pull = jnp.where(self.closed & (agreed | hopeless), -contact_rows(flat, multipliers) - self.force, -jnp.inf)
         deeper = jnp.where(agreed & self.candidates & ~self.closed, -gap_accelerations(flat, t, q, v, qddot) - self.acceleration, -jnp.inf)
         in_order = jnp.where((pull > 0) | (deeper > 0), size - jnp.arange(size, dtype=v.dtype), 0)
         excess = jnp.where(self.turn > 2 * size, in_order, jnp.where(jnp.any(pull > 0), pull, deeper))

@@ -104,6 +104,7 @@ class _Search(NamedTuple):
     stage: Any
     contacts: Any
     mode: Mode
+    turns: Any  # since the contacts changed
     clearly: Bool[Array, " e"]  # broken away by more than rounding
     free_rate: Float[Array, " e"]
 
@@ -122,8 +123,8 @@ class NoContact(NamedTuple):
         """Which elements no open contact loads."""
         return jnp.zeros(bound.size, bool)
 
-    def next(self, flat: Flat, t, q, v, qddot, multipliers, agreed: Any = True) -> tuple["NoContact", bool]:
-        """Other ones, where a contact pulls or, the friction being `agreed` on, goes deeper; and whether there was any."""
+    def next(self, flat: Flat, t, q, v, qddot, multipliers, agreed: Any = True, hopeless: Any = False) -> tuple["NoContact", bool]:
+        """Other ones, where the friction is `agreed` on and a contact pulls or goes deeper; and whether there was any."""
         return self, False
 
 
@@ -149,7 +150,7 @@ def select_mode(
     of = elements.element_of_row
     t, q, v = jax.lax.stop_gradient((t, q, v))
     loose = jnp.finfo(v.dtype).tiny ** 0.25  # a σ of this length slips without a force
-    no = jnp.zeros(elements.size, bool)
+    no, most = jnp.zeros(elements.size, bool), 4 * elements.size + 6
 
     def turn(search):
         mode, stage = search.mode, search.stage
@@ -162,12 +163,14 @@ def select_mode(
 
         over = jnp.where(sticking(elements, mode.sigma), -found.margin, -jnp.inf)
         idle = search.contacts.unloaded(found.bound)  # let go at once, and for good: it has no part in what the others do
+        held_idly = idle & (over > -jnp.inf)
         beyond = _greatest(over, (over > 0) & ~idle)
         backwards = -elements.sums(found.slip_rate * mode.sigma)
         returning = _greatest(backwards, released & ~idle & (backwards > jnp.where(search.clearly, 0, 1e-6 * search.free_rate)))
         torn = _torn(elements, t, q, v, found, search.free_rate, over > -jnp.inf) & ~jnp.any(beyond)
         along = (over > -1e-6 * jnp.abs(found.bound)) & elements.are_shared  # those of a share break away together
-        leaving = jnp.where((stage == FIRST) & jnp.any(breaking), breaking | along, beyond | torn) | (idle & (over > -jnp.inf))
+        leaving = jnp.where((stage == FIRST) & jnp.any(breaking), breaking | along, beyond | torn)
+        leaving = jnp.where(stage == LOOSE, held_idly, leaving | held_idly)
         returning = returning & ~jnp.any(leaving)
         way = jnp.where((beyond | breaking | along)[of], -found.force, found.slip_rate)
         size = elements.norms(way)[of]
@@ -180,7 +183,7 @@ def select_mode(
         all_slip = (stage == LOOSE) & ~jnp.any(at_rest)  # nothing to choose
         within = (stage == FIRST) | (stage == NEXT) | all_slip
         last = all_slip | ~jnp.any(at_rest & ~idle & ~sticking(elements, sigma))  # nothing that others may hold
-        contacts, changes = search.contacts.next(flat, t, q, v, found.qddot, found.multipliers, agrees)
+        contacts, changes = search.contacts.next(flat, t, q, v, found.qddot, found.multipliers, agrees, search.turns > most)
         following = jnp.where(within, jnp.where(in_current_mode, jnp.where(last, DONE, HOLD), NEXT), jnp.where(stage == LOOSE, FIRST, DONE))
         anew = within & changes
         contacts = jax.tree.map(lambda new, old: jnp.where(anew, new, old), contacts, search.contacts)
@@ -188,21 +191,21 @@ def select_mode(
             jnp.where(anew, LOOSE, following),
             contacts,
             Mode(
-                jnp.where(anew, resting, jnp.where(within, sigma, mode.sigma)),
+                jnp.where(anew, resting, jnp.where(within | (stage == LOOSE), sigma, mode.sigma)),
                 jnp.where(stage == HOLD, released & ~idle & (rate <= 1e-6 * search.free_rate), mode.held),
                 jnp.where(within, agrees & ~anew, mode.consistent),
                 jnp.where(within, found.bound, mode.bound),
             ),
+            jnp.where(anew, 0, search.turns + 1),
             jnp.where(within, clearly & ~anew, search.clearly),
             jnp.where(stage == LOOSE, rate, search.free_rate),
         )
 
     nothing = jnp.zeros(elements.size, v.dtype)
     resting = jax.lax.stop_gradient(jnp.where(at_rest[of], 0, sigma))
-    start = _Search(jnp.array(LOOSE), contacts, Mode(resting, no, jnp.array(False), nothing), no, nothing)
+    start = _Search(jnp.array(LOOSE), contacts, Mode(resting, no, jnp.array(False), nothing), jnp.array(0), no, nothing)
     # Nothing here is differentiated, so that the loop may end by itself: a motion behind many jumps of an input takes a tenth less.
-    most = (4 * elements.size + 6) * (1 + 4 * len(jax.tree.leaves(contacts)) * flat.rows)
-    going_on = lambda carry: (carry[0] < most) & (carry[1].stage != DONE)
+    going_on = lambda carry: (carry[0] < most * (1 + 4 * len(jax.tree.leaves(contacts)) * flat.rows)) & (carry[1].stage != DONE)
     done = jax.lax.while_loop(going_on, lambda carry: (carry[0] + 1, turn(carry[1])), (0, start))[1]
     return done.mode, done.contacts
 
