@@ -21,7 +21,7 @@ from .saddle_point import SaddlePoint, constrained_acceleration, reach_of, saddl
 from .stick_slip import Mode, first_mode, in_mode, sticking
 
 OUTWARDS = 6  # Newton steps that put a start on its obstacle
-ROUNDING = 1e4  # times eps, what counts as rounding of a gap, its rate, its acceleration and its force
+ROUNDING = 0.75  # power of eps, what counts as rounding of a gap, its rate, its acceleration and its force
 
 
 def in_contact(flat: Flat, closed: Bool[Array, " c"]) -> Flat:
@@ -35,7 +35,18 @@ def in_contact(flat: Flat, closed: Bool[Array, " c"]) -> Flat:
 
 def free(flat: Flat) -> Flat:
     """The system without its contacts: fewer rows, those of the other constraints."""
-    return flat._replace(holonomic=flat.bilateral, closed=None)
+
+    def of_all(function):
+        def padded(t, q, v, multipliers):
+            before, behind = jnp.split(multipliers, [flat.rows_of_bilateral])
+            return function(t, q, v, jnp.concatenate([before, jnp.zeros(len(flat.contacts), q.dtype), behind]))
+
+        return padded
+
+    named = {"dissipations": flat.dissipations, "forces": flat.forces}
+    return flat._replace(
+        holonomic=flat.bilateral, closed=None, **{slot: {name: of_all(term) for name, term in of.items()} for slot, of in named.items()}
+    )
 
 
 def contact_rows(flat: Flat, multipliers: Float[Array, " m"]) -> Float[Array, " c"]:
@@ -87,8 +98,8 @@ def gap_scales(flat: Flat, t, q, v, of_positions: Float[Array, " n"], of_velocit
 
 def roundings(x: Float[Array, " n"]) -> Float[Array, " n"]:
     """Of each number of a state, what counts as its rounding, with some for a state that is zero."""
-    eps = ROUNDING * jnp.finfo(x.dtype).eps
-    return eps * jnp.abs(jax.lax.stop_gradient(x)) + eps**2
+    little = jnp.finfo(x.dtype).eps ** ROUNDING
+    return little * jnp.abs(jax.lax.stop_gradient(x)) + little**2
 
 
 class Contacts(NamedTuple):
@@ -169,8 +180,8 @@ def _scales(flat, t, q, v):
     G = jnp.abs(jax.jacfwd(flat.gaps, argnums=1)(t, q))
     drift = jnp.abs(gap_accelerations(flat, t, q, v, jnp.zeros_like(v)))
     force, size = jnp.abs(inertia(flat, t, q, v)[0].mv(free)), jnp.sum(G**2, axis=1)
-    eps = ROUNDING * jnp.finfo(v.dtype).eps
-    return eps * (G @ force) / jnp.where(size > 0, size, 1), eps * (G @ jnp.abs(free) + drift)
+    little = jnp.finfo(v.dtype).eps ** ROUNDING
+    return little * (G @ force) / jnp.where(size > 0, size, 1), little * (G @ jnp.abs(free) + drift)
 
 
 def idle(flat: Flat, elements: FrictionElements, sigma: Float[Array, " r"], bound: Float[Array, " e"]) -> Bool[Array, " e"]:

@@ -157,6 +157,10 @@ def check(system: System, t: Array, q: Arrays, qdot: Arrays, params: PyTree, sta
                     f"{role(slot, name)} must return residuals, but returned {described(out)}. "
                     "Return what has to be zero, e.g. `q @ q - l**2`."
                 )
+            if slot == "unilateral" and not (isinstance(out, jax.ShapeDtypeStruct) and out.shape == ()):
+                raise ValueError(
+                    f"{role(slot, name)} must return one gap, a real number, but returned {described(out)}. Give each contact its name."
+                )
     for name, function in system.force:
         label, state = role("force", name), {"t": t, "q": q, "qdot": qdot, "multipliers": _multipliers(system, t, q, qdot, params, beside)}
         _shape_of(function, label, params, functools.partial(flat_like, q, label), **state, **beside)

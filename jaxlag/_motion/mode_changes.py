@@ -20,7 +20,7 @@ from .._mechanics.contact import (
     select_closed,
 )
 from .._mechanics.friction_elements import FrictionElements
-from .._mechanics.impact import Impact, impact, no_impact
+from .._mechanics.impact import impact, no_impact
 from .._mechanics.stick_slip import Mode, first_mode, friction, select_mode, slip_of, sticking
 from .._model.flat import Flat, StatesAt
 from .._program.jit import jitted
@@ -29,7 +29,8 @@ from .first_order import EquationsOfMotion
 from .protocol import Arguments
 from .state_vector import Parts, Start
 
-CONVERGED = 1e-9  # of the motion, the time that infinitely many impacts may yet take when they are summed up
+CONVERGED = 1e-9  # of the motion, the time that infinitely many impacts may yet take when they are summed up,
+LOW = 10  # or, in roundings of the gap, the height of the last flight
 
 
 class Change(NamedTuple):
@@ -77,7 +78,7 @@ def _margins(equations: EquationsOfMotion, t, parts: Parts, args):
 def _contact_margins(flat: Flat, t, q, closed, forces):
     """The force of a closed contact, the gap of an open one: with some of their rounding, since both begin at zero."""
     rounding = gap_scales(flat, t, q, q, roundings(q), q).gap
-    little = ROUNDING * jnp.finfo(q.dtype).eps * jnp.max(jnp.abs(jax.lax.stop_gradient(forces)), initial=0.0)
+    little = jnp.finfo(q.dtype).eps ** ROUNDING * jnp.max(jnp.abs(jax.lax.stop_gradient(forces)), initial=0.0)
     return jnp.where(closed, forces + little, flat.gaps(t, q) + rounding)
 
 
@@ -110,14 +111,20 @@ def approach(equations: EquationsOfMotion, path: Callable, t, y, args: Arguments
     return Approach(lambda start, end: jnp.all(~closed & (of_gaps(start, end)[0] > 0)), may_close)
 
 
-def exact_slopes(equations: EquationsOfMotion, t, y, args: Arguments, slopes: Float[Array, " m"]) -> Float[Array, " m"]:
-    """Slopes of the margins, those of open contacts made exact: the rate ġ, which is small among many impacts, is no difference of gaps."""
+def to_locate(equations: EquationsOfMotion, t, y, args: Arguments, slopes: Float[Array, " m"]) -> tuple[Array, Array]:
+    """Margins and slopes for Newton's method. Those of open contacts are g and ġ as they are: among many impacts a gap is hardly more than
+    its rounding, and its rate is no difference of gaps.
+    """
+    found = margins(equations, t, y, args, y)[: equations.modes]
     if not equations.contacts:
-        return slopes
+        return found, slopes
     parts = equations.parts(y)
     flat, _, _ = equations.mode(t, parts, args)
-    rates = jnp.where(parts.closed > 0.5, slopes[equations.elements :], gap_rates(flat, t, parts.q, parts.v))
-    return jax.lax.stop_gradient(jnp.concatenate([slopes[: equations.elements], rates]))
+    (values, of_contacts), (falls, rises) = (jnp.split(x, [equations.elements]) for x in (found, slopes))
+    is_closed = parts.closed > 0.5
+    gaps = jnp.where(is_closed, of_contacts, flat.gaps(t, parts.q))
+    rates = jnp.where(is_closed, rises, gap_rates(flat, t, parts.q, parts.v))
+    return jnp.concatenate([values, gaps]), jax.lax.stop_gradient(jnp.concatenate([falls, rates]))
 
 
 @jitted
@@ -155,8 +162,10 @@ def behind_contact(equations: EquationsOfMotion, t, parts: Parts, args: Argument
     hits = near & ~opening & (gap_rates(flat, t, q, before) < -scales.rate)
     is_impact = jnp.any(hits)
     duration = jnp.inf if args.scales is None else args.scales.duration
-    remaining, converged = _last_impacts(t, parts, hits & of_contact, duration)
-    e = jnp.where(converged, 0, flat.restitution(t, jnp.maximum(-gap_rates(flat, t, q, before), 0)))
+    speed = jnp.maximum(-gap_rates(flat, t, q, before), 0)
+    is_low = speed * (t - parts.changed) / 4 <= LOW * scales.gap
+    ratio, remaining, converged = _last_impacts(t, parts, hits & of_contact, is_low, duration)
+    e = jnp.where(converged, 0, flat.restitution(t, speed))
 
     def struck():
         there = on_contact(flat, t, q, before, closed | hits)
@@ -166,7 +175,8 @@ def behind_contact(equations: EquationsOfMotion, t, parts: Parts, args: Argument
     if equations.works:
         does = jnp.stack([jnp.asarray(found.works.get(name, 0.0), before.dtype) for name in equations.works])
         parts = parts._replace(works=parts.works + does)
-    parts = parts._replace(q=q, v=found.v, **_counted(t, parts, hits, opening, found, jnp.where(converged, remaining, 0)))
+    impulses = found.impulses * jnp.where(converged, (1 + ratio) / jnp.where(converged, 1 - ratio, 1), 1)
+    parts = parts._replace(q=q, v=found.v, **_counted(t, parts, hits, opening, impulses, jnp.where(converged, remaining, 0)))
     resting = near & ~opening & (jnp.abs(gap_rates(flat, t, q, found.v)) <= scales.rate)
     if elements is None:
         chosen = select_closed(flat, t, q, found.v, resting)
@@ -188,24 +198,24 @@ def behind_contact(equations: EquationsOfMotion, t, parts: Parts, args: Argument
     return Change(equations.projected(t, parts.y, args), chosen.consistent & found.consistent, found.dissipates, found.impulsive, at_rest)
 
 
-def _last_impacts(t, parts: Parts, hits, duration):
-    """Of each contact, the time that the impacts that are still to come will take, flights that shrink by one ratio; and whether that is
-    next to nothing, so that this impact may stand for them all.
+def _last_impacts(t, parts: Parts, hits, is_low, duration):
+    """Of each contact, the ratio by which flights shrink, the time that the impacts that are still to come will take; and whether that is
+    next to nothing, so that this impact may stand for them all, its impulse with theirs.
     """
     flight, before = t - parts.changed, parts.flight
     ratio = flight / jnp.where(before > 0, before, 1)
     shrinks = (before > 0) & (ratio < 1) & (parts.impacts >= 2)
     remaining = flight * ratio / jnp.where(shrinks, 1 - ratio, 1)
-    return remaining, hits & shrinks & (remaining < CONVERGED * duration)
+    return ratio, remaining, hits & shrinks & ((remaining < CONVERGED * duration) | is_low)
 
 
-def _counted(t, parts: Parts, hits, opening, found: Impact, remaining):
+def _counted(t, parts: Parts, hits, opening, impulses, remaining):
     """What is kept of each contact, behind an impact or an opening."""
     return {
         "impacts": parts.impacts + hits,
         "changed": jnp.where(hits, t + remaining, parts.changed),
         "flight": jnp.where(hits, t - parts.changed, jnp.where(opening, 0, parts.flight)),
-        "impulse": parts.impulse + found.impulses,
+        "impulse": parts.impulse + impulses,
     }
 
 

@@ -86,9 +86,11 @@ def first_end(
         value, slope, change = look(ts)
         hidden = jax.vmap(hides)(ts[:-1], ts[1:])
         largest = jnp.maximum(largest, jnp.max(jnp.abs(value), axis=0))
-        value = value + (np.where(np.arange(2 * elements) < elements, 0, 1e-9) * largest)[None]  # a bound of zero is none that is negative
+        value = value + jnp.where(np.arange(2 * elements) < elements, 0, 1e-9 * largest)[None]  # a bound of zero is none that is negative
         beyond = jnp.any(value[1:] < 0, axis=1)
-        doubtful = jnp.any(_dips(value, slope, part) & (part > near) | (hidden | (value[:-1] + value[1:] < change)) & (part > brief), axis=1)
+        doubtful = jnp.any(
+            _dips(value, slope, part) & (part > near) | (hidden | (value[:-1] + value[1:] < change)) & (part > brief), axis=1
+        )
         wanted = beyond | (doubtful & ~found)
         i = jnp.where(jnp.any(wanted), jnp.argmax(wanted), LOOKS - 1)  # the end itself may be beyond by rounding alone
         onward = ~found & ~jnp.any(wanted)
@@ -142,7 +144,7 @@ def _around(low, high, before, behind):
     """Times close to where the first of some chords is zero, and halfway, for a margin that jumps."""
     share = jnp.where(behind < 0, before / jnp.where(behind < 0, before - behind, 1), 1)
     root = low + (high - low) * jnp.clip(jnp.min(share), 0, 1)
-    near = (high - low) * np.array([*NEARER, *(-d for d in NEARER)])
+    near = (high - low) * np.array([*NEARER, *(-d for d in NEARER)], low.dtype)
     return _ascending(jnp.clip(jnp.stack([low, high, (low + high) / 2, *(root + near)]), low, high))
 
 
