@@ -83,8 +83,8 @@ def _contact_margins(flat: Flat, t, q, closed, forces):
 
 
 class Approach(NamedTuple):
-    """What is known of the gaps along the path of a step: whether all contacts stay open from one time to another, and of the margins of all
-    modes, whether they may be negative between two times.
+    """What is known of the gaps along the path of a step: whether all contacts stay open from one time to another, and of the margins of
+    all modes, whether they may be negative between two times.
     """
 
     stay_open: Callable
@@ -92,7 +92,7 @@ class Approach(NamedTuple):
 
 
 def approach(equations: EquationsOfMotion, path: Callable, t, y, args: Arguments) -> Approach | None:
-    """Bounds of the gaps and of their rates, within which a gap that rises or falls all the time is seen at the ends; None if there are none."""
+    """Bounds of the gaps and of their rates; None where there are none. A gap that rises or falls all the time is seen at the ends."""
     closed = equations.parts(y).closed > 0.5
 
     def gaps(t):
@@ -111,20 +111,30 @@ def approach(equations: EquationsOfMotion, path: Callable, t, y, args: Arguments
     return Approach(lambda start, end: jnp.all(~closed & (of_gaps(start, end)[0] > 0)), may_close)
 
 
-def to_locate(equations: EquationsOfMotion, t, y, args: Arguments, slopes: Float[Array, " m"]) -> tuple[Array, Array]:
-    """Margins and slopes for Newton's method. Those of open contacts are g and ġ as they are: among many impacts a gap is hardly more than
-    its rounding, and its rate is no difference of gaps.
+class AtEnd(NamedTuple):
+    """Margins and slopes at the end of a mode, for Newton's method; and by how much rounding may have hidden the end from a step before."""
+
+    value: Float[Array, " m"]
+    slope: Float[Array, " m"]
+    late: Float[Array, " m"]
+
+
+def at_end(equations: EquationsOfMotion, t, y, args: Arguments, slopes: Float[Array, " m"]) -> AtEnd:
+    """With `slopes` of the margins, those of open contacts apart, which are g and ġ as they are: among many impacts a gap is hardly more
+    than its rounding, and its rate is no difference of gaps.
     """
     found = margins(equations, t, y, args, y)[: equations.modes]
     if not equations.contacts:
-        return found, slopes
+        return AtEnd(found, slopes, jnp.zeros_like(slopes))
     parts = equations.parts(y)
     flat, _, _ = equations.mode(t, parts, args)
     (values, of_contacts), (falls, rises) = (jnp.split(x, [equations.elements]) for x in (found, slopes))
     is_closed = parts.closed > 0.5
     gaps = jnp.where(is_closed, of_contacts, flat.gaps(t, parts.q))
     rates = jnp.where(is_closed, rises, gap_rates(flat, t, parts.q, parts.v))
-    return jnp.concatenate([values, gaps]), jax.lax.stop_gradient(jnp.concatenate([falls, rates]))
+    hidden = jnp.where(~is_closed & (rates < 0), 2 * (of_contacts - gaps) / jnp.where(rates < 0, -rates, 1), 0)
+    slope, late = jnp.concatenate([falls, rates]), jnp.concatenate([jnp.zeros_like(falls), hidden])
+    return AtEnd(jnp.concatenate([values, gaps]), *jax.lax.stop_gradient((slope, late)))
 
 
 @jitted
@@ -163,7 +173,7 @@ def behind_contact(equations: EquationsOfMotion, t, parts: Parts, args: Argument
     is_impact = jnp.any(hits)
     duration = jnp.inf if args.scales is None else args.scales.duration
     speed = jnp.maximum(-gap_rates(flat, t, q, before), 0)
-    is_low = speed * (t - parts.changed) / 4 <= LOW * scales.gap
+    is_low = speed * (t - parts.changed) / 4 <= LOW * gap_scales(flat, t, q, before, roundings(q), before).gap
     ratio, remaining, converged = _last_impacts(t, parts, hits & of_contact, is_low, duration)
     e = jnp.where(converged, 0, flat.restitution(t, speed))
 

@@ -48,8 +48,8 @@ class RESULTS(dfx.RESULTS):  # pyright: ignore
         "contacts of different restitution. Lower `restitution` or the coefficient of friction."
     )
     not_impulsive = (
-        "`dissipation` must be homogeneous in the force of a contact that it follows, as mu * multipliers['table'] * |v| is, for an impact to "
-        "say what its friction is, but is not. Write it so."
+        "`dissipation` must be homogeneous in the force of a contact that it follows, as mu * multipliers['table'] * |v| is, for an impact "
+        "to say what its friction is, but is not. Write it so."
     )
     chattering = (
         "friction changed between sliding and sticking more than `max_transitions` times: it chatters. "

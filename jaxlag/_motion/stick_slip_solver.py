@@ -11,7 +11,7 @@ import numpy as np
 
 from .._program.jit import jitted
 from .first_order import EquationsOfMotion
-from .mode_changes import approach, changed, margins, to_locate
+from .mode_changes import approach, at_end, changed, margins
 from .results import RESULTS, under_diffrax
 from .runge_kutta import ExplicitRungeKutta
 from .step_monitor import Seen, first_end, is_hidden
@@ -147,12 +147,12 @@ class StickSlipSolver(ProjectedSolver):
 
     def _locate(self, split: Split, done: Piece, end, t0, t1, args, last) -> Split:
         """A Newton step for the time at which the mode ends, from the margins at the end of the piece; after the last, the next mode."""
-        value, slope = to_locate(self.equations, end, done.y, args, split.seen.slope)
+        value, slope, late = at_end(self.equations, end, done.y, args, split.seen.slope)
         falling = slope < 0
         until = jnp.where(falling, jnp.abs(value) / jnp.where(falling, -slope, 1), jnp.inf)
         nearest = jax.lax.stop_gradient(jnp.argmin(until))
         estimate = end - value[nearest] / jnp.where(falling[nearest], slope[nearest], -jnp.inf)
-        usable = jnp.any(falling) & (end >= t0) & (end < t1)
+        usable = jnp.any(falling) & (end >= t0 - late[nearest]) & (end < t1)
         located = split._replace(first=done, cut=split.cut._replace(time=end, estimate=estimate, usable=usable))
         simultaneous = falling & (value <= -slope * SIMULTANEOUS * args.scales.rounding)
         ended = (jnp.arange(value.size) == nearest) | simultaneous
