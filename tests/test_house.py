@@ -101,6 +101,7 @@ WINGS = {  # each imports only from those above it, and each file of a wing only
         "simulate_many",
     ],
     "_linear": [
+        "origin",
         "inputs",
         "tangent_space",
         "dynamics",
@@ -122,6 +123,8 @@ WINGS = {  # each imports only from those above it, and each file of a wing only
         "zero_eigenvalues",
         "crossing",
         "root_locus",
+        "parameter_plane",
+        "stability_map",
     ],
     "_fit": [
         "experiment",
@@ -196,7 +199,10 @@ WINGS = {  # each imports only from those above it, and each file of a wing only
         "linear",
         "animation",
         "moving_picture",
+        "mode_on_points",
         "animate",
+        "mode_shapes",
+        "stability_map",
         "fit",
     ],
 }
