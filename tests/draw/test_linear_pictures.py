@@ -106,7 +106,7 @@ def test_a_complex_mode_runs_along_ellipses():
     found = np.fft.fft(tracks, axis=0)[-1]  # x = Re(d e^{iφ})
     ratio = (a + b) / a if slow.eigenvalues.imag > 0 else np.conj((a + b) / a)
     np.testing.assert_allclose(np.conj(found[1] / found[0]), ratio, rtol=1e-6)
-    assert "ζ" in moving.ax.get_title()
+    assert "ζ" in moving.ax.get_title("left")
 
 
 def test_what_modes_are_not_drawn():
