@@ -18,12 +18,14 @@ REFERENCE = {
     "Residual consistent_state examine Examination",
     "Motions": "simulate simulate_many Trajectory FrictionState RESULTS Instant Interpolated load Dop853 Dopri5 Projection Baumgarte "
     "NoStabilisation StickSlip Regularised keep_compiled",
-    "Near a steady state": "equilibrium steady Equilibrium linearise LinearSystem Modes root_locus RootLocus Crossing",
+    "Near a steady state": "equilibrium steady Equilibrium linearise LinearSystem Modes root_locus RootLocus Crossing "
+    "stability_map StabilityMap",
     "Identification": "Experiment ModalTest FrequencyResponseTest fit fit_each Fit Channel Interval Prediction regress Regression Regress "
     "validate Validation compare Comparison information Information Huber learnt.ConvexDissipation learnt.PassiveDissipation "
     "learnt.Potential learnt.ConvexPotential",
     "On paper": "equations Equations LinearisedEquations to_sympy",
     "Pictures": "plot.motion plot.phase plot.forces plot.energy plot.balance plot.friction plot.bode plot.nyquist plot.root_locus "
+    "plot.mode_shapes plot.stability_map "
     "plot.fit plot.parameters plot.convergence plot.equations animate",
 }
 

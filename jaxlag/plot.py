@@ -11,6 +11,7 @@ from ._draw.forces import forces, friction
 from ._draw.linear import bode, nyquist, root_locus
 from ._draw.mode_shapes import mode_shapes
 from ._draw.motion import balance, energy, motion, phase
+from ._draw.stability_map import stability_map
 from ._paper.linearised_result import LinearisedEquations
 from ._paper.result import Equations
 
@@ -29,6 +30,7 @@ __all__ = [
     "parameters",
     "phase",
     "root_locus",
+    "stability_map",
 ]
 
 

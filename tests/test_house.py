@@ -107,6 +107,7 @@ WINGS = {  # each imports only from those above it, and each file of a wing only
         "simulate_many",
     ],
     "_linear": [
+        "origin",
         "inputs",
         "tangent_space",
         "dynamics",
@@ -128,6 +129,8 @@ WINGS = {  # each imports only from those above it, and each file of a wing only
         "zero_eigenvalues",
         "crossing",
         "root_locus",
+        "parameter_plane",
+        "stability_map",
     ],
     "_fit": [
         "experiment",
@@ -202,7 +205,10 @@ WINGS = {  # each imports only from those above it, and each file of a wing only
         "linear",
         "animation",
         "moving_picture",
+        "mode_on_points",
         "animate",
+        "mode_shapes",
+        "stability_map",
         "fit",
     ],
 }

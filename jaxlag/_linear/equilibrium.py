@@ -181,18 +181,19 @@ def _found(system: System, q: PyTree, qdot: PyTree, params: PyTree, t: Any, stat
     given = system, t, q, qdot, parameters(params, q), given_states(system, states, q)
     found, names = steady_state(search, *given), entry_names(q, "q")
     is_known = is_concrete(jax.lax.stop_gradient(found))
-    if found.friction and not (is_known and seen(found).succeeded):
+    values = seen(found)
+    if found.friction and not (is_known and values is not None and values.succeeded):
         held = steady_state(search._replace(held=True), *given)
         found = held if is_known else jax.tree.map(lambda free, held: jnp.where(found.succeeded, free, held), found, held)
-    values = seen(found)
+        values = seen(found)
     if values is not None:
         values = jax.tree.map(np.asarray, values)
         _refuse(values, names)
-    if not is_known:
-        return Equilibrium(*found[:6], None, f"not known under `{'jit' if values is None else 'vmap'}`", ())
+    if values is None or not is_known:
+        return Equilibrium(*found[:5], found.t, None, f"not known under `{'jit' if values is None else 'vmap'}`", ())
     stiffness, kind = stability(system, values)
     shown = None if stiffness is None else without_derivative(stiffness, given)
-    return Equilibrium(*found[:6], shown, kind, undecided(values, names))
+    return Equilibrium(*found[:5], found.t, shown, kind, undecided(values, names))
 
 
 def _refuse(found, names):

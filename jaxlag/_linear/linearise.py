@@ -192,4 +192,7 @@ def _linear_system(near: _Near, choice: Choice, found: Matrices, q: PyTree, qdot
         output_names=entry_names(shapes, "q" if choice.outputs is None else "y"),
         coordinates=Coordinates(at, Layout.of(like), Layout.of(near.first_order), Layout.of(multipliers)),
     )
-    return between_updates(near.system, params, near.sampled, found.updates, system) if choice.loops else system
+    if not choice.loops:
+        return system
+    closed = lambda updates, system: between_updates(near.system, params, near.sampled, updates, system)
+    return (closed if origin is not None else jax.vmap(closed))(found.updates, system)

@@ -90,7 +90,9 @@ def matrices(choice: Choice, system: System, t: Any, q: PyTree, qdot: PyTree, pa
     rates = jax.tree.map(lambda *rows: jnp.concatenate(rows, axis=-2), *parts)
     near = jnp.finfo(y.q.dtype).eps ** 0.375
     by_state = jnp.abs(jnp.concatenate([of.by_state for of in (qddot, z, updates)]))
-    allowed = near * by_state @ (jnp.abs(basis.T) @ (1 + jnp.abs(jnp.concatenate(y))))
+    by_held = jnp.abs(jnp.concatenate([of.by_inputs[0, :, len(choice.inputs) - choice.loops :] for of in (qddot, z, updates)]))
+    near_zero = jnp.abs(basis.T) @ (1 + jnp.abs(jnp.concatenate(y))), 1 + jnp.abs(dynamics.held[: choice.loops])
+    allowed = near * (by_state @ near_zero[0] + by_held @ near_zero[1])
     allowed = allowed.at[:n].add(near**2 * _rounding(dynamics, y, forces.multipliers, M))
     left = jnp.concatenate([forces.qddot, found.z, found.updates - dynamics.held])
     steadiness = Steadiness(left, allowed, forces.sound.determined & forces.sound.satisfied)

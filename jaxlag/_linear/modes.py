@@ -43,27 +43,27 @@ class Modes(eqx.Module):
     `modes[0]` is one of them, which `animate` shows. Printed, it is a table. In discrete time λ is log(z)/T.
     """
 
-    eigenvalues: Complex[Array, " k"]
-    damping_ratio: Float[Array, " k"]
-    stable: Bool[Array, " k"]
-    repeated: Bool[Array, " k"]
+    eigenvalues: Complex[Array, "*k"]
+    damping_ratio: Float[Array, "*k"]
+    stable: Bool[Array, "*k"]
+    repeated: Bool[Array, "*k"]
     shapes: PyTree
     multipliers: dict[str, PyTree]
     states: dict[str, PyTree]
     origin: Origin | None
 
     @property
-    def angular_frequency(self) -> Float[Array, " k"]:
+    def angular_frequency(self) -> Float[Array, "*k"]:
         """ω₀ = |λ|, in rad/time."""
         return _size(self.eigenvalues)
 
     @property
-    def frequency(self) -> Float[Array, " k"]:
+    def frequency(self) -> Float[Array, "*k"]:
         """ω₀/2π, in 1/time."""
         return self.angular_frequency / (2 * jnp.pi)
 
     @property
-    def time_constant(self) -> Float[Array, " k"]:
+    def time_constant(self) -> Float[Array, "*k"]:
         """1/|Re λ|, infinite where nothing decays or grows."""
         decay = jnp.abs(self.eigenvalues.real)
         return jnp.where(decay > 0, 1 / jnp.where(decay > 0, decay, 1), jnp.inf)

@@ -1,5 +1,6 @@
 """Steady states, and the motion near them, on a grid of two parameters."""
 
+import functools
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
@@ -70,10 +71,8 @@ class ParameterPlane:
             A = np.asarray(near.rates.by_state)
             later, _ = self._near(choice, x, row, np.array([a_little(one) for one in A]))
             for j in range(self.shape[1]):
-                reason = self._why_missing(row, j, off[j]) or why_unsteady(
-                    _entry(near, j), lambda _, j=j, later=later: _entry(later, j), names
-                )
-                if reason:
+                soon = functools.partial(lambda later, j, _: _entry(later, j), later, j)
+                if reason := self._why_missing(row, j, float(off[j])) or why_unsteady(_entry(near, j), soon, names):
                     missing[i, j] = reason
             As.append(list(A))
         return As, missing

@@ -9,8 +9,9 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float, PyTree
 
-from .._mechanics.friction_elements import find_elements
+from .._mechanics.friction_elements import FrictionElements, find_elements
 from .._mechanics.lagrange import applied_force, constraint_rows, inertia
+from .._mechanics.stick_slip import in_mode, slip_of, sticking
 from .._model.flat import Flat, StatesAt, bind
 from .._model.state_values import Layout, start_values
 from .._model.system import System
@@ -39,6 +40,7 @@ class Rest(NamedTuple):
     states: dict[str, PyTree]
     multipliers: dict[str, PyTree]
     friction: dict[str, tuple[Array, Array]]  # force and bound
+    slips: Bool[Array, ""]  # whether some of it does
     t: Array
     succeeded: Bool[Array, ""]
     uniform: Bool[Array, ""]  # whether it stays as it is
@@ -94,17 +96,18 @@ class Equations:
         rates = ravel_pytree(flat.state_rates(given.t, q, v))[0]
         values, updates = self.unravel_states(of.states), flat.updates(given.t, q, v)
         changes = ravel_pytree([jax.tree.map(jnp.subtract, new, values[name]) for name, new in updates.items()])[0]
-        return jnp.concatenate([self.force(flat, given.t, q, v, of), g, psi, rates, changes]).astype(w.dtype)
+        return jnp.concatenate([self.force(flat, given, q, v, of), g, psi, rates, changes]).astype(w.dtype)
 
-    def force(self, flat: Flat, t: Any, q: Array, v: Array, of: Unknowns) -> Float[Array, " n"]:
-        """f + Gᵀλ without dry friction, or with what it would have to hold."""
+    def force(self, flat: Flat, given: Given, q: Array, v: Array, of: Unknowns) -> Float[Array, " n"]:
+        """f + Gᵀλ with dry friction where it slips; where it does not, without it, or with what it would have to hold."""
+        t, held = given.t, 0.0
         elements = find_elements(flat, t, q, v)
-        held = 0.0
         if elements is not None:
-            potentials, nothing = elements.potentials, jnp.zeros(elements.size, v.dtype)
-            without = {name: lambda *state, D=D: D(*state, nothing) for name, D in potentials.items()}
-            flat = flat._replace(dissipations=without)
-            held = jax.vjp(lambda v: elements.slip(t, q, v), v)[1](of.friction)[0] if self.friction_rows else 0.0
+            sigma = directions_of_slip(elements, given)
+            flat = flat._replace(dissipations=in_mode(flat, elements, sigma).dissipations)
+            if self.friction_rows:
+                holding = jnp.where(sticking(elements, sigma)[elements.element_of_row], of.friction, 0)
+                held = jax.vjp(lambda v: elements.slip(t, q, v), v)[1](holding)[0]
         _, G, _ = constraint_rows(flat, t, q, v)
         return inertia(flat, t, q, v)[1] + applied_force(flat, t, q, v, of.multipliers) + G.T @ of.multipliers + held
 
@@ -121,7 +124,7 @@ def steady_state(search: Search, system: System, t: Any, q: PyTree, qdot: PyTree
         start = minimum_near(lambda q: -flat.lagrangian(t, q, v0), lambda q: flat.holonomic(t, q), start, equations.moving)
     nothing = jnp.zeros(flat.rows, q0.dtype), jnp.zeros(equations.friction_rows, q0.dtype)
     of = Unknowns(start[equations.moving], v0[equations.running], ravel_pytree(values)[0].astype(q0.dtype), *nothing)
-    f, (_, G, _) = equations.force(flat, t, start, v0, of), constraint_rows(flat, t, start, v0)
+    f, (_, G, _) = equations.force(flat, given, start, v0, of), constraint_rows(flat, t, start, v0)
     of = of._replace(multipliers=least_change(G.T, -f, 1.0) if flat.rows else of.multipliers)
     ease = jnp.ones(sum(x.size for x in of), q0.dtype).at[equations.sizes[2] :].set(1e8 if search.held else 1.0)  # q stays if it can
     w, found = root_near(equations, given, jnp.concatenate(of), ease)
@@ -142,7 +145,7 @@ def _described(equations: Equations, given: Given, w: Array, found: Array) -> Re
     if flat.rows:  # of dependent rows, those of least norm
         _, G, _ = constraint_rows(flat, t, q, v)
         multipliers = least_change(G.T, G.T @ multipliers, 1.0)
-    friction, holds = _friction(equations, flat, t, q, v, of)
+    friction, holds, slips = _friction(equations, flat, given, q, v, of)
     succeeded = found & holds
     shown = lambda x: jnp.where(succeeded, x, jnp.nan)
     states = jax.tree.map(shown, equations.unravel_states(of.states))
@@ -152,6 +155,7 @@ def _described(equations: Equations, given: Given, w: Array, found: Array) -> Re
         states,
         flat.unravel_multipliers(shown(multipliers)),
         friction,
+        slips,
         t,
         succeeded,
         uniform,
@@ -163,18 +167,31 @@ def _described(equations: Equations, given: Given, w: Array, found: Array) -> Re
 
 
 def _friction(
-    equations: Equations, flat: Flat, t: Any, q: Array, v: Array, of: Unknowns
-) -> tuple[dict[str, tuple[Array, Array]], Bool[Array, ""]]:
-    """By dissipation term, the friction force at rest and its bound; and whether all forces are within their bounds."""
+    equations: Equations, flat: Flat, given: Given, q: Array, v: Array, of: Unknowns
+) -> tuple[dict[str, tuple[Array, Array]], Bool[Array, ""], Bool[Array, ""]]:
+    """By dissipation term, the friction force and its bound; whether all forces are within their bounds, and against the slip; and
+    whether anything slips.
+    """
+    t = given.t
     elements = find_elements(flat, t, q, v)
     if elements is None:
-        return {}, jnp.array(True)
-    nothing, force = jnp.zeros(elements.size, v.dtype), of.friction if equations.friction_rows else jnp.zeros(elements.element_of_row.size)
-    bounds = {
-        name: jax.grad(lambda u, D=D: D(t, q, v, of.multipliers, u))(nothing)[elements.element_of_row[elements.rows_of_term[name]]]
-        for name, D in elements.potentials.items()
-        if name in elements.rows_of_term
-    }
-    total = jax.grad(lambda u: sum(D(t, q, v, of.multipliers, u) for D in elements.potentials.values()))(nothing)
-    holds = jnp.all(elements.norms(force) <= total * (1 + jnp.finfo(v.dtype).eps ** 0.5))
-    return {name: (force[elements.rows_of_term[name]], bound) for name, bound in bounds.items()}, holds
+        return {}, jnp.array(True), jnp.array(False)
+    sigma, slip, row = directions_of_slip(elements, given), elements.slip(t, q, v), elements.element_of_row
+    stuck, extent = sticking(elements, sigma), elements.norms(jnp.where(sigma == 0, 0, slip))
+    slope = lambda D: jax.grad(lambda u: D(t, q, v, of.multipliers, u))(extent)
+    total = slope(lambda *state: sum(D(*state) for D in elements.potentials.values()))
+    held = of.friction if equations.friction_rows else jnp.zeros(row.size)
+    bounds = {name: slope(D)[row[elements.rows_of_term[name]]] for name, D in elements.potentials.items() if name in elements.rows_of_term}
+    forces = {name: jnp.where(stuck[row[rows]], held[rows], -bounds[name] * sigma[rows]) for name, rows in elements.rows_of_term.items()}
+    within = elements.norms(held) <= total * (1 + jnp.finfo(v.dtype).eps ** 0.5)
+    holds = jnp.all(jnp.where(stuck, within, elements.sums(sigma * slip) > 0))
+    return {name: (forces[name], bounds[name]) for name in bounds}, holds, ~jnp.all(stuck)
+
+
+def directions_of_slip(elements: FrictionElements, given: Given) -> Float[Array, " r"]:
+    """Of the rows of each element that slips in the guess, as on a belt that runs; 0 of what rests there."""
+    _, t, q, v = jax.lax.stop_gradient(given)
+    slip = elements.slip(t, q, v)
+    size = elements.norms(slip)
+    at_rest = size <= slip_of(elements, t, q, v, 1e2 * jnp.finfo(v.dtype).eps * jnp.abs(v))
+    return jnp.where(at_rest[elements.element_of_row], 0, slip / jnp.where(at_rest, 1, size)[elements.element_of_row])

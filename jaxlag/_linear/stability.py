@@ -20,6 +20,8 @@ def stability(system: System, found: Rest) -> tuple[Array | None, str]:
         return None, ELSEWHERE
     if system.nonholonomic or system.states:
         return None, f"{ELSEWHERE}: there are states or nonholonomic constraints"
+    if found.slips:
+        return None, f"{ELSEWHERE}: friction slips"
     if any(np.any(force) for force, _ in found.friction.values()):
         return None, "held by friction"
     n, eps = len(found.M), float(np.finfo(found.M.dtype).eps)

@@ -1,135 +1,23 @@
-"""A, B, C and D against motions of the full system, against algebra by hand and against SciPy; what is refused."""
+"""A, B, C and D against algebra by hand and against SciPy; what is refused. Motions beside examples: `test_linearise_examples`."""
 
 import functools
-from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import linear_by_hand as by_hand
 import numpy as np
 import pytest
-from jax.flatten_util import ravel_pytree
 from linear_by_hand import FULL
 from scipy import signal
-from scipy.linalg import expm
 from spectra import assert_same_spectrum
 
 import jaxlag as jl
 from jaxlag.examples import pendulum, vehicle
 
 g = 9.81
-SHARP = {"rtol": 1e-11, "atol": 1e-12}
-SMALL = 1e-4  # deviations of motions: their squares and the errors of the motions, over them, are below SHOWN
-SHOWN = 1e-6
 
 
-# Motions near a steady one: T exp(A τ) x, to first order in x
-
-
-class Example(NamedTuple):
-    system: jl.System
-    q: Any
-    qdot: Any
-    params: dict
-    time: float
-    states: Any = None
-
-
-def four_bar():
-    """Three uniform bars that hang between two bearings, as symmetric as they are."""
-    e = lambda angle: jnp.stack([jnp.sin(angle), -jnp.cos(angle)])
-
-    def centres(q, a, b, c):
-        far = jnp.array([1.0, 0.0])
-        return jnp.stack([a / 2 * e(q["alpha"]), a * e(q["alpha"]) + b / 2 * e(q["beta"]), far + c / 2 * e(q["gamma"])])
-
-    def bars(t, q, qdot, params):
-        lengths = jnp.stack([params[name] for name in "abc"])
-        turning = lengths * jnp.stack([qdot[name] for name in ("alpha", "beta", "gamma")])
-        moving = jnp.sum(jl.rate(centres)(t, q, qdot, params) ** 2, axis=1)
-        return 0.5 * lengths @ (moving + turning**2 / 12) - g * lengths @ centres(q, *lengths)[:, 1]
-
-    loop = lambda q, a, b, c: a * e(q["alpha"]) + b * e(q["beta"]) - c * e(q["gamma"]) - jnp.array([1.0, 0.0])
-    q = {"alpha": np.arcsin(0.25), "beta": np.pi / 2, "gamma": -np.arcsin(0.25)}
-    return Example(jl.System(bars, holonomic={"loop": loop}), q, dict.fromkeys(q, 0.0), {"a": 0.8, "b": 0.6, "c": 0.8}, 0.5)
-
-
-def rolling_coin():
-    """Upright and fast enough, its coordinates from notebook 7."""
-    from test_modes import COIN, FLAT, UNIT, rolling
-
-    return Example(COIN, FLAT, rolling(0.8, 1.0), UNIT, 1.0)
-
-
-def bead():
-    """On a hoop that turns freely, away from its lowest point: φ runs uniformly; gravity and centrifugal force are in balance."""
-    spherical = lambda q, qdot, R, I: (
-        0.5 * R**2 * (qdot["theta"] ** 2 + (qdot["phi"] * jnp.sin(q["theta"])) ** 2)
-        + 0.5 * I * qdot["phi"] ** 2
-        + g * R * jnp.cos(q["theta"])
-    )
-    R, Omega = 0.2, 9.0
-    return Example(
-        jl.System(spherical), {"theta": np.arccos(g / (Omega**2 * R)), "phi": 0.3}, {"theta": 0.0, "phi": Omega}, {"R": R, "I": 0.01}, 0.4
-    )
-
-
-def hinged():
-    return Example(pendulum.cartesian, *pendulum.cartesian_state(0.0, 0.0, 1.0), pendulum.params, 0.5)
-
-
-def driven_vehicle():
-    p = vehicle.params
-    speed = np.sqrt(p["M0"] / (p["r"] * p["k"])) - p["v"]
-    q = {"x": 1.0, "y": p["l"] - p["M"] * g / (2 * p["c"]), "phi": 0.0}
-    return Example(vehicle.system, q, {"x": speed, "y": 0.0, "phi": 0.0}, p, 0.3)
-
-
-def servo():
-    """A pendulum held by a motor with a lag and an integrating controller: two states beside q."""
-    system = jl.System(
-        lambda q, qdot, m, l: 0.5 * m * (l * qdot) ** 2 + m * g * l * jnp.cos(q),
-        force=lambda M: M,
-        states={
-            "M": jl.State(
-                lambda M, q, qdot, total, tau: (8.0 * (0.6 - q) - 1.0 * qdot + total - M) / tau, start=lambda m, l: m * g * l * jnp.sin(0.6)
-            ),
-            "total": jl.State(lambda q: 5.0 * (0.6 - q), start=lambda m, l: m * g * l * jnp.sin(0.6)),
-        },
-    )
-    p = {"m": 0.5, "l": 0.4, "tau": 0.05}
-    held = p["m"] * g * p["l"] * np.sin(0.6)
-    return Example(system, 0.6, 0.0, p, 0.5, {"M": held, "total": held})
-
-
-EXAMPLES = {
-    "a pendulum on a rod": hinged,
-    "four bars": four_bar,
-    "a bead on a hoop": bead,
-    "the vehicle": driven_vehicle,
-    "states": servo,
-    "a rolling coin": rolling_coin,
-}
-
-
-@pytest.mark.parametrize("name", [pytest.param(n, marks=[pytest.mark.slow] * (n in ("four bars", "a rolling coin"))) for n in EXAMPLES])
-def test_motions_near_the_steady_one(name):
-    """Each independent coordinate, velocity and state is moved a little, and the full system simulated from there."""
-    example = EXAMPLES[name]()
-    q0, shape = ravel_pytree(jax.tree.map(lambda x: jnp.asarray(x, float), (example.q, example.qdot, example.states)))
-    linear = jl.linearise(example.system, example.q, example.qdot, example.params, states=example.states)
-    ts = np.array([0.0, example.time])
-
-    def end(y):
-        q, qdot, states = shape(y)
-        motion = jl.simulate(example.system, q, qdot, ts, example.params, states=states, **SHARP)
-        last = motion.q, motion.qdot, motion.states if example.states else example.states
-        return np.asarray(ravel_pytree(jax.tree.map(lambda x: x[-1], last))[0])
-
-    basis = np.asarray(linear.basis)
-    seen = np.stack([(end(q0 + SMALL * column) - end(q0 - SMALL * column)) / (2 * SMALL) for column in basis.T], axis=1)
-    expected = basis @ expm(np.asarray(linear.A) * example.time)
-    np.testing.assert_allclose(seen, expected, rtol=0, atol=SHOWN * np.abs(expected).max())
+# The matrices and their names
 
 
 def test_the_names_of_states_and_the_basis():
@@ -312,6 +200,18 @@ def test_a_controller_with_too_large_a_gain_is_unstable():
         assert np.all(modes.stable) == stable
 
 
+def test_along_a_motion_with_a_controller():
+    """u⁺ = −9 sin q − 3 q̇, held by a unit mass: the row of u is −(9 cos q, 3, 0)."""
+    controller = jl.Sampled(lambda q, qdot: -9.0 * jnp.sin(q) - 3.0 * qdot, every=0.1, start=0.0)
+    cart = jl.System(lambda qdot: 0.5 * qdot**2, force=lambda u: u, states={"u": controller})
+    motion = jl.simulate(cart, 1.0, 0.0, np.linspace(0.0, 1.0, 6))
+    linear, q = jl.linearise(cart, motion), np.asarray(motion.q)
+    row = np.stack([-9 * np.cos(q), np.full(6, -3.0), np.zeros(6)], axis=1)
+    held = np.array([[1, 0.1, 0], [0, 1, 0]]) + np.array([[0.005], [0.1]]) * row[:, None]
+    np.testing.assert_allclose(linear.A, np.concatenate([held, row[:, None]], axis=1), rtol=1e-10, atol=1e-12)
+    assert linear.modes().eigenvalues.shape == (6, 3)
+
+
 def test_derivatives_by_the_sample_time():
     def radius(period):
         return jnp.max(jnp.abs(jl.linearise(sampled_pd(), 0.0, params=PLANT | GAINS | {"period": period}).eigenvalues))
@@ -443,10 +343,19 @@ def test_as_a_system_of_scipy():
 
 
 def test_as_a_system_of_control():
+    """The same poles and responses, also in discrete time, and with the names."""
     control = pytest.importorskip("control")
-    found = full().to_control()
-    assert isinstance(found, control.StateSpace)
-    np.testing.assert_allclose(found(1j * 3.0), expected_response([3.0])[0], rtol=1e-9)
+    found, discrete = full().to_control(), full().discrete(0.07)
+    assert isinstance(found, control.StateSpace) and found.isctime()
+    assert tuple(found.state_labels) == full().state_names and tuple(found.input_labels) == full().input_names
+    assert tuple(found.output_labels) == full().output_names
+    np.testing.assert_allclose(np.moveaxis(found(1j * RATES), -1, 0), expected_response(), rtol=1e-9, atol=1e-12)
+    assert_same_spectrum(full().eigenvalues, found.poles(), rtol=1e-10)
+    assert discrete.to_control().dt == 0.07
+    np.testing.assert_allclose(
+        np.moveaxis(discrete.to_control()(np.exp(0.07j * RATES)), -1, 0), discrete.frequency_response(RATES), rtol=1e-9, atol=1e-12
+    )
+    assert_same_spectrum(discrete.eigenvalues, discrete.to_control().poles(), rtol=1e-10)
 
 
 # Dry friction
@@ -477,7 +386,11 @@ def test_what_slips_keeps_its_force():
         dissipation={"belt": lambda qdot, F, belt: F * jnp.abs(qdot["x"] - belt)},
     )
     p = {"m": 0.4, "c": 90.0, "F": 5.0, "belt": 0.3}
-    linear = jl.linearise(system, {"x": p["F"] / p["c"]}, params=p, inputs=("F",))
+    at = jl.equilibrium(system, {"x": 0.0}, p)
+    np.testing.assert_allclose(at.q["x"], p["F"] / p["c"], rtol=1e-12)
+    np.testing.assert_allclose(at.friction["belt"], [[p["F"]], [p["F"]]], rtol=1e-12)
+    assert at.stability == "by the eigenvalues of `linearise`: friction slips"
+    linear = jl.linearise(system, at, params=p, inputs=("F",))
     w = np.sqrt(p["c"] / p["m"])
     assert_same_spectrum(linear.eigenvalues, [1j * w, -1j * w], rtol=1e-10)
     np.testing.assert_allclose(linear.B, [[0], [1 / p["m"]]], rtol=1e-12)
