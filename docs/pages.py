@@ -12,11 +12,11 @@ TEXTS = {
     "docs/architecture.md": "architecture.md",
 }
 REFERENCE = {
-    "Systems": "System State Sampled virtual_work rate substitute Signal ZeroOrderHold Linear Cubic dissipation.sliding "
-    "dissipation.viscous dissipation.drag dissipation.power_law dissipation.stribeck dissipation.speed",
+    "Systems": "System Contact State Sampled virtual_work rate substitute Signal ZeroOrderHold Linear Cubic "
+    "dissipation.sliding dissipation.viscous dissipation.drag dissipation.power_law dissipation.stribeck dissipation.speed",
     "At one state": "acceleration Acceleration mass_matrix momentum energy constraint_jacobian constraint_residual constraint_force powers "
     "Residual consistent_state examine Examination",
-    "Motions": "simulate simulate_many Trajectory FrictionState RESULTS Instant Interpolated load Dop853 Dopri5 Projection Baumgarte "
+    "Motions": "simulate simulate_many Trajectory FrictionState ContactState RESULTS Instant Interpolated load Dop853 Dopri5 Projection Baumgarte "
     "NoStabilisation StickSlip Regularised keep_compiled",
     "Near a steady state": "equilibrium steady Equilibrium linearise LinearSystem Modes root_locus RootLocus Crossing "
     "stability_map StabilityMap",

@@ -43,10 +43,8 @@ def free(flat: Flat) -> Flat:
 
         return padded
 
-    named = {"dissipations": flat.dissipations, "forces": flat.forces}
-    return flat._replace(
-        holonomic=flat.bilateral, closed=None, **{slot: {name: of_all(term) for name, term in of.items()} for slot, of in named.items()}
-    )
+    dissipations, forces = ({name: of_all(term) for name, term in of.items()} for of in (flat.dissipations, flat.forces))
+    return flat._replace(holonomic=flat.bilateral, closed=None, dissipations=dissipations, forces=forces)
 
 
 def contact_rows(flat: Flat, multipliers: Float[Array, " m"]) -> Float[Array, " c"]:

@@ -163,14 +163,13 @@ def select_mode(
 
         over = jnp.where(sticking(elements, mode.sigma), -found.margin, -jnp.inf)
         idle = search.contacts.unloaded(found.bound)  # let go at once, and for good: it has no part in what the others do
-        held_idly = idle & (over > -jnp.inf)
         beyond = _greatest(over, (over > 0) & ~idle)
         backwards = -elements.sums(found.slip_rate * mode.sigma)
         returning = _greatest(backwards, released & ~idle & (backwards > jnp.where(search.clearly, 0, 1e-6 * search.free_rate)))
         torn = _torn(elements, t, q, v, found, search.free_rate, over > -jnp.inf) & ~jnp.any(beyond)
         along = (over > -1e-6 * jnp.abs(found.bound)) & elements.are_shared  # those of a share break away together
         leaving = jnp.where((stage == FIRST) & jnp.any(breaking), breaking | along, beyond | torn)
-        leaving = jnp.where(stage == LOOSE, held_idly, leaving | held_idly)
+        leaving = (leaving & (stage != LOOSE)) | (idle & (over > -jnp.inf))
         returning = returning & ~jnp.any(leaving)
         way = jnp.where((beyond | breaking | along)[of], -found.force, found.slip_rate)
         size = elements.norms(way)[of]

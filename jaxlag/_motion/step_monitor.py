@@ -2,8 +2,8 @@
 
 A mode may end and begin again between two samples of a step in two ways. What follows the state is smooth on a step, so a dip shows in
 the slopes at the samples on both sides of it; a gap, which may be as rough as an obstacle, is bounded along the path. What follows time
-alone, such as a load that comes as a pulse, need not show at all: bounds of it over the whole interval (`_program.time_bounds`) say by how much it may have changed there. Wherever a margin may have been
-used up, samples are closer.
+alone, such as a load that comes as a pulse, need not show at all: bounds of it over the whole interval (`_program.time_bounds`) say by
+how much it may have changed there. Wherever a margin may have been used up, samples are closer.
 """
 
 from collections.abc import Callable
