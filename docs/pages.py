@@ -16,8 +16,8 @@ REFERENCE = {
     "dissipation.sliding dissipation.viscous dissipation.drag dissipation.power_law dissipation.stribeck dissipation.speed",
     "At one state": "acceleration Acceleration mass_matrix momentum energy constraint_jacobian constraint_residual constraint_force powers "
     "Residual consistent_state examine Examination",
-    "Motions": "simulate simulate_many Trajectory FrictionState ContactState RESULTS Instant Interpolated load Dop853 Dopri5 Projection Baumgarte "
-    "NoStabilisation StickSlip Regularised keep_compiled",
+    "Motions": "simulate simulate_many Trajectory FrictionState ContactState RESULTS Instant Interpolated load Dop853 Dopri5 Projection "
+    "Baumgarte NoStabilisation StickSlip Regularised keep_compiled",
     "Near a steady state": "equilibrium steady Equilibrium linearise LinearSystem Modes root_locus RootLocus Crossing "
     "stability_map StabilityMap",
     "Identification": "Experiment ModalTest FrequencyResponseTest fit fit_each Fit Channel Interval Prediction regress Regression Regress "

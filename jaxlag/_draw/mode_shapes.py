@@ -60,7 +60,7 @@ def mode_shapes(
     points = {"upper": lambda q, l: ends(q, l)[0], "lower": lambda q, l: ends(q, l)[1]}
     links = [((0.0, 0.0), "upper"), ("upper", "lower")]
     slow, fast = plot.mode_shapes(near.modes(), points, links, units={"x": "m", "t": "s"})
-    slow.get_title()  # f₀ = 0.5395 Hz, ζ = 0
+    slow.get_title()  # f₀ = 0.5396 Hz, ζ = 0
     ```
     """
     links = tuple(links)
