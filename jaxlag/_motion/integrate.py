@@ -128,7 +128,7 @@ def with_status(ys, result, conditions, inputs) -> tuple[Array, RESULTS]:
     for passed, reason in conditions:
         result = RESULTS.where(passed, result, reason)
     started = jnp.all(jnp.stack([passed for passed, _ in conditions]))
-    return jnp.where(started & jnp.isfinite(ys), ys, jnp.nan * ys), result  # so that its derivative is NaN as well
+    return jnp.where(started & jnp.isfinite(ys), ys, jnp.nan), result
 
 
 def states_at(

@@ -297,3 +297,22 @@ def test_rest_on_floors_anywhere():
 
     for at in (0.5, 0.8, 0.97):
         np.testing.assert_allclose(jax.jacfwd(end)(at), jax.grad(end_of_bouncing, 1)(H, at, G), rtol=1e-6)
+
+
+def test_a_held_force_lifts_it_off():
+    """A force that jumps opens the contact at its time; and closes another flight with an impact."""
+    lifted = jl.System(
+        lambda q, qdot, m: 0.5 * m * qdot**2 - m * G * q,
+        force=lambda t, F: F(t),
+        unilateral={"floor": jl.Contact(lambda q: q, restitution=0.5)},
+    )
+    F = jl.Signal(jnp.array([0.0, 1.0, 1.5]), jnp.array([0.0, 3 * 2.0 * G, 0.0]), jl.ZeroOrderHold())
+    ts = np.linspace(0, 4, 17)
+    motion = jl.simulate(lifted, 0.0, 0.0, ts, {"m": 2.0, "F": F}, works=True)
+    up, free = np.clip(ts - 1, 0, 0.5), np.clip(ts - 1.5, 0, None)
+    flight = G * up**2 + G * free - G * free**2 / 2  # twice g upwards for half a second, and then free
+    hit = 1.5 + 1 + np.sqrt(1.5)
+    np.testing.assert_allclose(motion.q[ts < hit], flight[ts < hit], atol=1e-12)
+    np.testing.assert_array_equal(motion.contacts["floor"].closed, ts < 1)
+    np.testing.assert_allclose(motion.contacts["floor"].changed[-1], hit, rtol=1e-12)
+    assert np.max(np.abs(motion.balance())) < 1e-12
