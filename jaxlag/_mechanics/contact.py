@@ -91,7 +91,7 @@ class GapScales(NamedTuple):
 def gap_scales(flat: Flat, t, q, v, of_positions: Float[Array, " n"], of_velocities: Float[Array, " n"]) -> GapScales:
     """Those of these errors."""
     G = jnp.abs(jax.lax.stop_gradient(jax.jacfwd(flat.gaps, argnums=1)(t, q)))
-    return GapScales(G @ of_positions, G @ of_velocities)
+    return GapScales(_times(G, of_positions), _times(G, of_velocities))
 
 
 def roundings(x: Float[Array, " n"]) -> Float[Array, " n"]:
@@ -179,7 +179,12 @@ def _scales(flat, t, q, v):
     drift = jnp.abs(gap_accelerations(flat, t, q, v, jnp.zeros_like(v)))
     force, size = jnp.abs(inertia(flat, t, q, v)[0].mv(free)), jnp.sum(G**2, axis=1)
     little = jnp.finfo(v.dtype).eps ** ROUNDING
-    return little * (G @ force) / jnp.where(size > 0, size, 1), little * (G @ jnp.abs(free) + drift)
+    return little * _times(G, force) / jnp.where(size > 0, size, 1), little * (_times(G, jnp.abs(free)) + drift)
+
+
+def _times(G, x):
+    """G x, in sums: of many states at once a product would be one of matrices, for a library (`_program.whole_kernel`)."""
+    return jnp.sum(G * x[None], axis=1)
 
 
 def idle(flat: Flat, elements: FrictionElements, sigma: Float[Array, " r"], bound: Float[Array, " e"]) -> Bool[Array, " e"]:

@@ -13,6 +13,7 @@ from typing import Any
 import jax
 import jax.custom_batching
 import jax.numpy as jnp
+import numpy as np
 from jax.experimental.xla_metadata import set_xla_metadata
 from jax.extend import core
 from jaxtyping import Array, Float
@@ -68,7 +69,17 @@ def in_whole_kernel(function: Callable) -> Callable:
 def _is_allowed(program) -> bool:
     """Whether such a kernel can hold it; closed-over arrays would be further arguments."""
     closed_over = any(isinstance(x, jax.core.Tracer) for x in program.consts)
-    return not closed_over and all(e.primitive.name in ALLOWED and _terms(e) <= MOST_TERMS for e in _lowered(program))
+    fits = lambda e: e.primitive.name in ALLOWED and _terms(e) <= MOST_TERMS and not _is_product_of_matrices(e)
+    return not closed_over and all(map(fits, _lowered(program)))
+
+
+def _is_product_of_matrices(equation) -> bool:
+    """Whether XLA may leave it to a library, however small it is; not a product with a vector."""
+    if equation.primitive.name != "dot_general":
+        return False
+    of_both = zip(*equation.params["dimension_numbers"], strict=True)  # contracted and batch dimensions of each
+    free = [np.delete(x.aval.shape, [*contracted, *batch]) for x, (contracted, batch) in zip(equation.invars, of_both, strict=True)]
+    return all(np.prod(sizes) > 1 for sizes in free)
 
 
 def _terms(equation) -> int:
