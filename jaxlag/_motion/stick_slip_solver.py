@@ -23,6 +23,7 @@ from .wrapped_solver import ProjectedSolver
 # mode changes; and the rest of the step, watched for a second end.
 WHOLE, NEWTON, CHANGE, REST = range(4)
 PHASES = np.array([WHOLE, NEWTON, NEWTON, CHANGE, REST], np.int32)
+OF_CONTACT = np.array([WHOLE, NEWTON, NEWTON, NEWTON, CHANGE, REST], np.int32)  # a gap is seen to end late, by its rounding
 SIMULTANEOUS = 1e3  # modes that end within this many roundings of time end together
 BARELY = 1e-6  # of the motion, the step that ends where a bound turns negative
 
@@ -118,11 +119,12 @@ class StickSlipSolver(ProjectedSolver):
 
     def _phases(self, run, carry):
         """The step after its phases, from the number of the first: there is but one, unless a mode ends."""
-        going_on = lambda carry: (carry[0] == 0) | (carry[1].seen.ended & (carry[0] < PHASES.size))
-        turn = lambda carry: (carry[0] + 1, run(carry[1], jnp.asarray(PHASES)[carry[0]]))
+        phases = OF_CONTACT if self.equations.contacts else PHASES
+        going_on = lambda carry: (carry[0] == 0) | (carry[1].seen.ended & (carry[0] < phases.size))
+        turn = lambda carry: (carry[0] + 1, run(carry[1], jnp.asarray(phases)[carry[0]]))
         if not self.reverse:  # a sixth faster: a turn that does nothing copies all that the loop carries
             return jax.lax.while_loop(going_on, turn, carry)
-        return jax.lax.fori_loop(0, PHASES.size, lambda _, carry: jax.lax.cond(going_on(carry), turn, lambda carry: carry, carry), carry)
+        return jax.lax.fori_loop(0, phases.size, lambda _, carry: jax.lax.cond(going_on(carry), turn, lambda carry: carry, carry), carry)
 
     def _run(self, piece, given, args, split: Split, phase) -> Split:
         """One phase of the step."""
