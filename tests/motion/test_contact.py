@@ -84,7 +84,7 @@ def test_derivatives_of_the_end_of_bouncing():
     np.testing.assert_allclose(jax.jacfwd(together(last))(at), expected, rtol=1e-9)
     np.testing.assert_allclose(jax.grad(together(last))(at), expected, rtol=1e-9)
     found, curvature = (jax.jacfwd(jax.jacfwd(together(function)))(at) for function in (last, end_of_bouncing))
-    np.testing.assert_allclose(found, curvature, rtol=2e-6, atol=1e-7)
+    np.testing.assert_allclose(found, curvature, rtol=1e-5, atol=1e-7)  # the last flights take 1e-7 s, and their rounding is squared
 
 
 def test_derivatives_amid_the_impacts():
