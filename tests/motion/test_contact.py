@@ -83,8 +83,10 @@ def test_derivatives_of_the_end_of_bouncing():
     expected = jax.grad(together(end_of_bouncing))(at)
     np.testing.assert_allclose(jax.jacfwd(together(last))(at), expected, rtol=1e-9)
     np.testing.assert_allclose(jax.grad(together(last))(at), expected, rtol=1e-9)
-    found, curvature = (jax.jacfwd(jax.jacfwd(together(function)))(at) for function in (last, end_of_bouncing))
-    np.testing.assert_allclose(found, curvature, rtol=1e-5, atol=1e-7)  # the last flights take 1e-7 s, and their rounding is squared
+    for e, rtol in ((0.5, 2e-6), (E, 1e-5)):  # the last flights take 1e-7 s; of more impacts their rounding counts more
+        there = jnp.array([H, e, G])
+        found, curvature = (jax.jacfwd(jax.jacfwd(together(function)))(there) for function in (last, end_of_bouncing))
+        np.testing.assert_allclose(found, curvature, rtol=rtol, atol=1e-7)
 
 
 def test_derivatives_amid_the_impacts():
@@ -196,7 +198,7 @@ def test_a_mass_on_a_string():
     motion = jl.simulate(string, jnp.array([x, 0.0]), jnp.zeros(2), jnp.linspace(0, 1.0, 101), {"l": l})
     tight = np.sqrt(2 * np.sqrt(l**2 - x**2) / 9.81)
     held = motion.contacts["string"].closed
-    np.testing.assert_allclose(motion.contacts["string"].changed[-1], tight, rtol=1e-11)
+    np.testing.assert_allclose(motion.contacts["string"].changed[-1], tight, rtol=1e-12)
     np.testing.assert_array_equal(held, motion.ts > tight)
     phi, v = np.arcsin(x), -9.81 * tight
     part = solve_ivp(
@@ -261,7 +263,7 @@ def by_events(M, K, n, d, e, q, v, ts):
     return np.array(rows)
 
 
-@pytest.mark.parametrize("seed", range(12))
+@pytest.mark.parametrize("seed", [0, 2, 3, 4, 5, 6, 7, 8, 10, 11, 12, 13])  # in 1 and 9 it rests before the first sample
 def test_random_walls(seed):
     """A mass on springs between slanted walls, in any units, against SciPy's events."""
     rng = np.random.default_rng(seed)
@@ -275,6 +277,7 @@ def test_random_walls(seed):
     params = {"M": scaled(M), "K": scaled(K), "n": n / units, "d": d, "e": e}
     motion = jl.simulate(walls, q * units, v * units, ts, params, rtol=1e-10, atol=1e-13 * float(np.min(units)))
     k = len(expected)
+    assert k > 3 and np.sum(expected[-1, 6:]) >= 3
     found = np.concatenate([np.asarray(motion.q[:k]) / units, np.asarray(motion.qdot[:k]) / units], axis=1)
     np.testing.assert_array_equal(np.stack([motion.contacts[f"{i}"].impacts[:k] for i in range(4)], axis=1), expected[:, 6:])
     np.testing.assert_allclose(found, expected[:, :6], atol=2e-7 * np.max(np.abs(expected[:, :6])))
@@ -296,6 +299,7 @@ def test_rest_on_floors_anywhere():
         return motion.contacts["shelf"].changed[-1]
 
     for at in (0.5, 0.8, 0.97):
+        np.testing.assert_allclose(end(at), end_of_bouncing(H, at, G), rtol=2e-9)
         np.testing.assert_allclose(jax.jacfwd(end)(at), jax.grad(end_of_bouncing, 1)(H, at, G), rtol=1e-8)
 
 

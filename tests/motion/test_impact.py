@@ -42,6 +42,7 @@ def test_a_ball_with_spin(v, spin):
     np.testing.assert_allclose(motion.work()["floor"][-1], energies, rtol=1e-9)
     expected = jax.jacfwd(after_the_bounce, (0, 1, 2))(*at)
     np.testing.assert_allclose(jax.jacfwd(found, (0, 1, 2))(*at), expected, atol=1e-9)
+    np.testing.assert_allclose(jax.jacrev(found, 2)(*at), expected[2], atol=1e-9)
 
 
 balls = jl.System(
@@ -86,7 +87,7 @@ def test_a_rocking_block():
     """Housner: each impact leaves 1 − 1.5 sin²α of the rate; and the times between impacts by quadrature."""
     tilt = 0.1
     q0 = jnp.array([0.0, np.cos(tilt) + B * np.sin(tilt), tilt])
-    ts = jnp.linspace(0, 2.2, 221)
+    ts = jnp.linspace(0, 2.8, 281)
     motion = jl.simulate(block, q0, jnp.zeros(3), ts, works=True, rtol=1e-9, atol=1e-11)
 
     def fall(amplitude):  # ∫ dφ/φ̇ with φ̇²/2 = p² (cos(α − φ₀) − cos(α − φ)), and φ = φ₀ − s²
@@ -95,15 +96,15 @@ def test_a_rocking_block():
 
     time, rate = fall(tilt)
     impacts, rates = [time], [rate]
-    while time < 2.2:
+    while time < 2.8:
         rate *= 1 - 1.5 * np.sin(ALPHA) ** 2
         half, _ = fall(ALPHA - np.arccos(np.cos(ALPHA) + rate**2 / (2 * P2)))
         time += 2 * half
         impacts.append(time)
         rates.append(rate)
-    happened = sum(t < 2.2 for t in impacts)
+    happened = sum(t < 2.8 for t in impacts)
     struck = [motion.contacts[name].impacts for name in ("left", "right")]
-    assert happened == 3
+    assert happened >= 4
     np.testing.assert_array_equal(sum(struck), np.searchsorted(impacts, ts))
     latest = max(float(motion.contacts[name].changed[-1]) for name in ("left", "right"))
     np.testing.assert_allclose(latest, impacts[happened - 1], rtol=1e-7)
