@@ -33,6 +33,8 @@ class Flat(NamedTuple):
     unravel_multipliers: Callable[[Float[Array, " m"]], dict[str, PyTree]]
     state_rates: Callable[..., dict[str, PyTree]]  # ż(t, q, v) of the states of first order
     updates: Callable[..., dict[str, PyTree]]  # u(t, q, v) of the sampled ones
+    witnesses: Callable[..., Float[Array, " e"]]  # w(t, q, v, number of events so far) of the events
+    happened: Callable[..., tuple[Float[Array, " n"], Float[Array, " n"], dict[str, PyTree]]]  # q, q̇ and states after an event, by name
     needs_multipliers: bool
     holonomic_names: tuple[str, ...]
     contacts: tuple[str, ...]
@@ -71,6 +73,8 @@ def bind(system: System, like: PyTree, params: PyTree, states: StatesAt | None =
         unravel_multipliers=bound.unravel_multipliers,
         state_rates=bound.state_rates,
         updates=bound.updates,
+        witnesses=bound.witnesses,
+        happened=bound.happened,
         needs_multipliers=any(asks_for(function, "multipliers") for _, function in (*system.dissipation, *system.force)),
         holonomic_names=tuple(name for name, _ in (*system.holonomic, *system.unilateral)),
         contacts=tuple(name for name, _ in system.unilateral),
@@ -154,6 +158,24 @@ class _Bound:
     def updates(self, t, q, v):
         return self._of_states("update", {name: state.update for name, state in sampled(self.system).items()}, t, q, v)
 
+    def witnesses(self, t, q, v, counts):
+        found = [self._witness(name, event, t, q, v, count) for (name, event), count in zip(self.system.events, counts, strict=True)]
+        return jnp.stack(found) if found else jnp.zeros(0, q.dtype)
+
+    def _witness(self, name, event, t, q, v, count):
+        if not isinstance(event.when, tuple):
+            return jnp.asarray(self._called(event.when, f"`when` of {name!r}", t, q, v), q.dtype)
+        times = jnp.asarray((*event.when, jnp.inf), q.dtype)
+        following = times[jnp.clip(count.astype(int), 0, len(event.when))]
+        return jnp.where(jnp.isfinite(following), jnp.where(jnp.isfinite(following), following, 0) - t, 1)
+
+    def happened(self, name, t, q, v):
+        event = dict(self.system.events)[name]
+        given = self._called(event.then, f"`then` of {name!r}", t, q, v)
+        now = {"q": self.unravel(q), "qdot": self.unravel(v), "states": dict(self.states)}
+        after = merged(f"`then` of {name!r}", now, given)
+        return ravel_pytree(after["q"])[0], ravel_pytree(after["qdot"])[0], after["states"]
+
     def _of_states(self, what, functions, t, q, v):
         values = values_at(self.states, t)
         found = {}
@@ -174,6 +196,20 @@ class _Bound:
 
     def unravel_multipliers(self, multipliers):
         return dict(zip(self.system.constraints, self.unravel_residuals(multipliers[: self.rows]), strict=True))
+
+
+def merged(label: str, now: Any, given: Any) -> Any:
+    """What there is now, with the entries that are given in place of its own; mappings may leave out what stays."""
+    if isinstance(now, Mapping) and isinstance(given, Mapping):
+        for name in given:
+            if name not in now:
+                there = ", ".join(map(str, now))
+                raise ValueError(f"{label} must return entries of the state, but returned {name!r}. There are {there}.")
+        return {name: merged(label, old, given[name]) if name in given else old for name, old in now.items()}
+    shapes = [jax.tree.map(lambda x: jnp.shape(x), tree) for tree in (now, given)]
+    if shapes[0] != shapes[1]:
+        raise ValueError(f"{label} must return what has the shape of the state, {shapes[0]}, but returned {shapes[1]}. Keep its shape.")
+    return jax.tree.map(lambda old, new: jnp.asarray(new, jnp.result_type(old)), now, given)
 
 
 def flat_like(like: PyTree, label: str, given: PyTree) -> Float[Array, " n"]:

@@ -109,6 +109,8 @@ def substitute(system: System, coordinates: Callable) -> System:
     """
 
     check_function(coordinates, "`coordinates`")
+    for name, _ in system.events:
+        raise ValueError(f"`system` must have no events in `substitute`, but has {name!r}. Write them in the new coordinates.")
 
     def pulled(slot: str, kind: type) -> dict[str, Callable]:
         terms: Terms = getattr(system, slot)

@@ -5,6 +5,7 @@ from collections.abc import Callable, Collection, Mapping
 from typing import Any
 
 from .contact import Contact
+from .event import Event
 from .injection import check_function, needs
 from .pickling import picklable, unpickled
 from .states import Named, Sampled, State, states_of
@@ -46,9 +47,10 @@ class System:
       printed trajectory, `examine` and `plot.forces` report it.
     - `states`: by name, states beside q: `State(rate)`, of first order, ż = rate(…), or `Sampled(update, every)`, which changes at
       sample times alone, as in a digital controller.
+    - `events`: by name, `Event(when, then)`: what happens where a function of the state passes through zero, or at given times.
 
     **Fields:** `lagrangian`, `dissipation`, `force`, `holonomic`, `unilateral` and `nonholonomic`, each a tuple of (name, function);
-    `restitution`, a tuple of (name, number or function); `one_sided`, a tuple of names; `states`, a tuple of (name, state).
+    `restitution`, a tuple of (name, number or function); `one_sided`, a tuple of names; `states` and `events`, tuples of (name, state or event).
 
     Any consistent set of units. Functions may return plain numbers, integers or lists, which become floating arrays. A system is
     immutable, hashable and compared by its functions. Create it once: one created again from new functions is compiled again. What was
@@ -79,6 +81,7 @@ class System:
     restitution: tuple[tuple[str, Any], ...]
     one_sided: tuple[str, ...]
     states: Named
+    events: tuple[tuple[str, Event], ...]
 
     def __init__(
         self,
@@ -91,6 +94,7 @@ class System:
         nonholonomic: Slot = None,
         one_sided: Any = (),  # a name, or a collection of names
         states: Mapping[str, State | Sampled] | None = None,
+        events: Mapping[str, Event] | None = None,
     ):
         contacts = _contacts(unilateral)
         gaps = {name: contact.gap for name, contact in contacts.items()}
@@ -113,6 +117,7 @@ class System:
                 raise ValueError(f"`one_sided` must name holonomic constraints, but holds {name!r}. There are {there}.")
         object.__setattr__(self, "one_sided", tuple(name for name in known if name in given))
         object.__setattr__(self, "states", states_of(states))
+        object.__setattr__(self, "events", _events(events))
         for slot in ("holonomic", "unilateral"):
             for name, function in getattr(self, slot):
                 _check_position(role(slot, name), function, dict(self.states))
@@ -126,7 +131,7 @@ class System:
     def __reduce__(self) -> Any:
         references = {slot: {name: picklable(f, role(slot, name)) for name, f in getattr(self, slot)} for slot in SLOTS}
         restitution = {name: picklable(e, f"`restitution` of {name!r}") if callable(e) else e for name, e in self.restitution}
-        return _unpickled, (references, self.one_sided, dict(self.states), restitution)
+        return _unpickled, (references, self.one_sided, dict(self.states), restitution, dict(self.events))
 
     def __repr__(self) -> str:
         def listed(slot: str, terms: Terms) -> str:
@@ -148,10 +153,10 @@ class System:
         return (*(name for name, _ in (*self.dissipation, *self.force)), *self.constraints, EXPLICIT_TIME)
 
 
-def _unpickled(references: Any, one_sided: Any, states: Any = None, restitution: Any = None) -> System:
+def _unpickled(references: Any, one_sided: Any, states: Any = None, restitution: Any = None, events: Any = None) -> System:
     slots = {slot: {name: unpickled(f) for name, f in terms.items()} for slot, terms in references.items()}
     contacts = {name: Contact(slots["unilateral"][name], unpickled(e)) for name, e in (restitution or {}).items()}
-    return System(**slots | {"unilateral": contacts}, one_sided=one_sided, states=states)
+    return System(**slots | {"unilateral": contacts}, one_sided=one_sided, states=states, events=events)
 
 
 def _contacts(given: Any) -> dict[str, Contact]:
@@ -166,6 +171,17 @@ def _contacts(given: Any) -> dict[str, Contact]:
                 "`unilateral={'table': lambda q: q['y']}`."
             )
     return {name: term if isinstance(term, Contact) else Contact(term) for name, term in terms.items()}
+
+
+def _events(given: Any) -> tuple[tuple[str, Event], ...]:
+    terms = () if given is None else tuple(given.items()) if isinstance(given, Mapping) else ((None, given),)
+    for name, event in terms:
+        if not isinstance(name, str) or not isinstance(event, Event):
+            raise TypeError(
+                f"`events` must be a mapping from names to `Event`s, but holds {event!r} under {name!r}. Write e.g. "
+                "`events={'latch': jl.Event(lambda q: q)}`."
+            )
+    return terms
 
 
 def _check_position(label: str, function: Callable, states: dict[str, State | Sampled]) -> None:

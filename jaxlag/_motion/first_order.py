@@ -59,12 +59,13 @@ class EquationsOfMotion:
     states: Layout = NOTHING  # of first order, by name
     sampled: Layout = NOTHING  # states that change at sample times
     contacts: int = 0
+    events: int = 0
 
     @classmethod
     def of(cls, system: System, q0: PyTree, formulation: Formulation, params: PyTree, at: StatesAt) -> "EquationsOfMotion":
         """Looks for dry friction at the start, in shapes alone."""
         z, u = (Layout.of({name: at.values[name] for name in of}) for of in (of_first_order(system), sampled(system)))
-        alone = cls(system, Layout.of(q0), formulation, states=z, sampled=u, contacts=len(system.unilateral))
+        alone = cls(system, Layout.of(q0), formulation, states=z, sampled=u, contacts=len(system.unilateral), events=len(system.events))
         if broken_signals(params):
             elsewhere = called_elsewhere(lambda params: _values(bind(system, q0, params, at), *at[1:]), params)
             warn_of_delays(params, elsewhere)
@@ -101,8 +102,8 @@ class EquationsOfMotion:
 
     @property
     def modes(self) -> int:
-        """How many elements of dry friction and contacts change their modes."""
-        return self.elements + self.contacts
+        """How many elements of dry friction and contacts change their modes, and events happen."""
+        return self.elements + self.contacts + self.events
 
     @property
     def works(self) -> tuple[str, ...]:
@@ -136,8 +137,15 @@ class EquationsOfMotion:
     def parts(self, y) -> Parts:
         """y, taken apart."""
         beside = self.states.size, self.sampled.size, len(self.works)
-        sizes = [self.size, self.size, *beside, self.rows, self.elements, min(self.elements, 1), self.elements, *[self.contacts] * 5]
+        of_friction = self.rows, self.elements, min(self.elements, 1), self.elements
+        of_events = self.events, self.events, sum(of.most for _, of in self.system.events) * self.recorded, min(self.events, 1)
+        sizes = [self.size, self.size, *beside, *of_friction, *[self.contacts] * 5, *of_events]
         return Parts(*jnp.split(y, np.cumsum(sizes)[:-1]))
+
+    @property
+    def recorded(self) -> int:
+        """How many numbers are recorded of an event: the time, q, q̇ and the states."""
+        return 1 + self.controlled + self.sampled.size
 
     @property
     def projection(self) -> Projection | None:
@@ -154,7 +162,10 @@ class EquationsOfMotion:
         z, u = (ravelled({name: at.values[name] for name in of.shapes}, q.dtype) for of in (self.states, self.sampled))
         of_friction = map(zeros, (self.elements, min(self.elements, 1), self.elements))
         of_contact = zeros(self.contacts), zeros(self.contacts), zeros(self.contacts) + t, *map(zeros, (self.contacts, self.contacts))
-        parts = Parts(q, v, z, u, zeros(len(self.works)), zeros(self.rows) + 1, *of_friction, *of_contact)  # with slip, for the time being
+        recorded = sum(of.most for _, of in self.system.events) * self.recorded
+        of_events = zeros(self.events) + 1, zeros(self.events), zeros(recorded), zeros(min(self.events, 1))
+        motion = q, v, z, u, zeros(len(self.works)), zeros(self.rows) + 1  # with slip, for the time being
+        parts = Parts(*motion, *of_friction, *of_contact, *of_events)
         if self.sampled.size:
             y = self.updated(t, parts.y, args, [True] * len(self.sampled_names))
             parts = self.parts(self.projected(t, y, args) if self.projection else y)._replace(works=parts.works)
@@ -189,6 +200,10 @@ class EquationsOfMotion:
         """Whether there were more transitions than allowed."""
         return jnp.any(self.parts(y).transitions > self.formulation.friction.max_transitions)
 
+    def unrecorded(self, y) -> Bool[Array, ""]:
+        """Whether more events happened than are recorded."""
+        return jnp.any(self.parts(y).happened > np.array([event.most for _, event in self.system.events], y.dtype))
+
     def sample(self, t, y, params, tolerances) -> tuple[Sample, Evidence]:
         """One sample, from y on the constraints."""
         rtol, atol = tolerances
@@ -213,8 +228,9 @@ class EquationsOfMotion:
             violation = violation.beside(*_contact_violation(flat, t, parts, multipliers, rtol, atol))
         of_contact = parts.closed > 0.5, parts.impacts, parts.changed, parts.impulse
         contacts = dict(zip(flat.contacts, zip(*of_contact, strict=True), strict=True))
+        events = dict(zip(dict(self.system.events), parts.happened, strict=True))
         unraveled = flat.unravel(q), flat.unravel(v), flat.unravel(qddot), flat.unravel_multipliers(multipliers)
-        return Sample(*unraveled, dict(states), named, friction_states, contacts, counts), Evidence(sound, jax.lax.stop_gradient(violation))
+        return Sample(*unraveled, dict(states), named, friction_states, contacts, events, counts), Evidence(sound, jax.lax.stop_gradient(violation))
 
 
 def _check_impacts(flat: Flat, elements: FrictionElements | None, treatment) -> None:
@@ -252,7 +268,8 @@ def _rates(equations: EquationsOfMotion, t, y, args):
     powers = listed_powers(mode, t, q, v) if equations.works else works
     stuck = parts.time_stuck if elements is None else jnp.maximum(sticking(elements, sigma).astype(y.dtype), held)
     resting = Parts(*(jnp.zeros_like(part) for part in parts))
-    return resting._replace(q=v, v=qddot, z=rates, works=powers, time_stuck=stuck).y
+    moving = resting._replace(q=v, v=qddot, z=rates, works=powers, time_stuck=stuck).y
+    return jnp.where(parts.stopped[0] > 0, 0, moving) if equations.events else moving
 
 
 @jitted
@@ -261,7 +278,8 @@ def _updated(equations: EquationsOfMotion, t, y, args, due):
     flat = equations.flat_at(args.params, equations.states_of(t, parts))
     new, old = flat.updates(t, parts.q, parts.v), equations.sampled.unravelled(parts.u)
     changed = {name: jax.tree.map(functools.partial(jnp.where, on), new[name], old[name]) for name, on in zip(old, due, strict=True)}
-    return parts._replace(u=ravelled(changed, y.dtype)).y
+    u = ravelled(changed, y.dtype)
+    return parts._replace(u=jnp.where(parts.stopped[0] > 0, parts.u, u) if equations.events else u).y
 
 
 def _contact_violation(flat, t, parts, multipliers, rtol, atol):

@@ -20,6 +20,7 @@ from .._model.flat import StatesAt
 from .._model.numbers import count, number
 from .._model.signal import broken_signals, moves_smoothly
 from .._program.single_kernel import in_one_kernel
+from .events import begun
 from .first_order import EquationsOfMotion, Formulation
 from .interval_loop import integrated
 from .mode_changes import started
@@ -117,7 +118,8 @@ def initialised(equations: EquationsOfMotion, at: StatesAt, params) -> Initial:
         (nearest.determined, RESULTS.no_inertia),
         (nearest.defined, RESULTS.undefined),
     )
-    return Initial(start.y, moved, conditions)
+    y = begun(equations, t0, start.y, Arguments(params)) if isinstance(equations, EquationsOfMotion) and equations.events else start.y
+    return Initial(y, moved, conditions)
 
 
 def with_status(ys, result, conditions, inputs) -> tuple[Array, RESULTS]:
@@ -180,7 +182,7 @@ def _wrapped(options, equations, projected, adjoint):
 
 def has_nodes(equations: FirstOrderSystem, params: PyTree) -> bool:
     """Whether steps end where an input jumps or bends, or a state is updated."""
-    return isinstance(equations, EquationsOfMotion) and bool(equations.contacts or equations.sampled.size or broken_signals(params))
+    return isinstance(equations, EquationsOfMotion) and bool(equations.contacts or equations.events or equations.sampled.size or broken_signals(params))
 
 
 def on_nodes(

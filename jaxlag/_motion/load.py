@@ -12,9 +12,10 @@ import numpy as np
 
 from .._mechanics.friction_treatment import Regularised, StickSlip
 from .export import FORMAT, filled_outline
+from .moments import ContactState, FrictionState
 from .provenance import Recorded
 from .results import result_of
-from .trajectory import ContactState, FrictionState, Trajectory
+from .trajectory import Trajectory
 
 
 def load(file: str | Path) -> Any:

@@ -28,6 +28,7 @@ from .._program.time_bounds import bounds_over_time
 from .first_order import EquationsOfMotion
 from .protocol import Arguments
 from .state_vector import Parts, Start
+from .witnesses import witness_margins
 
 CONVERGED = 1e-9  # of the motion, the time that infinitely many impacts may yet take when they are summed up,
 LOW = 10  # or, in roundings of the gap, the height of the last flight
@@ -61,6 +62,8 @@ def margins(equations: EquationsOfMotion, t, y, args: Arguments, start) -> Float
 def _margins(equations: EquationsOfMotion, t, parts: Parts, args):
     q, v, sigma, held = parts.q, parts.v, parts.sigma, parts.held
     flat, mode, elements = equations.mode(t, parts, args)
+    of_events, rounding = witness_margins(flat, t, parts)
+    of_events = of_events + rounding
     if elements is None:
         closed = parts.closed > 0.5
         forces = jax.lax.cond(
@@ -68,11 +71,12 @@ def _margins(equations: EquationsOfMotion, t, parts: Parts, args):
             lambda: contact_rows(flat, equations.acceleration(mode, t, q, v).multipliers),
             lambda: jnp.zeros_like(parts.closed),
         )
-        return jnp.concatenate([_contact_margins(flat, t, q, closed, forces), jnp.ones_like(parts.closed)])
+        none = jnp.ones_like(parts.closed), jnp.ones_like(parts.sign)
+        return jnp.concatenate([_contact_margins(flat, t, q, closed, forces), of_events, *none])
     found = friction(flat, elements, sigma, t, q, v)
     of_contacts = _contact_margins(flat, t, q, parts.closed > 0.5, contact_rows(flat, found.multipliers))
     of_elements = jnp.where((held > 0) | idle(flat, elements, sigma, found.bound), 1, found.margin)
-    return jnp.concatenate([of_elements, of_contacts, found.bound, jnp.ones_like(parts.closed)])
+    return jnp.concatenate([of_elements, of_contacts, of_events, found.bound, jnp.ones_like(parts.closed), jnp.ones_like(parts.sign)])
 
 
 def _contact_margins(flat: Flat, t, q, closed, forces):
@@ -106,7 +110,8 @@ def approach(equations: EquationsOfMotion, path: Callable, t, y, args: Arguments
 
     def may_close(start, end):
         (low, _), (falls, rises) = of_gaps(start, end), of_rates(start, end)
-        return jnp.concatenate([jnp.zeros(equations.elements, bool), ~closed & (low < 0) & (falls < 0) & (rises > 0)])
+        of_events = jnp.zeros(equations.events, bool)
+        return jnp.concatenate([jnp.zeros(equations.elements, bool), ~closed & (low < 0) & (falls < 0) & (rises > 0), of_events])
 
     return Approach(lambda start, end: jnp.all(~closed & (of_gaps(start, end)[0] > 0)), may_close)
 
@@ -124,17 +129,21 @@ def at_end(equations: EquationsOfMotion, t, y, args: Arguments, slopes: Float[Ar
     than its rounding, and its rate is no difference of gaps.
     """
     found = margins(equations, t, y, args, y)[: equations.modes]
-    if not equations.contacts:
+    if not (equations.contacts or equations.events):
         return AtEnd(found, slopes, jnp.zeros_like(slopes))
     parts = equations.parts(y)
     flat, _, _ = equations.mode(t, parts, args)
-    (values, of_contacts), (falls, rises) = (jnp.split(x, [equations.elements]) for x in (found, slopes))
+    first = [equations.elements, equations.elements + equations.contacts]
+    (of_elements, of_contacts, _), (falls, rises, passes) = (jnp.split(x, first) for x in (found, slopes))
     is_closed = parts.closed > 0.5
     gaps = jnp.where(is_closed, of_contacts, flat.gaps(t, parts.q))
     rates = jnp.where(is_closed, rises, gap_rates(flat, t, parts.q, parts.v))
-    hidden = jnp.where(~is_closed & (rates < 0), 2 * (of_contacts - gaps) / jnp.where(rates < 0, -rates, 1), 0)
-    slope, late = jnp.concatenate([falls, rates]), jnp.concatenate([jnp.zeros_like(falls), hidden])
-    return AtEnd(jnp.concatenate([values, gaps]), *jax.lax.stop_gradient((slope, late)))
+    witnesses, rounding = witness_margins(flat, t, parts)
+    value, slope = jnp.concatenate([of_elements, gaps, witnesses]), jnp.concatenate([falls, rates, passes])
+    is_exact = jnp.concatenate([jnp.zeros_like(falls, bool), ~is_closed, jnp.ones_like(passes, bool)])
+    beside = jnp.concatenate([jnp.zeros_like(falls), of_contacts - gaps, rounding])
+    late = jnp.where(is_exact & (slope < 0), 2 * beside / jnp.where(slope < 0, -slope, 1), 0)
+    return AtEnd(value, *jax.lax.stop_gradient((slope, late)))
 
 
 @jitted
@@ -143,7 +152,7 @@ def changed(equations: EquationsOfMotion, t, y, args: Arguments, ended: Bool[Arr
     assert args.scales is not None  # ends are located
     parts = equations.parts(y)
     flat, _, elements = equations.mode(t, parts, args)
-    of_friction, of_contact = ended[: equations.elements], ended[equations.elements :]
+    of_friction, of_contact = jnp.split(ended[: equations.elements + equations.contacts], [equations.elements])
     if not equations.contacts:
         assert elements is not None
         stuck, slow = sticking(elements, parts.sigma) | (parts.held > 0), _slow(elements, t, parts, args.scales.error(parts.v))

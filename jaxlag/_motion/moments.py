@@ -1,4 +1,4 @@
-"""What a `Trajectory` holds of friction and of contacts, and what it gives of single times."""
+"""What a `Trajectory` holds of friction, contacts and events, and what it gives of single times."""
 
 import equinox as eqx
 from jaxtyping import Array, Bool, Float, PyTree
@@ -20,6 +20,18 @@ class ContactState(eqx.Module):
     impacts: Float[Array, "*members T"]
     changed: Float[Array, "*members T"]
     impulse: Float[Array, "*members T"]
+
+
+class EventState(eqx.Module):
+    """What happened up to the end of a motion, event by event: the times `ts`, and `q`, `qdot` and `states` just before; NaN beyond the
+    last. `count`: how many there were up to each sample.
+    """
+
+    ts: Float[Array, "*members most"]
+    q: PyTree
+    qdot: PyTree
+    states: dict[str, PyTree]
+    count: Float[Array, "*members T"]
 
 
 class Instant(eqx.Module):

@@ -51,6 +51,10 @@ class RESULTS(dfx.RESULTS):  # pyright: ignore
         "`dissipation` must be homogeneous in the force of a contact that it follows, as mu * multipliers['table'] * |v| is, for an impact "
         "to say what its friction is, but is not. Write it so."
     )
+    too_many_events = (
+        "an event happened more than `most` times. Allow more, `Event(..., most=...)`; one that happens at once for ever chatters: let `then` "
+        "take the state away from where `when` is zero."
+    )
     chattering = (
         "friction changed between sliding and sticking more than `max_transitions` times: it chatters. "
         "Allow more with `friction=StickSlip(max_transitions=...)`, or smooth it with `friction=Regularised(width)`."

@@ -16,13 +16,15 @@ from .._model.signal import with_second_derivatives
 from .._model.state_values import start_values
 from .._model.system import System
 from .._model.validation import check
+from .events import recorded
 from .first_order import EquationsOfMotion
 from .guarantees import verified
 from .integrate import SolverOptions, Variations, has_nodes, initialised, is_variational, on_nodes, states_at, with_status
+from .moments import ContactState, EventState, FrictionState
 from .protocol import Arguments, Scales
 from .provenance import Provenance
 from .state_vector import Sample
-from .trajectory import ContactState, FrictionState, Trajectory
+from .trajectory import Trajectory
 from .variational import derived, pushforward, split_varying
 
 
@@ -170,6 +172,8 @@ def samples_at(equations: EquationsOfMotion, ts, ys, params, result, stats, tole
     samples = jax.vmap(lambda t, y: equations.sample(t, y, params, tolerances))(times, states)
     shown, result, reached = verified(equations, times, states, samples, params, result, tolerances)
     counts = {name: count for name, count in stats.items() if name != "last"} | {"reached": jax.lax.stop_gradient(reached)}
+    if equations.events:  # behind the end of a motion
+        shown = jax.tree.map(lambda x: jnp.where((ys[:, -1] > 0).reshape(-1, *[1] * (x.ndim - 1)), jnp.nan, x), shown)
     changing, rest = eqx.partition(shown, eqx.is_inexact_array)
     return Samples(ys, changing), Unchanging(result, counts, rest)
 
@@ -181,4 +185,5 @@ def trajectory_of(system: System, options: SolverOptions, params: PyTree, ts, sa
     provenance = Provenance.of(system, params, options.formulation.friction)
     state, counts = (shown.q, shown.qdot, shown.qddot, shown.multipliers), unchanging.stats | shown.counts
     contacts = {name: ContactState(*of_one) for name, of_one in shown.contacts.items()}
-    return Trajectory(ts, *state, unchanging.result, counts, shown.works, friction, provenance, shown.states, contacts)
+    events = {name: EventState(*of_one, shown.events[name]) for name, of_one in recorded(system, shown, samples.ys).items()}
+    return Trajectory(ts, *state, unchanging.result, counts, shown.works, friction, provenance, shown.states, contacts, events)

@@ -2,9 +2,11 @@
 
     y = (q, q̇, states of first order, sampled states, work of each term,
          σ of each slip, which elements others hold at their bound, number of transitions, time stuck,
-         of each contact: whether it is closed, its impacts, when it changed, how long it was open before, its impulses)
+         of each contact: whether it is closed, its impacts, when it changed, how long it was open before, its impulses,
+         of each event: the sign of its witness, how often it happened; what is recorded of all; whether the motion has stopped)
 
-Works are present where they were asked for, the four of friction where D is nonsmooth, the last five where there are contacts.
+Works are present where they were asked for, the four of friction where D is nonsmooth, five where there are contacts, the last four where
+there are events.
 """
 
 from typing import NamedTuple
@@ -32,6 +34,10 @@ class Parts(NamedTuple):
     changed: Float[Array, " c"]
     flight: Float[Array, " c"]
     impulse: Float[Array, " c"]
+    sign: Float[Array, " w"]  # 1 or -1
+    happened: Float[Array, " w"]
+    record: Float[Array, " x"]
+    stopped: Float[Array, " 0|1"]  # 1 or 0
 
     @property
     def y(self) -> Float[Array, " y"]:
@@ -74,6 +80,7 @@ class Sample(NamedTuple):
     works: dict[str, Array] | None
     friction: dict[str, tuple[Array, Array]]
     contacts: dict[str, tuple[Array, Array, Array, Array]]
+    events: dict[str, Array]
     counts: dict[str, Array]
 
 

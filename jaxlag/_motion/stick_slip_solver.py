@@ -10,8 +10,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from .._program.jit import jitted
+from .events import behind
 from .first_order import EquationsOfMotion
-from .mode_changes import approach, at_end, changed, margins
+from .mode_changes import approach, at_end, margins
 from .results import RESULTS, under_diffrax
 from .runge_kutta import ExplicitRungeKutta
 from .step_monitor import Seen, first_end, is_hidden
@@ -162,7 +163,7 @@ class StickSlipSolver(ProjectedSolver):
 
     def _change(self, split: Split, ended, args) -> Split:
         """With the state in the mode that follows when those of the elements `ended` end."""
-        found = changed(self.equations, split.cut.time, split.first.y, args, ended)
+        found = behind(self.equations, split.cut.time, split.first.y, args, ended)
         fine = {"consistent": found.consistent, "dissipates": found.dissipates, "impulsive": found.impulsive}
         cut = split.cut._replace(y=found.y, **fine, usable=split.cut.usable & found.at_rest)
         return split._replace(cut=cut)
@@ -183,6 +184,7 @@ class StickSlipSolver(ProjectedSolver):
             result = dfx.RESULTS.where(~ended | passed | ~cut.usable, result, under_diffrax(reason))
         result = dfx.RESULTS.where(seen.negative & ~shrinking, under_diffrax(RESULTS.negative_bound), result)
         result = dfx.RESULTS.where(self.equations.exhausted(second.y), under_diffrax(RESULTS.chattering), result)
+        result = dfx.RESULTS.where(self.equations.unrecorded(second.y), under_diffrax(RESULTS.too_many_events), result)
         result = dfx.RESULTS.where(first.result == dfx.RESULTS.successful, result, first.result)
         dense = {"cut": jnp.where(ended, cut.time, t1), "first": first.dense, "second": second.dense}
         return second.y, error, dense, second.state, result
@@ -195,7 +197,7 @@ class StickSlipSolver(ProjectedSolver):
         of, modes = lambda t, y, start: margins(self.equations, t, y, args, start), self.equations.modes
         between = approach(self.equations, path.evaluate, t0, path.evaluate(t0), args) if self.equations.contacts else None
         watched = lambda: first_end(of, path.evaluate, t0, t1, modes, args.scales, exactly, between and between.may_close)
-        if between is None or self.equations.elements:
+        if between is None or self.equations.elements or self.equations.events:
             return watched()
         no = jnp.array(False)
         return jax.lax.cond(between.stay_open(t0, t1), lambda: Seen(no, no, no, t1, jnp.zeros(modes, t1.dtype)), watched)

@@ -21,7 +21,7 @@ from .._program.jit import compiled, is_concrete
 from .card import card
 from .export import arrays_of, frame_of, outline, write_arrays
 from .interpolation import Moving, between
-from .moments import ContactState, FrictionState, Instant, Interpolated
+from .moments import ContactState, EventState, FrictionState, Instant, Interpolated
 from .provenance import Provenance, Recorded
 from .results import RESULTS, names_of
 
@@ -39,6 +39,7 @@ class Trajectory(eqx.Module):
     - `result`: `RESULTS.successful`, or the reason of failure; samples that were not reached are NaN.
     - `friction`: by the name of the dissipation term, the `force` on its slip velocities and whether they are `sticking`.
     - `contacts`: by the name of the unilateral constraint, whether it is `closed`, its `impacts`, when it `changed`, its `impulse`s.
+    - `events`: by name, when they happened, `ts`, the `q`, `qdot` and `states` just before, and their `count` at each sample.
     - `works`: what `work()` returns, where the motion was computed with `works=True`.
     - `stats`: `num_steps`, `num_accepted_steps`, `num_rejected_steps`; `start_moved`, how far the initial state was projected;
       `reached`, the time to which the motion was computed. With dry friction, at each sample and since the start: `transitions`, how
@@ -58,6 +59,7 @@ class Trajectory(eqx.Module):
     provenance: Provenance | Recorded
     states: dict[str, PyTree] = dataclasses.field(default_factory=dict)
     contacts: dict[str, ContactState] = dataclasses.field(default_factory=dict)
+    events: dict[str, EventState] = dataclasses.field(default_factory=dict)
 
     @property
     def succeeded(self) -> Any:
@@ -128,8 +130,9 @@ class Trajectory(eqx.Module):
         provenance = self.provenance
         if isinstance(provenance, Recorded):
             provenance = dataclasses.replace(provenance, energies=chosen(provenance.energies), slip=chosen(provenance.slip))
+        events = {name: dataclasses.replace(event, count=chosen(event.count)) for name, event in self.events.items()}
         *motion, states = chosen((self.ts, self.q, self.qdot, self.qddot, self.multipliers, self.states))
-        return Trajectory(*motion, self.result, counts, works, chosen(self.friction), provenance, states, chosen(self.contacts))
+        return Trajectory(*motion, self.result, counts, works, chosen(self.friction), provenance, states, chosen(self.contacts), events)
 
     def at(self, ts: Any) -> Interpolated:
         r"""The motion at other times, one or an array of them, interpolated between the samples by their q, q̇ and q̈.
