@@ -13,17 +13,22 @@ from .pickling import picklable, unpickled
 
 @dataclasses.dataclass(frozen=True)
 class Falling:
-    """An event happens where `when` becomes negative, and at the start where it is so already."""
+    """An event happens where `when` becomes negative."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Rising:
-    """An event happens where `when` becomes positive, and at the start where it is so already."""
+    """An event happens where `when` becomes positive."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Either:
     """An event happens where `when` changes its sign, whichever way."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Negative:
+    """An event happens where `when` becomes negative, and at the start where it is so already."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -39,10 +44,10 @@ class Event:
     - `then`: what the state becomes: a mapping with some of "q", "qdot" and "states", each structured like its own, where mappings may
       leave out what stays. It receives what `when` does. Default: nothing, the event is counted.
     - `stop`: whether the motion ends there. Samples behind are NaN, and the motion is a success.
-    - `direction`: `Falling()`, `Rising()` or `Either()`, the default.
+    - `direction`: `Falling()`, `Rising()`, `Either()`, the default, or `Negative()`, as `Falling()` and at the start, too.
     - `most`: how many are recorded; one more ends the motion with that reason.
 
-    The time is located to rounding. What `then` returns is put on the constraints, and is differentiated, as the time is. Any consistent
+    The time is located to rounding; a sample at it shows the state before. What `then` returns is put on the constraints, and is differentiated, as the time is. Any consistent
     units. A system takes events by name: `System(..., events={"latch": Event(...)})`.
 
     **Raises:** `TypeError` or `ValueError` where these are not such functions, times and numbers.
@@ -63,7 +68,7 @@ class Event:
     when: Any
     then: Callable | None = None
     stop: bool = False
-    direction: Falling | Rising | Either = Either()
+    direction: Falling | Rising | Either | Negative = Either()
     most: int = 16
 
     def __post_init__(self):
@@ -72,12 +77,13 @@ class Event:
         for function, label in ((self.when, "`when`"), (self.then, "`then`")):
             if function is not None and not isinstance(function, tuple):
                 check_function(function, label)
-        if not isinstance(self.direction, (Falling, Rising, Either)):
-            raise TypeError(f"`direction` must be `Falling()`, `Rising()` or `Either()`, but is {self.direction!r}. Take one of these.")
+        if not isinstance(self.direction, (Falling, Rising, Either, Negative)):
+            raise TypeError(
+                f"`direction` must be `Falling()`, `Rising()`, `Either()` or `Negative()`, but is {self.direction!r}. Take one of these."
+            )
         if not isinstance(self.stop, (bool, np.bool_)):
             raise TypeError(f"`stop` must be True or False, but is {self.stop!r}. Take one of these.")
         count(self.most, "`most`", least=1, cure="The default is 16.")
-
 
     def __reduce__(self) -> Any:
         of = lambda x, label: picklable(x, label) if callable(x) else x

@@ -172,7 +172,7 @@ class _Bound:
     def happened(self, name, t, q, v):
         event = dict(self.system.events)[name]
         given = self._called(event.then, f"`then` of {name!r}", t, q, v)
-        now = {"q": self.unravel(q), "qdot": self.unravel(v), "states": dict(self.states)}
+        now = {"q": self.unravel(q), "qdot": self.unravel(v), "states": dict(values_at(self.states, t))}
         after = merged(f"`then` of {name!r}", now, given)
         return ravel_pytree(after["q"])[0], ravel_pytree(after["qdot"])[0], after["states"]
 

@@ -50,7 +50,8 @@ class System:
     - `events`: by name, `Event(when, then)`: what happens where a function of the state passes through zero, or at given times.
 
     **Fields:** `lagrangian`, `dissipation`, `force`, `holonomic`, `unilateral` and `nonholonomic`, each a tuple of (name, function);
-    `restitution`, a tuple of (name, number or function); `one_sided`, a tuple of names; `states` and `events`, tuples of (name, state or event).
+    `restitution`, a tuple of (name, number or function); `one_sided`, a tuple of names; `states`, `events`, tuples of (name, state) and
+    (name, event).
 
     Any consistent set of units. Functions may return plain numbers, integers or lists, which become floating arrays. A system is
     immutable, hashable and compared by its functions. Create it once: one created again from new functions is compiled again. What was

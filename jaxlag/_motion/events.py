@@ -9,6 +9,7 @@ from jaxtyping import Array, Bool, Float, PyTree
 
 from .._mechanics.contact import roundings
 from .._mechanics.projection import nearest_state
+from .._model.event import Negative
 from .._model.flat import Flat
 from .._model.state_values import of_first_order, ravelled, sampled
 from .._model.system import System
@@ -84,13 +85,17 @@ def _moved(equations: EquationsOfMotion, flat: Flat, t, parts: Parts, args: Argu
     return after_jump(equations, t, parts.y, new._replace(q=nearest.q, v=nearest.v).y, args, args)
 
 
-def begun(equations: EquationsOfMotion, t, y, args: Arguments):
-    """y at the start, on which side of zero the witnesses are; what has the wrong sign already happens."""
+def begun(equations: EquationsOfMotion, t, y, args: Arguments) -> tuple[Float[Array, " y"], Bool[Array, ""]]:
+    """y at the start, with the sides of zero on which the witnesses are, and behind the events of those that are `Negative` already; and
+    whether a mode of friction and contact is consistent there.
+    """
     parts = equations.parts(y)
     flat, mode, _ = equations.mode(t, parts, args)
     errors = (roundings(1 + jnp.abs(jax.lax.stop_gradient(x))) for x in (parts.q, parts.v))
     sign = signs(flat, t, parts, equations.acceleration(mode, t, parts.q, parts.v).x, *errors)
-    return parts._replace(sign=sign).y
+    due = np.array([isinstance(event.direction, Negative) for _, event in equations.system.events]) & (sign < 0)
+    begun = parts._replace(sign=jnp.where(due, 1, sign)).y
+    return jax.lax.cond(jnp.any(due), lambda: happened(equations, t, begun, args, due), lambda: (begun, jnp.array(True)))
 
 
 def recorded(system: System, shown: Sample, ys: Float[Array, "T y"]) -> dict[str, tuple[Array, PyTree, PyTree, dict[str, PyTree]]]:

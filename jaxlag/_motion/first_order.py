@@ -230,7 +230,9 @@ class EquationsOfMotion:
         contacts = dict(zip(flat.contacts, zip(*of_contact, strict=True), strict=True))
         events = dict(zip(dict(self.system.events), parts.happened, strict=True))
         unraveled = flat.unravel(q), flat.unravel(v), flat.unravel(qddot), flat.unravel_multipliers(multipliers)
-        return Sample(*unraveled, dict(states), named, friction_states, contacts, events, counts), Evidence(sound, jax.lax.stop_gradient(violation))
+        return Sample(*unraveled, dict(states), named, friction_states, contacts, events, counts), Evidence(
+            sound, jax.lax.stop_gradient(violation)
+        )
 
 
 def _check_impacts(flat: Flat, elements: FrictionElements | None, treatment) -> None:

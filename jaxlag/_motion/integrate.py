@@ -25,7 +25,7 @@ from .first_order import EquationsOfMotion, Formulation
 from .interval_loop import integrated
 from .mode_changes import started
 from .progress import Bar
-from .protocol import Arguments, FirstOrderSystem
+from .protocol import Arguments, FirstOrderSystem, Scales
 from .results import RESULTS, from_diffrax
 from .runge_kutta import Dop853, ExplicitRungeKutta, is_explicit
 from .step_size import GuardedController
@@ -99,8 +99,8 @@ class Initial(NamedTuple):
     conditions: tuple[tuple[Bool[Array, ""], Any], ...]
 
 
-def initialised(equations: EquationsOfMotion, at: StatesAt, params) -> Initial:
-    """The start, put on the constraints."""
+def initialised(equations: EquationsOfMotion, at: StatesAt, params, scales: Scales | None = None) -> Initial:
+    """The start, put on the constraints; `scales` are needed where there are events."""
     _, t0, q, v = at
     flat = equations.flat_at(params, at)
     nearest = nearest_state(flat._replace(holonomic=flat.bilateral), t0, outside(flat, t0, q, v), v)
@@ -118,8 +118,10 @@ def initialised(equations: EquationsOfMotion, at: StatesAt, params) -> Initial:
         (nearest.determined, RESULTS.no_inertia),
         (nearest.defined, RESULTS.undefined),
     )
-    y = begun(equations, t0, start.y, Arguments(params)) if isinstance(equations, EquationsOfMotion) and equations.events else start.y
-    return Initial(y, moved, conditions)
+    if not equations.events:
+        return Initial(start.y, moved, conditions)
+    y, consistent = begun(equations, t0, start.y, Arguments(params, scales))
+    return Initial(y, moved, (*conditions, (consistent, RESULTS.no_friction)))
 
 
 def with_status(ys, result, conditions, inputs) -> tuple[Array, RESULTS]:
@@ -182,7 +184,9 @@ def _wrapped(options, equations, projected, adjoint):
 
 def has_nodes(equations: FirstOrderSystem, params: PyTree) -> bool:
     """Whether steps end where an input jumps or bends, or a state is updated."""
-    return isinstance(equations, EquationsOfMotion) and bool(equations.contacts or equations.events or equations.sampled.size or broken_signals(params))
+    return isinstance(equations, EquationsOfMotion) and bool(
+        equations.contacts or equations.events or equations.sampled.size or broken_signals(params)
+    )
 
 
 def on_nodes(

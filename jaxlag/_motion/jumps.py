@@ -15,7 +15,7 @@ from .protocol import Arguments
 def after_jump(equations: EquationsOfMotion, t, y0, y, before: Arguments, args: Arguments):
     """y behind a jump of inputs or sampled states at t, and whether a friction mode is consistent with the forces there.
 
-    `y0` and `before` are y and the arguments before the jump; y differs from y0 in sampled states alone.
+    `y0` and `before` are y and the arguments before the jump; y differs from y0 in sampled states, or in what an event has changed.
 
     A velocity constraint that jumps takes q̇ along by an impulse, which is the projection in the metric of M. Friction is bounded and
     has no part in it: where there is slip afterwards, it goes on; where there is none, it sticks or breaks away.
@@ -23,8 +23,9 @@ def after_jump(equations: EquationsOfMotion, t, y0, y, before: Arguments, args: 
     parts = equations.parts(y)
     flat, _, elements = equations.mode(t, parts, args)
     if equations.works:
-        earlier = equations.flat(before.params, equations.states_of(t, equations.parts(y0)))
-        lift = energy_exchange(flat, t, parts.q, parts.v)[0] - energy_exchange(earlier, t, parts.q, parts.v)[0]
+        there = equations.parts(y0)
+        earlier = equations.flat(before.params, equations.states_of(t, there))
+        lift = energy_exchange(flat, t, parts.q, parts.v)[0] - energy_exchange(earlier, t, there.q, there.v)[0]
         parts = parts._replace(works=parts.works.at[equations.works.index(EXPLICIT_TIME)].add(lift))
     slipping = parts._replace(sigma=jnp.ones_like(parts.sigma))
     if equations.contacts:

@@ -47,7 +47,19 @@ def _padded(rows: Any) -> np.ndarray:
 def without_padding(t: Trajectory, length: int) -> Trajectory:
     """The motion without the samples that were added."""
     counts = {name: count for name, count in t.stats.items() if name in COUNTED}
-    parts = t.ts, t.q, t.qdot, t.qddot, t.multipliers, t.works, t.friction, counts, t.states, t.contacts, {name: event.count for name, event in t.events.items()}
+    parts = (
+        t.ts,
+        t.q,
+        t.qdot,
+        t.qddot,
+        t.multipliers,
+        t.works,
+        t.friction,
+        counts,
+        t.states,
+        t.contacts,
+        {name: event.count for name, event in t.events.items()},
+    )
     *state, works, friction, counts, states, contacts, happened = _first(parts, length)
     events = {name: dataclasses.replace(event, count=happened[name]) for name, event in t.events.items()}
     return Trajectory(*state, t.result, t.stats | counts, works, friction, t.provenance, states, contacts, events)

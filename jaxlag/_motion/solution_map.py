@@ -74,7 +74,8 @@ class SolutionMap:
         equations, at = self._equations(inputs, ts)
         params, tolerances = inputs.params, inputs.tolerances
         smooth = with_second_derivatives(params)
-        start, args = initialised(equations, at, smooth), Arguments(smooth, Scales.of(tolerances, ts, smooth))
+        args = Arguments(smooth, Scales.of(tolerances, ts, smooth))
+        start = initialised(equations, at, smooth, args.scales)
         ys, result, stats = states_at(equations, self.options, adjoint, at.t, start.y, ts, args, tolerances)
         ys, result = with_status(ys, result, start.conditions, (inputs, ts))
         return samples_at(equations, ts, ys, params, result, stats | {"start_moved": start.moved}, tolerances)
@@ -88,7 +89,8 @@ class SolutionMap:
             return pushforward(self.solve)(inputs, directions, ts)
 
         def initial(inputs):
-            start = initialised(equations, self._at(inputs, ts), with_second_derivatives(inputs.params))
+            params = with_second_derivatives(inputs.params)
+            start = initialised(equations, self._at(inputs, ts), params, Scales.of(inputs.tolerances, ts, params))
             return start.y, start
 
         arguments = lambda inputs: (_first_time(inputs, ts), Arguments(with_second_derivatives(inputs.params)))

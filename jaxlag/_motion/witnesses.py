@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from .._mechanics.contact import roundings
-from .._model.event import Falling, Rising
+from .._model.event import Either, Rising
 from .._model.flat import Flat
 from .first_order import EquationsOfMotion
 from .state_vector import Parts
@@ -37,5 +37,6 @@ def signs(flat: Flat, t, parts: Parts, qddot: Float[Array, " n"], of_q: Float[Ar
 def matching(equations: EquationsOfMotion, sign: Float[Array, " w"]) -> Bool[Array, " w"]:
     """Which events happen where their witness had this sign and loses it."""
     of = [event.direction for _, event in equations.system.events]
-    falls, rises = (np.array([not isinstance(direction, kind) for direction in of]) for kind in (Rising, Falling))
+    falls = np.array([not isinstance(direction, Rising) for direction in of])
+    rises = np.array([isinstance(direction, (Rising, Either)) for direction in of])
     return jnp.where(sign > 0, falls, rises)
