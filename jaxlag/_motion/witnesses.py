@@ -22,7 +22,7 @@ def _value_and_scale(flat, t, parts, of_q, of_v):
     """Of each witness, its value, and what errors of q and q̇ amount to in it."""
     of = lambda t, q, v: flat.witnesses(t, q, v, jax.lax.stop_gradient(parts.happened))
     by_t, by_q, by_v = (jnp.abs(by) for by in jax.lax.stop_gradient(jax.jacfwd(of, argnums=(0, 1, 2))(t, parts.q, parts.v)))
-    return of(t, parts.q, parts.v), by_t * roundings(t[None]) + by_q @ of_q + by_v @ of_v
+    return of(t, parts.q, parts.v), by_t * roundings(t[None]) + jnp.sum(by_q * of_q[None], axis=1) + jnp.sum(by_v * of_v[None], axis=1)
 
 
 def signs(flat: Flat, t, parts: Parts, qddot: Float[Array, " n"], of_q: Float[Array, " n"], of_v: Float[Array, " n"]) -> Float[Array, " w"]:
