@@ -39,7 +39,14 @@ from ._linear.modes import Modes as Modes
 from ._linear.stability_map import StabilityMap as StabilityMap, stability_map as stability_map
 from ._program.compilation_cache import keep_compiled as keep_compiled
 from ._model.contact import Contact as Contact
-from ._model.event import Either as Either, Event as Event, Falling as Falling, Negative as Negative, Rising as Rising
+from ._model.event import (
+    Either as Either,
+    Event as Event,
+    Every as Every,
+    Falling as Falling,
+    Negative as Negative,
+    Rising as Rising,
+)
 from ._model.kinematics import rate as rate, substitute as substitute, virtual_work as virtual_work
 from ._mechanics.projection import (
     Baumgarte as Baumgarte,

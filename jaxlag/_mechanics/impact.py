@@ -12,11 +12,13 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from .._model.flat import Flat, rows_by_name
 from .contact import Contacts, accelerated, contact_rows, gap_rates, in_contact, select_closed
 from .friction_elements import FrictionElements
+from .friction_treatment import Regularised, StickSlip
 from .lagrange import constraint_rows, inertia
 from .stick_slip import bounds, friction, friction_by_term, select_mode
 
@@ -86,6 +88,22 @@ def no_impact(flat: Flat, elements: FrictionElements | None, v) -> Impact:
     yes, none = jnp.array(True), jnp.zeros((), v.dtype)
     terms = {} if elements is None else elements.rows_of_term
     return Impact(v, jnp.zeros(len(flat.contacts), v.dtype), {name: none for name in (*rows_by_name(flat), *terms)}, yes, yes, yes)
+
+
+def check_impacts(flat: Flat, elements: FrictionElements | None, treatment: StickSlip | Regularised) -> None:
+    """Refuses friction whose impulses are not solved for."""
+    if not flat.needs_multipliers:
+        return
+    if isinstance(treatment, Regularised):
+        raise ValueError(
+            "`friction` must be `StickSlip()` where contacts rub, whose impacts take the impulses for the forces, but is `Regularised`. "
+            "Leave it out."
+        )
+    if elements is not None and np.any(elements.is_vector):
+        raise ValueError(
+            "`dissipation` must rub along single directions where an impact may multiply its normal force, but holds the norm of a slip "
+            "velocity of several components, whose direction in an impact is not solved for. Move in a plane, or leave out `unilateral`."
+        )
 
 
 def _in_fast_time(flat, elements, t, q, v, returned):

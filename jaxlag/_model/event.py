@@ -1,9 +1,12 @@
 """Events, as the user states them: when something happens, and what happens then."""
 
 import dataclasses
-from collections.abc import Callable
+import itertools
+from collections.abc import Callable, Collection, Mapping
 from typing import Any
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 
 from .injection import check_function
@@ -32,23 +35,44 @@ class Negative:
 
 
 @dataclasses.dataclass(frozen=True)
+class Every:
+    """An event happens at all multiples of a `period`: a positive number, or a function of params that returns one."""
+
+    period: float | Callable
+
+    def __post_init__(self):
+        if callable(self.period):
+            check_function(self.period, "`period`")
+        else:
+            number(self.period, "`period`", positive=True, cure="Take the time from one event to the next.")
+
+    def __reduce__(self) -> Any:
+        return _every, (picklable(self.period, "`period`") if callable(self.period) else self.period,)
+
+
+@dataclasses.dataclass(frozen=True)
 class Event:
     r"""Something that happens where a function of the state passes through zero, or at given times.
 
-    $$ w(t^*, q, \dot q) = 0: \qquad (q, \dot q, z) \to h(t^*, q, \dot q, z) $$
+    $$ w(t^*, q, \dot q, z) = 0: \qquad (q, \dot q, z) \to h(t^*, q, \dot q, z) $$
 
     **Arguments:**
 
-    - `when`: w, a real number; it receives the arguments it names, out of `t`, `q`, `qdot`, `params`, its entries and the states. Or a
-      time, or some, increasing: numbers, or a function of `params` and its entries that returns them.
+    - `when`: w, a continuous real number; it receives the arguments it names, out of `t`, `q`, `qdot`, `multipliers`, `params`, its
+      entries and the states. Or times, increasing numbers; or `Every(period)`; or the name of a contact, for each of its impacts. What
+      is given by times happens after the start.
     - `then`: what the state becomes: a mapping with some of "q", "qdot" and "states", each structured like its own, where mappings may
-      leave out what stays. It receives what `when` does. Default: nothing, the event is counted.
+      leave out what stays. It receives what `when` does, but for the multipliers. Default: nothing, the event is recorded. What it is to
+      change of the params is stated as a state that stays, e.g. `State(lambda: 0.0, start=1.0)`.
     - `stop`: whether the motion ends there. Samples behind are NaN, and the motion is a success.
     - `direction`: `Falling()`, `Rising()`, `Either()`, the default, or `Negative()`, as `Falling()` and at the start, too.
     - `most`: how many are recorded; one more ends the motion with that reason.
 
-    The time is located to rounding; a sample at it shows the state before. What `then` returns is put on the constraints, and is differentiated, as the time is. Any consistent
-    units. A system takes events by name: `System(..., events={"latch": Event(...)})`.
+    The time is located to rounding, and differentiated exactly, as is what `then` returns, which is put on the constraints. A sample at
+    the time of an event shows the state behind it. Where an impact, an input that jumps or another event takes w to the other side of
+    zero, the event happens, too, but none twice at one time. Where several happen at once, those stated first come first. Events act in motions alone: to
+    `equilibrium`, `linearise`, `examine` and `equations` a system is what it is without. Any consistent units. A system takes events by
+    name: `System(..., events={"latch": Event(...)})`; a motion, too: `simulate(..., events=...)`.
 
     **Raises:** `TypeError` or `ValueError` where these are not such functions, times and numbers.
 
@@ -72,14 +96,19 @@ class Event:
     most: int = 16
 
     def __post_init__(self):
-        if not callable(self.when):
+        if callable(self.when):
+            check_function(self.when, "`when`")
+        elif not isinstance(self.when, (str, Every)):
             object.__setattr__(self, "when", _times(self.when))
-        for function, label in ((self.when, "`when`"), (self.then, "`then`")):
-            if function is not None and not isinstance(function, tuple):
-                check_function(function, label)
+        if self.then is not None:
+            check_function(self.then, "`then`")
         if not isinstance(self.direction, (Falling, Rising, Either, Negative)):
             raise TypeError(
                 f"`direction` must be `Falling()`, `Rising()`, `Either()` or `Negative()`, but is {self.direction!r}. Take one of these."
+            )
+        if self.direction != Either() and not callable(self.when):
+            raise ValueError(
+                f"`direction` must be left out for times and impacts, which have none, but is {self.direction!r}. Leave it out."
             )
         if not isinstance(self.stop, (bool, np.bool_)):
             raise TypeError(f"`stop` must be True or False, but is {self.stop!r}. Take one of these.")
@@ -87,16 +116,52 @@ class Event:
 
     def __reduce__(self) -> Any:
         of = lambda x, label: picklable(x, label) if callable(x) else x
-        return _unpickled, (of(self.when, "`when`"), of(self.then, "`then`"), self.stop, self.direction, self.most)
+        return _event, (of(self.when, "`when`"), of(self.then, "`then`"), self.stop, self.direction, self.most)
 
 
-def _unpickled(when: Any, then: Any, *rest: Any) -> Event:
+def events_of(given: Any, contacts: Collection[str]) -> tuple[tuple[str, Event], ...]:
+    """The events of a system, by name, whose contacts have these names."""
+    terms = () if given is None else tuple(given.items()) if isinstance(given, Mapping) else ((None, given),)
+    for name, event in terms:
+        if not isinstance(name, str) or not isinstance(event, Event):
+            raise TypeError(
+                f"`events` must be a mapping from names to `Event`s, but holds {event!r} under {name!r}. Write e.g. "
+                "`events={'latch': jl.Event(lambda q: q)}`."
+            )
+        if isinstance(event.when, str) and event.when not in contacts:
+            there = ", ".join(contacts) or "none"
+            raise ValueError(f"`when` of {name!r} must name a contact, but is {event.when!r}. There are {there} in `unilateral`.")
+    return terms
+
+
+def merged(label: str, now: Any, given: Any) -> Any:
+    """What there is now, with the entries that are given in place of its own; mappings may leave out what stays."""
+    if isinstance(now, Mapping) and isinstance(given, Mapping):
+        for name in given:
+            if name not in now:
+                there = ", ".join(map(str, now))
+                raise ValueError(
+                    f"{label} must return entries of the state, but returned {name!r}. There are {there}; state what else "
+                    "changes as a `State`."
+                )
+        return {name: merged(label, old, given[name]) if name in given else old for name, old in now.items()}
+    shapes = [jax.tree.map(lambda x: jnp.shape(x), tree) for tree in (now, given)]
+    if shapes[0] != shapes[1]:
+        raise ValueError(f"{label} must return what has the shape of the state, {shapes[0]}, but returned {shapes[1]}. Keep its shape.")
+    return jax.tree.map(lambda old, new: jnp.asarray(new, jnp.result_type(old)), now, given)
+
+
+def _event(when: Any, then: Any, *rest: Any) -> Event:
     return Event(unpickled(when), unpickled(then), *rest)
+
+
+def _every(period: Any) -> Every:
+    return Every(unpickled(period))
 
 
 def _times(given: Any) -> tuple[float, ...]:
     values = given if np.ndim(given) else [given]
     times = tuple(float(number(time, "`when`", cure="Take times, or a function.")) for time in values)
-    if not times or any(late <= early for early, late in zip(times, times[1:], strict=False)):
+    if not times or any(late <= early for early, late in itertools.pairwise(times)):
         raise ValueError(f"`when` must be increasing times, but is {times}. Sort them, and name each once.")
     return times

@@ -10,6 +10,7 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float, PyTree
 
+from .event import Every, merged
 from .injection import asks_for, call, described, needs
 from .signal import at_time
 from .state_values import of_first_order, sampled, shaped_like
@@ -33,9 +34,10 @@ class Flat(NamedTuple):
     unravel_multipliers: Callable[[Float[Array, " m"]], dict[str, PyTree]]
     state_rates: Callable[..., dict[str, PyTree]]  # ż(t, q, v) of the states of first order
     updates: Callable[..., dict[str, PyTree]]  # u(t, q, v) of the sampled ones
-    witnesses: Callable[..., Float[Array, " e"]]  # w(t, q, v, number of events so far) of the events
+    witnesses: Callable[..., Float[Array, " e"]]  # w(t, q, v, multipliers) of the events
     happened: Callable[..., tuple[Float[Array, " n"], Float[Array, " n"], dict[str, PyTree]]]  # q, q̇ and states after an event, by name
     needs_multipliers: bool
+    events_need_multipliers: bool
     holonomic_names: tuple[str, ...]
     contacts: tuple[str, ...]
     terms: tuple[str, ...]
@@ -76,6 +78,7 @@ def bind(system: System, like: PyTree, params: PyTree, states: StatesAt | None =
         witnesses=bound.witnesses,
         happened=bound.happened,
         needs_multipliers=any(asks_for(function, "multipliers") for _, function in (*system.dissipation, *system.force)),
+        events_need_multipliers=any(callable(event.when) and asks_for(event.when, "multipliers") for _, event in system.events),
         holonomic_names=tuple(name for name, _ in (*system.holonomic, *system.unilateral)),
         contacts=tuple(name for name, _ in system.unilateral),
         terms=system.terms,
@@ -158,16 +161,22 @@ class _Bound:
     def updates(self, t, q, v):
         return self._of_states("update", {name: state.update for name, state in sampled(self.system).items()}, t, q, v)
 
-    def witnesses(self, t, q, v, counts):
-        found = [self._witness(name, event, t, q, v, count) for (name, event), count in zip(self.system.events, counts, strict=True)]
+    def witnesses(self, t, q, v, multipliers):
+        found = [self._witness(name, event.when, t, q, v, multipliers) for name, event in self.system.events]
         return jnp.stack(found) if found else jnp.zeros(0, q.dtype)
 
-    def _witness(self, name, event, t, q, v, count):
-        if not isinstance(event.when, tuple):
-            return jnp.asarray(self._called(event.when, f"`when` of {name!r}", t, q, v), q.dtype)
-        times = jnp.asarray((*event.when, jnp.inf), q.dtype)
-        following = times[jnp.clip(count.astype(int), 0, len(event.when))]
-        return jnp.where(jnp.isfinite(following), jnp.where(jnp.isfinite(following), following, 0) - t, 1)
+    def _witness(self, name, when, t, q, v, multipliers):
+        """A function that passes through zero where the event happens; one of times changes its sign at each of them."""
+        if isinstance(when, str):  # an impact is seen otherwise
+            return jnp.ones((), q.dtype)
+        if isinstance(when, tuple):
+            until = np.array(when, q.dtype) - t
+            return jnp.prod(jnp.where(until < 0, -1, 1)) * jnp.min(jnp.abs(until))
+        if isinstance(when, Every):
+            given = call(when.period, f"`period` of {name!r}", at_time(self.params, t)) if callable(when.period) else when.period
+            return jnp.sin(jnp.pi * t / jnp.asarray(given, q.dtype))
+        w = self._called(when, f"`when` of {name!r}", t, q, v, multipliers=self.unravel_multipliers(multipliers))
+        return jnp.asarray(w, q.dtype)
 
     def happened(self, name, t, q, v):
         event = dict(self.system.events)[name]
@@ -196,20 +205,6 @@ class _Bound:
 
     def unravel_multipliers(self, multipliers):
         return dict(zip(self.system.constraints, self.unravel_residuals(multipliers[: self.rows]), strict=True))
-
-
-def merged(label: str, now: Any, given: Any) -> Any:
-    """What there is now, with the entries that are given in place of its own; mappings may leave out what stays."""
-    if isinstance(now, Mapping) and isinstance(given, Mapping):
-        for name in given:
-            if name not in now:
-                there = ", ".join(map(str, now))
-                raise ValueError(f"{label} must return entries of the state, but returned {name!r}. There are {there}.")
-        return {name: merged(label, old, given[name]) if name in given else old for name, old in now.items()}
-    shapes = [jax.tree.map(lambda x: jnp.shape(x), tree) for tree in (now, given)]
-    if shapes[0] != shapes[1]:
-        raise ValueError(f"{label} must return what has the shape of the state, {shapes[0]}, but returned {shapes[1]}. Keep its shape.")
-    return jax.tree.map(lambda old, new: jnp.asarray(new, jnp.result_type(old)), now, given)
 
 
 def flat_like(like: PyTree, label: str, given: PyTree) -> Float[Array, " n"]:

@@ -5,7 +5,7 @@ from collections.abc import Callable, Collection, Mapping
 from typing import Any
 
 from .contact import Contact
-from .event import Event
+from .event import Event, events_of
 from .injection import check_function, needs
 from .pickling import picklable, unpickled
 from .states import Named, Sampled, State, states_of
@@ -47,7 +47,8 @@ class System:
       printed trajectory, `examine` and `plot.forces` report it.
     - `states`: by name, states beside q: `State(rate)`, of first order, ż = rate(…), or `Sampled(update, every)`, which changes at
       sample times alone, as in a digital controller.
-    - `events`: by name, `Event(when, then)`: what happens where a function of the state passes through zero, or at given times.
+    - `events`: by name, `Event(when, then)`: what happens where a function of the state passes through zero, or at given times;
+      `with_events(...)` gives the system with others.
 
     **Fields:** `lagrangian`, `dissipation`, `force`, `holonomic`, `unilateral` and `nonholonomic`, each a tuple of (name, function);
     `restitution`, a tuple of (name, number or function); `one_sided`, a tuple of names; `states`, `events`, tuples of (name, state) and
@@ -118,10 +119,18 @@ class System:
                 raise ValueError(f"`one_sided` must name holonomic constraints, but holds {name!r}. There are {there}.")
         object.__setattr__(self, "one_sided", tuple(name for name in known if name in given))
         object.__setattr__(self, "states", states_of(states))
-        object.__setattr__(self, "events", _events(events))
+        object.__setattr__(self, "events", events_of(events, contacts))
         for slot in ("holonomic", "unilateral"):
             for name, function in getattr(self, slot):
                 _check_position(role(slot, name), function, dict(self.states))
+
+    def with_events(self, events: Mapping[str, Event] | None) -> "System":
+        """The system with these events in place of its own."""
+        fields = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
+        new = object.__new__(System)
+        for name, value in (fields | {"events": events_of(events, [name for name, _ in self.unilateral])}).items():
+            object.__setattr__(new, name, value)
+        return new
 
     def __copy__(self) -> "System":
         return self
@@ -172,17 +181,6 @@ def _contacts(given: Any) -> dict[str, Contact]:
                 "`unilateral={'table': lambda q: q['y']}`."
             )
     return {name: term if isinstance(term, Contact) else Contact(term) for name, term in terms.items()}
-
-
-def _events(given: Any) -> tuple[tuple[str, Event], ...]:
-    terms = () if given is None else tuple(given.items()) if isinstance(given, Mapping) else ((None, given),)
-    for name, event in terms:
-        if not isinstance(name, str) or not isinstance(event, Event):
-            raise TypeError(
-                f"`events` must be a mapping from names to `Event`s, but holds {event!r} under {name!r}. Write e.g. "
-                "`events={'latch': jl.Event(lambda q: q)}`."
-            )
-    return terms
 
 
 def _check_position(label: str, function: Callable, states: dict[str, State | Sampled]) -> None:

@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Array, Float, PyTree
 
 from .._program.jit import compiled, is_concrete
+from .event import merged
 from .flat import Flat, StatesAt, bind, flat_like
 from .injection import call, check_entries, described, missing
 from .numbers import Label, in_dtype, number, numbers
@@ -169,8 +170,25 @@ def check(system: System, t: Array, q: Arrays, qdot: Arrays, params: PyTree, sta
         label = f"`{what}` of state {name!r}"
         then = functools.partial(shaped_like, label, states[name])
         _shape_of(function, label, params, then, t=t, q=q, qdot=qdot, **beside)
+    for name, event in system.events:
+        _check_event(system, name, event, t, q, qdot, params, states)
     shapes = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype), (q, eqx.filter(params, eqx.is_array)))
     warn_of_recreated_functions([(role(s, n), f) for s in SLOTS for n, f in getattr(system, s)], shapes)
+
+
+def _check_event(system, name, event, t, q, qdot, params, states):
+    """Its witness is a number, and what it makes of the state a state."""
+    beside = dict(states) | {"states": states}
+    multipliers = _multipliers(system, t, q, qdot, params, beside)
+    if callable(event.when):
+        out = _shape_of(event.when, f"`when` of {name!r}", params, t=t, q=q, qdot=qdot, multipliers=multipliers, **beside)
+        if not (isinstance(out, jax.ShapeDtypeStruct) and out.shape == ()):
+            raise ValueError(
+                f"`when` of {name!r} must return one real number, but returned {described(out)}. State an event for each number."
+            )
+    if event.then is not None:
+        label, now = f"`then` of {name!r}", {"q": q, "qdot": qdot, "states": dict(states)}
+        _shape_of(event.then, label, params, functools.partial(merged, label, now), t=t, q=q, qdot=qdot, **beside)
 
 
 def _check_state_names(system, q, params):

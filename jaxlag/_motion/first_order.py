@@ -13,6 +13,7 @@ from jaxtyping import Array, Bool, Float, PyTree
 from .._mechanics.contact import contact_rows, free, gap_scales, idle, in_contact
 from .._mechanics.friction_elements import FrictionElements
 from .._mechanics.friction_treatment import Regularised, StickSlip
+from .._mechanics.impact import check_impacts
 from .._mechanics.power import energy_exchange, listed_powers
 from .._mechanics.projection import Baumgarte, NoStabilisation, Projection
 from .._mechanics.saddle_point import SaddlePoint, Sound, constrained_acceleration
@@ -72,7 +73,7 @@ class EquationsOfMotion:
             alone = dataclasses.replace(alone, elsewhere=elsewhere)
         elements = formulation.friction.elements(alone.flat_at(params, at), *at[1:])
         if system.unilateral:
-            _check_impacts(alone.flat_at(params, at), elements, formulation.friction)
+            check_impacts(alone.flat_at(params, at), elements, formulation.friction)
         return alone if elements is None else dataclasses.replace(alone, rows=elements.element_of_row.size, elements=elements.size)
 
     def flat(self, params: PyTree, at: StatesAt) -> Flat:
@@ -138,9 +139,14 @@ class EquationsOfMotion:
         """y, taken apart."""
         beside = self.states.size, self.sampled.size, len(self.works)
         of_friction = self.rows, self.elements, min(self.elements, 1), self.elements
-        of_events = self.events, self.events, sum(of.most for _, of in self.system.events) * self.recorded, min(self.events, 1)
+        of_events = self.events, self.events, self.most.sum() * self.recorded, min(self.events, 1)
         sizes = [self.size, self.size, *beside, *of_friction, *[self.contacts] * 5, *of_events]
         return Parts(*jnp.split(y, np.cumsum(sizes)[:-1]))
+
+    @property
+    def most(self) -> np.ndarray:
+        """How many of each event are recorded."""
+        return np.array([event.most for _, event in self.system.events], int)
 
     @property
     def recorded(self) -> int:
@@ -162,8 +168,7 @@ class EquationsOfMotion:
         z, u = (ravelled({name: at.values[name] for name in of.shapes}, q.dtype) for of in (self.states, self.sampled))
         of_friction = map(zeros, (self.elements, min(self.elements, 1), self.elements))
         of_contact = zeros(self.contacts), zeros(self.contacts), zeros(self.contacts) + t, *map(zeros, (self.contacts, self.contacts))
-        recorded = sum(of.most for _, of in self.system.events) * self.recorded
-        of_events = zeros(self.events) + 1, zeros(self.events), zeros(recorded), zeros(min(self.events, 1))
+        of_events = zeros(self.events) + 1, zeros(self.events), zeros(self.most.sum() * self.recorded), zeros(min(self.events, 1))
         motion = q, v, z, u, zeros(len(self.works)), zeros(self.rows) + 1  # with slip, for the time being
         parts = Parts(*motion, *of_friction, *of_contact, *of_events)
         if self.sampled.size:
@@ -200,9 +205,13 @@ class EquationsOfMotion:
         """Whether there were more transitions than allowed."""
         return jnp.any(self.parts(y).transitions > self.formulation.friction.max_transitions)
 
+    def has_stopped(self, y) -> Bool[Array, ""]:
+        """Whether an event has ended the motion."""
+        return jnp.any(self.parts(y).stopped > 0)
+
     def unrecorded(self, y) -> Bool[Array, ""]:
         """Whether more events happened than are recorded."""
-        return jnp.any(self.parts(y).happened > np.array([event.most for _, event in self.system.events], y.dtype))
+        return jnp.any(self.parts(y).happened > self.most) if self.events else jnp.array(False)
 
     def sample(self, t, y, params, tolerances) -> tuple[Sample, Evidence]:
         """One sample, from y on the constraints."""
@@ -230,25 +239,8 @@ class EquationsOfMotion:
         contacts = dict(zip(flat.contacts, zip(*of_contact, strict=True), strict=True))
         events = dict(zip(dict(self.system.events), parts.happened, strict=True))
         unraveled = flat.unravel(q), flat.unravel(v), flat.unravel(qddot), flat.unravel_multipliers(multipliers)
-        return Sample(*unraveled, dict(states), named, friction_states, contacts, events, counts), Evidence(
-            sound, jax.lax.stop_gradient(violation)
-        )
-
-
-def _check_impacts(flat: Flat, elements: FrictionElements | None, treatment) -> None:
-    """Refuses friction whose impulses are not solved for."""
-    if not flat.needs_multipliers:
-        return
-    if isinstance(treatment, Regularised):
-        raise ValueError(
-            "`friction` must be `StickSlip()` where contacts rub, whose impacts take the impulses for the forces, but is `Regularised`. "
-            "Leave it out."
-        )
-    if elements is not None and np.any(elements.is_vector):
-        raise ValueError(
-            "`dissipation` must rub along single directions where an impact may multiply its normal force, but holds the norm of a slip "
-            "velocity of several components, whose direction in an impact is not solved for. Move in a plane, or leave out `unilateral`."
-        )
+        sample = Sample(*unraveled, dict(states), named, friction_states, contacts, events, counts)
+        return sample, Evidence(sound, jax.lax.stop_gradient(violation))
 
 
 def _values(flat: Flat, t, q, v):
@@ -270,8 +262,7 @@ def _rates(equations: EquationsOfMotion, t, y, args):
     powers = listed_powers(mode, t, q, v) if equations.works else works
     stuck = parts.time_stuck if elements is None else jnp.maximum(sticking(elements, sigma).astype(y.dtype), held)
     resting = Parts(*(jnp.zeros_like(part) for part in parts))
-    moving = resting._replace(q=v, v=qddot, z=rates, works=powers, time_stuck=stuck).y
-    return jnp.where(parts.stopped[0] > 0, 0, moving) if equations.events else moving
+    return resting._replace(q=v, v=qddot, z=rates, works=powers, time_stuck=stuck).y
 
 
 @jitted
@@ -280,8 +271,7 @@ def _updated(equations: EquationsOfMotion, t, y, args, due):
     flat = equations.flat_at(args.params, equations.states_of(t, parts))
     new, old = flat.updates(t, parts.q, parts.v), equations.sampled.unravelled(parts.u)
     changed = {name: jax.tree.map(functools.partial(jnp.where, on), new[name], old[name]) for name, on in zip(old, due, strict=True)}
-    u = ravelled(changed, y.dtype)
-    return parts._replace(u=jnp.where(parts.stopped[0] > 0, parts.u, u) if equations.events else u).y
+    return parts._replace(u=ravelled(changed, y.dtype)).y
 
 
 def _contact_violation(flat, t, parts, multipliers, rtol, atol):

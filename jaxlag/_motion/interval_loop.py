@@ -20,8 +20,8 @@ from jaxtyping import Array, Bool, Float, Int, PyTree
 from .._model.signal import broken_signals
 from .._model.states import flow
 from .._program.whole_kernel import in_whole_kernel
+from .events import behind_jump
 from .interval_inputs import Inputs, Recorded, Rows, packed
-from .jumps import after_jump
 from .protocol import Arguments
 from .results import RESULTS, number_of, numbered, under_diffrax
 from .runge_kutta import ExplicitRungeKutta
@@ -95,7 +95,7 @@ class IntervalLoop(NamedTuple):
             moving, steps, *_ = carry
             within = (steps.sample < self.ts.shape[0]) & (self.sample_time(steps.sample) > now(moving))  # the last may be repeated
             going = (steps.result == dfx.RESULTS.successful) & (steps.accepted + steps.rejected < self.max_steps)
-            return within & going
+            return within & going & ~self.equations.has_stopped(_alone(moving.y, numbers))
 
         moving, steps = stepping._start(controller, first, last, y0, following, numbers)
         moving, steps, saved, meter = loop(going_on, turn, (moving, steps, saved, self.meter.init()))
@@ -159,7 +159,7 @@ class IntervalLoop(NamedTuple):
 
         def behind(y):
             updated = self.equations.updated(t, y, after, passed[signals:]) if ticks else y
-            return after_jump(self.equations, t, y, updated, args, after)
+            return behind_jump(self.equations, t, y, updated, args, after)
 
         y, consistent = jax.lax.cond(jumps, behind, lambda y: (y, jnp.array(True)), y)
         result = dfx.RESULTS.where(consistent, result, under_diffrax(RESULTS.no_friction))
@@ -246,7 +246,7 @@ def integrated(equations, solver, max_steps, meter, y0, varied, scales, ts, tole
         write = lambda saved, i, y, wanted: saved.at[i].set(y, pred=wanted)
         checkpointed = functools.partial(while_loop, max_steps=max_steps, buffers=lambda carry: carry[2], kind="checkpointed")
         moving, steps, ys = started(given)(saved, write, checkpointed)
-        return _results(ys, _end(moving, steps), ts, max_steps)
+        return _results(equations, ys, _end(moving, steps), ts, max_steps)
 
     like = y0[(0, *[slice(None)] * len(directions))], y0, *[jnp.zeros((), int)] * 4
     space, unpack_end, _ = packed(like, [])
@@ -258,7 +258,7 @@ def integrated(equations, solver, max_steps, meter, y0, varied, scales, ts, tole
         return jax.lax.dynamic_update_slice_in_dim(saved, end, ts.size * y0.size, 0)
 
     found = in_whole_kernel(run)(given, jnp.concatenate([saved.ravel(), 0 * space]))
-    return _results(found[: saved.size].reshape(saved.shape), unpack_end(found[saved.size :]), ts, max_steps)
+    return _results(equations, found[: saved.size].reshape(saved.shape), unpack_end(found[saved.size :]), ts, max_steps)
 
 
 def _moving(equations, params, directions, reverse) -> tuple[bool, ...]:
@@ -282,13 +282,14 @@ def _written(length, width, saved, i, y, wanted):
     return jax.lax.dynamic_update_slice_in_dim(saved, y, at, 0)
 
 
-def _results(ys, end, ts, max_steps):
+def _results(equations, ys, end, ts, max_steps):
     t, y, number, accepted, rejected, sample = end
     t = t[(0,) * t.ndim]
-    repeated = (jnp.arange(ts.size) >= sample) & (ts == t)  # the last time, as padding has it
+    stopped = equations.has_stopped(y[(slice(None), *[0] * (y.ndim - 1))])
+    repeated = (jnp.arange(ts.size) >= sample) & ((ts == t) | stopped)  # the last time, as padding has it
     ys = jnp.where(repeated.reshape(-1, *[1] * y.ndim), y, ys)
     result = numbered(number)
-    unfinished = (result == dfx.RESULTS.successful) & (ts[-1] > t) & (accepted + rejected >= max_steps)
+    unfinished = (result == dfx.RESULTS.successful) & ~stopped & (ts[-1] > t) & (accepted + rejected >= max_steps)
     result = dfx.RESULTS.where(unfinished, dfx.RESULTS.max_steps_reached, result)
     stats = {"num_steps": accepted + rejected, "num_accepted_steps": accepted, "num_rejected_steps": rejected}
     return ys, (result, stats | {"last": jax.lax.stop_gradient((t, y[(slice(None), *[0] * (y.ndim - 1))]))})

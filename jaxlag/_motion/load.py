@@ -12,7 +12,7 @@ import numpy as np
 
 from .._mechanics.friction_treatment import Regularised, StickSlip
 from .export import FORMAT, filled_outline
-from .moments import ContactState, FrictionState
+from .moments import ContactState, EventState, FrictionState
 from .provenance import Recorded
 from .results import result_of
 from .trajectory import Trajectory
@@ -78,6 +78,8 @@ def _motion(about, arrays):
     (friction,) = (kinds[name](**fields) for name, fields in about["friction"].items())
     energy, friction_states, of_contacts = part("energy"), part("friction"), part("contacts")
     terms, contacts = (list(dict.fromkeys(name.rpartition(".")[0] for name in of)) for of in (friction_states, of_contacts))
+    happened = tree("happened") if "happened" in about["outlines"] else {}
+    events = {name: EventState(**record, count=jnp.asarray(arrays[f"events.{name}.count"])) for name, record in happened.items()}
     fields = [field.name for field in dataclasses.fields(ContactState)]
     return Trajectory(
         ts=jnp.asarray(arrays["t"]),
@@ -91,5 +93,6 @@ def _motion(about, arrays):
         works=part("works") if about["audit"] else None,
         friction={term: FrictionState(friction_states[f"{term}.force"], friction_states[f"{term}.sticking"]) for term in terms},
         contacts={name: ContactState(*(of_contacts[f"{name}.{field}"] for field in fields)) for name in contacts},
+        events=events,
         provenance=Recorded((energy["h"], energy["turned"]), part("slip"), tree("params"), tuple(about["one_sided"]), friction),
     )

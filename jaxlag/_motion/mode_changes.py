@@ -28,7 +28,7 @@ from .._program.time_bounds import bounds_over_time
 from .first_order import EquationsOfMotion
 from .protocol import Arguments
 from .state_vector import Parts, Start
-from .witnesses import witness_margins
+from .witnesses import plain_witnesses, witness_margins
 
 CONVERGED = 1e-9  # of the motion, the time that infinitely many impacts may yet take when they are summed up,
 LOW = 10  # or, in roundings of the gap, the height of the last flight
@@ -52,7 +52,7 @@ def margins(equations: EquationsOfMotion, t, y, args: Arguments, start) -> Float
     The mode and the sampled states are those of `start`, y at the start of the step: what these alone determine is computed once.
     """
     here, there = equations.parts(y), equations.parts(start)
-    still = {"u": there.u, "held": there.held, "closed": there.closed}
+    still = {"u": there.u, "held": there.held, "closed": there.closed, "sign": there.sign}
     if equations.rows == equations.elements:  # others may turn
         still["sigma"] = there.sigma
     return _margins(equations, t, here._replace(**still), args)
@@ -62,8 +62,8 @@ def margins(equations: EquationsOfMotion, t, y, args: Arguments, start) -> Float
 def _margins(equations: EquationsOfMotion, t, parts: Parts, args):
     q, v, sigma, held = parts.q, parts.v, parts.sigma, parts.held
     flat, mode, elements = equations.mode(t, parts, args)
-    of_events, rounding = witness_margins(flat, t, parts)
-    of_events = of_events + rounding
+    of_events = sum(witness_margins(equations, t, parts, args))
+    unbounded = jnp.ones_like(parts.closed), jnp.ones_like(parts.sign)
     if elements is None:
         closed = parts.closed > 0.5
         forces = jax.lax.cond(
@@ -71,12 +71,11 @@ def _margins(equations: EquationsOfMotion, t, parts: Parts, args):
             lambda: contact_rows(flat, equations.acceleration(mode, t, q, v).multipliers),
             lambda: jnp.zeros_like(parts.closed),
         )
-        none = jnp.ones_like(parts.closed), jnp.ones_like(parts.sign)
-        return jnp.concatenate([_contact_margins(flat, t, q, closed, forces), of_events, *none])
+        return jnp.concatenate([_contact_margins(flat, t, q, closed, forces), of_events, *unbounded])
     found = friction(flat, elements, sigma, t, q, v)
     of_contacts = _contact_margins(flat, t, q, parts.closed > 0.5, contact_rows(flat, found.multipliers))
     of_elements = jnp.where((held > 0) | idle(flat, elements, sigma, found.bound), 1, found.margin)
-    return jnp.concatenate([of_elements, of_contacts, of_events, found.bound, jnp.ones_like(parts.closed), jnp.ones_like(parts.sign)])
+    return jnp.concatenate([of_elements, of_contacts, of_events, found.bound, *unbounded])
 
 
 def _contact_margins(flat: Flat, t, q, closed, forces):
@@ -87,33 +86,46 @@ def _contact_margins(flat: Flat, t, q, closed, forces):
 
 
 class Approach(NamedTuple):
-    """What is known of the gaps along the path of a step: whether all contacts stay open from one time to another, and of the margins of
-    all modes, whether they may be negative between two times.
+    """What is known of gaps and witnesses along the path of a step: whether none is zero from one time to another, if that can be known at
+    all, and of the margins of all modes, whether they may be negative between two times.
     """
 
-    stay_open: Callable
-    may_close: Callable
+    stays_away: Callable | None
+    may_arrive: Callable
 
 
-def approach(equations: EquationsOfMotion, path: Callable, t, y, args: Arguments) -> Approach | None:
-    """Bounds of the gaps and of their rates; None where there are none. A gap that rises or falls all the time is seen at the ends."""
-    closed = equations.parts(y).closed > 0.5
+def approach(equations: EquationsOfMotion, path: Callable, t, y, args: Arguments) -> Approach:
+    """Bounds of gaps and witnesses and of their rates, where there are any. What rises or falls all the time is seen at the ends."""
+    closed, sign = equations.parts(y).closed > 0.5, equations.parts(y).sign
 
-    def gaps(t):
-        parts = equations.parts(path(t))
-        return equations.flat_at(args.params, equations.states_of(t, parts)).gaps(t, parts.q)
+    def along(function):
+        def at(t):
+            parts = equations.parts(path(t))
+            return function(equations.flat_at(args.params, equations.states_of(t, parts)), t, parts)
 
-    of_gaps = bounds_over_time(gaps, t)
-    of_rates = bounds_over_time(lambda t: jax.jvp(gaps, (t,), (jnp.ones_like(t),))[1], t)
-    if of_gaps is None or of_rates is None:
-        return None
+        return bounds_over_time(at, t), bounds_over_time(lambda t: jax.jvp(at, (t,), (jnp.ones_like(t),))[1], t)
 
-    def may_close(start, end):
-        (low, _), (falls, rises) = of_gaps(start, end), of_rates(start, end)
-        of_events = jnp.zeros(equations.events, bool)
-        return jnp.concatenate([jnp.zeros(equations.elements, bool), ~closed & (low < 0) & (falls < 0) & (rises > 0), of_events])
+    of_gaps = along(lambda flat, t, parts: flat.gaps(t, parts.q))
+    of_events = along(lambda flat, t, parts: sign * plain_witnesses(flat, t, parts.q, parts.v))
+    known = [(of, watched) for of, watched in ((of_gaps, ~closed), (of_events, jnp.ones(equations.events, bool))) if watched.size]
+    is_known = all(bound is not None for of, _ in known for bound in of)
+    flat, _, _ = equations.mode(t, equations.parts(y), args)
 
-    return Approach(lambda start, end: jnp.all(~closed & (of_gaps(start, end)[0] > 0)), may_close)
+    def may_arrive(start, end):
+        found = [jnp.zeros(equations.elements, bool)]
+        for (value, rate), watched in known:
+            if value is None or rate is None:
+                found.append(jnp.zeros_like(watched))
+            else:
+                (low, _), (falls, rises) = value(start, end), rate(start, end)
+                found.append(watched & (low < 0) & (falls < 0) & (rises > 0))
+        return jnp.concatenate(found)
+
+    def stays_away(start, end):
+        return jnp.all(jnp.concatenate([watched & (value(start, end)[0] > 0) for (value, _), watched in known]))
+
+    can_tell = is_known and known and not equations.elements and not flat.events_need_multipliers
+    return Approach(stays_away if can_tell else None, may_arrive)
 
 
 class AtEnd(NamedTuple):
@@ -138,7 +150,7 @@ def at_end(equations: EquationsOfMotion, t, y, args: Arguments, slopes: Float[Ar
     is_closed = parts.closed > 0.5
     gaps = jnp.where(is_closed, of_contacts, flat.gaps(t, parts.q))
     rates = jnp.where(is_closed, rises, gap_rates(flat, t, parts.q, parts.v))
-    witnesses, rounding = witness_margins(flat, t, parts)
+    witnesses, rounding = witness_margins(equations, t, parts, args)
     value, slope = jnp.concatenate([of_elements, gaps, witnesses]), jnp.concatenate([falls, rates, passes])
     is_exact = jnp.concatenate([jnp.zeros_like(falls, bool), ~is_closed, jnp.ones_like(passes, bool)])
     beside = jnp.concatenate([jnp.zeros_like(falls), of_contacts - gaps, rounding])

@@ -1,5 +1,7 @@
 """What a `Trajectory` holds of friction, contacts and events, and what it gives of single times."""
 
+import dataclasses
+
 import equinox as eqx
 from jaxtyping import Array, Bool, Float, PyTree
 
@@ -23,8 +25,8 @@ class ContactState(eqx.Module):
 
 
 class EventState(eqx.Module):
-    """What happened up to the end of a motion, event by event: the times `ts`, and `q`, `qdot` and `states` just before; NaN beyond the
-    last. `count`: how many there were up to each sample.
+    """Events of one name in a motion: their times `ts`, and `q`, `qdot` and `states` just before each; NaN beyond the last. `count`: how
+    many there were up to each sample.
     """
 
     ts: Float[Array, "*members most"]
@@ -32,6 +34,11 @@ class EventState(eqx.Module):
     qdot: PyTree
     states: dict[str, PyTree]
     count: Float[Array, "*members T"]
+
+
+def with_counts(events: dict[str, EventState], counts: dict[str, Array]) -> dict[str, EventState]:
+    """The same events, with the counts at other samples."""
+    return {name: dataclasses.replace(event, count=counts[name]) for name, event in events.items()}
 
 
 class Instant(eqx.Module):

@@ -10,6 +10,7 @@ from jaxtyping import PyTree
 
 from .._model.signal import is_signal
 from .._program.jit import is_called_by_python, is_concrete, jitted
+from .moments import with_counts
 from .provenance import Provenance
 from .trajectory import COUNTED, Trajectory
 
@@ -47,21 +48,10 @@ def _padded(rows: Any) -> np.ndarray:
 def without_padding(t: Trajectory, length: int) -> Trajectory:
     """The motion without the samples that were added."""
     counts = {name: count for name, count in t.stats.items() if name in COUNTED}
-    parts = (
-        t.ts,
-        t.q,
-        t.qdot,
-        t.qddot,
-        t.multipliers,
-        t.works,
-        t.friction,
-        counts,
-        t.states,
-        t.contacts,
-        {name: event.count for name, event in t.events.items()},
-    )
-    *state, works, friction, counts, states, contacts, happened = _first(parts, length)
-    events = {name: dataclasses.replace(event, count=happened[name]) for name, event in t.events.items()}
+    happened = {name: event.count for name, event in t.events.items()}
+    state, parts = (t.ts, t.q, t.qdot, t.qddot, t.multipliers), (t.works, t.friction, counts, t.states, t.contacts, happened)
+    state, (works, friction, counts, states, contacts, happened) = _first((state, parts), length)
+    events = with_counts(t.events, happened)
     return Trajectory(*state, t.result, t.stats | counts, works, friction, t.provenance, states, contacts, events)
 
 

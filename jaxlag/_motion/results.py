@@ -52,8 +52,8 @@ class RESULTS(dfx.RESULTS):  # pyright: ignore
         "to say what its friction is, but is not. Write it so."
     )
     too_many_events = (
-        "an event happened more than `most` times. Allow more, `Event(..., most=...)`; one that happens at once for ever chatters: let `then` "
-        "take the state away from where `when` is zero."
+        "an event happened more than `most` times. Allow more, `Event(..., most=...)`; one that happens at once for ever chatters: let "
+        "`then` take the state away from where `when` is zero."
     )
     chattering = (
         "friction changed between sliding and sticking more than `max_transitions` times: it chatters. "

@@ -1,5 +1,6 @@
 """The motion of one system."""
 
+from collections.abc import Mapping
 from typing import Any
 
 import diffrax as dfx
@@ -10,6 +11,7 @@ from jaxtyping import Array, PyTree
 from .._mechanics.friction_treatment import Regularised, StickSlip
 from .._mechanics.projection import Baumgarte, NoStabilisation, Projection
 from .._model.deprecation import renamed
+from .._model.event import Event
 from .._model.state_values import given_states
 from .._model.system import System
 from .._model.validation import parameters, sample_times, state
@@ -32,6 +34,7 @@ def simulate(
     params: PyTree = None,
     *,
     states: PyTree = None,
+    events: Mapping[str, Event] | None = None,
     solver: dfx.AbstractSolver | None = None,
     rtol: float | Array | None = None,
     atol: float | Array | None = None,
@@ -58,6 +61,7 @@ def simulate(
     - `ts`: sample times, shape (T,), increasing, at least two.
     - `params`: what the functions of the system name, any pytree; measured inputs among them are `Signal`s.
     - `states`: values at the start of states of the system, by name, in place of those that `State` and `Sampled` give.
+    - `events`: by name, `Event(when, then, stop)`, in place of those of the system. Keep them: new ones are compiled anew.
     - `solver`: any explicit or diagonally implicit Runge–Kutta solver of diffrax. Default `jaxlag.Dop853()`; for forces
       that are not smooth `jaxlag.Dopri5()`, for stiff systems `diffrax.Kvaerno5()`.
     - `rtol`, `atol`: tolerances of the step size control. Defaults 1e-8 and 1e-10 in double, 1e-4 and 1e-6 in single precision.
@@ -86,6 +90,7 @@ def simulate(
     ```
     """
     works = renamed(works, "works", audit=audit)
+    system = system if events is None else system.with_events(events)
     q0, qdot0 = state(q0, qdot0, ("q0", "qdot0"))
     dtype = jax.tree.leaves(q0)[0].dtype
     options = SolverOptions.of(solver, Formulation(stabilisation, friction, works), max_steps, adjoint, progress)

@@ -1,7 +1,7 @@
 """Many motions of one system at once."""
 
 import functools
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import diffrax as dfx
@@ -16,6 +16,7 @@ from jaxtyping import Array, PyTree
 from .._mechanics.friction_treatment import Regularised, StickSlip
 from .._mechanics.projection import Baumgarte, NoStabilisation, Projection
 from .._model.deprecation import renamed
+from .._model.event import Event
 from .._model.flat import StatesAt
 from .._model.paths import is_within, leaf_names
 from .._model.signal import is_signal, jump_times, with_second_derivatives
@@ -46,6 +47,7 @@ def simulate_many(
     params: PyTree = None,
     *,
     over: Sequence[str],
+    events: Mapping[str, Event] | None = None,
     common_steps: bool | None = None,
     solver: dfx.AbstractSolver | None = None,
     rtol: float | Array | None = None,
@@ -66,7 +68,7 @@ def simulate_many(
 
     **Arguments:**
 
-    - `system`, `q0`, `qdot0`, `ts`, `params`, `solver` to `throw`: as `simulate`; `ts` is the same for all.
+    - `system`, `q0`, `qdot0`, `ts`, `params`, `events`, `solver` to `throw`: as `simulate`; `ts` is the same for all.
     - `over`: what differs: "q0", "qdot0", entries of them ("q0.phi") or of `params` ("b", "wheel.c").
     - `common_steps`: True has 64 members at a time take the same steps, short enough for each of them, with the members as the last
       axis of all arithmetic: many times as fast as one by one. False lets each member take its own. Default: True, but False where there
@@ -90,6 +92,7 @@ def simulate_many(
     motions.q[-1, -1]  # cos(2 · 10) = 0.408
     ```
     """
+    system = system if events is None else system.with_events(events)
     everything = {"q0": coordinates(q0, "q0"), "qdot0": coordinates(qdot0, "qdot0")}
     everything["params"] = parameters(params, everything["q0"])
     own, shared = eqx.partition(everything, _differing(everything, tuple(over)))
@@ -163,7 +166,7 @@ def _share_steps(common_steps, equations, params, own):
     obstacle = equations.modes or equations.sampled.size or signals or jump_times(params, float) is not None
     if common_steps and obstacle:
         raise ValueError(
-            "`common_steps` must be False where dry friction, a contact, a jumping input or an update ends steps at its own time, or "
+            "`common_steps` must be False where dry friction, a contact, an event, a jumping input or an update ends steps at its own time, or "
             "signals differ, but is True. Leave it out."
         )
     return common_steps is not False and not obstacle

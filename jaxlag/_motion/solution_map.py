@@ -172,10 +172,10 @@ def samples_at(equations: EquationsOfMotion, ts, ys, params, result, stats, tole
     last_t, last_y = stats["last"]
     times, states = jnp.concatenate([ts, last_t[None]]), jnp.concatenate([ys, last_y[None]])
     samples = jax.vmap(lambda t, y: equations.sample(t, y, params, tolerances))(times, states)
+    if equations.events:  # behind the end of a motion there is none
+        states = jnp.where(states[:, -1:] > 0, jnp.nan, states)
     shown, result, reached = verified(equations, times, states, samples, params, result, tolerances)
     counts = {name: count for name, count in stats.items() if name != "last"} | {"reached": jax.lax.stop_gradient(reached)}
-    if equations.events:  # behind the end of a motion
-        shown = jax.tree.map(lambda x: jnp.where((ys[:, -1] > 0).reshape(-1, *[1] * (x.ndim - 1)), jnp.nan, x), shown)
     changing, rest = eqx.partition(shown, eqx.is_inexact_array)
     return Samples(ys, changing), Unchanging(result, counts, rest)
 

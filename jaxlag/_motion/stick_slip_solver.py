@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from .._program.jit import jitted
-from .events import behind
+from .events import behind_end
 from .first_order import EquationsOfMotion
 from .mode_changes import approach, at_end, margins
 from .results import RESULTS, under_diffrax
@@ -24,7 +24,7 @@ from .wrapped_solver import ProjectedSolver
 # mode changes; and the rest of the step, watched for a second end.
 WHOLE, NEWTON, CHANGE, REST = range(4)
 PHASES = np.array([WHOLE, NEWTON, NEWTON, CHANGE, REST], np.int32)
-OF_CONTACT = np.array([WHOLE, NEWTON, NEWTON, NEWTON, CHANGE, REST], np.int32)  # a gap is seen to end late, by its rounding
+SEEN_LATE = np.array([WHOLE, NEWTON, NEWTON, NEWTON, CHANGE, REST], np.int32)  # as gaps and witnesses are, by their rounding
 SIMULTANEOUS = 1e3  # modes that end within this many roundings of time end together
 BARELY = 1e-6  # of the motion, the step that ends where a bound turns negative
 
@@ -120,7 +120,7 @@ class StickSlipSolver(ProjectedSolver):
 
     def _phases(self, run, carry):
         """The step after its phases, from the number of the first: there is but one, unless a mode ends."""
-        phases = OF_CONTACT if self.equations.contacts else PHASES
+        phases = SEEN_LATE if self.equations.contacts or self.equations.events else PHASES
         going_on = lambda carry: (carry[0] == 0) | (carry[1].seen.ended & (carry[0] < phases.size))
         turn = lambda carry: (carry[0] + 1, run(carry[1], jnp.asarray(phases)[carry[0]]))
         if not self.reverse:  # a sixth faster: a turn that does nothing copies all that the loop carries
@@ -163,7 +163,7 @@ class StickSlipSolver(ProjectedSolver):
 
     def _change(self, split: Split, ended, args) -> Split:
         """With the state in the mode that follows when those of the elements `ended` end."""
-        found = behind(self.equations, split.cut.time, split.first.y, args, ended)
+        found = behind_end(self.equations, split.cut.time, split.first.y, args, ended)
         fine = {"consistent": found.consistent, "dissipates": found.dissipates, "impulsive": found.impulsive}
         cut = split.cut._replace(y=found.y, **fine, usable=split.cut.usable & found.at_rest)
         return split._replace(cut=cut)
@@ -195,12 +195,14 @@ class StickSlipSolver(ProjectedSolver):
         t0, t1, dense, args = jax.lax.stop_gradient((t0, t1, dense, args))
         path = self.solver.interpolation_cls(t0=t0, t1=t1, **dense)
         of, modes = lambda t, y, start: margins(self.equations, t, y, args, start), self.equations.modes
-        between = approach(self.equations, path.evaluate, t0, path.evaluate(t0), args) if self.equations.contacts else None
-        watched = lambda: first_end(of, path.evaluate, t0, t1, modes, args.scales, exactly, between and between.may_close)
-        if between is None or self.equations.elements or self.equations.events:
+        if not (self.equations.contacts or self.equations.events):
+            return first_end(of, path.evaluate, t0, t1, modes, args.scales, exactly)
+        between = approach(self.equations, path.evaluate, t0, path.evaluate(t0), args)
+        watched = lambda: first_end(of, path.evaluate, t0, t1, modes, args.scales, exactly, between.may_arrive)
+        if between.stays_away is None:
             return watched()
         no = jnp.array(False)
-        return jax.lax.cond(between.stay_open(t0, t1), lambda: Seen(no, no, no, t1, jnp.zeros(modes, t1.dtype)), watched)
+        return jax.lax.cond(between.stays_away(t0, t1), lambda: Seen(no, no, no, t1, jnp.zeros(modes, t1.dtype)), watched)
 
 
 def _nodes(solver) -> np.ndarray:

@@ -21,7 +21,7 @@ from .._program.jit import compiled, is_concrete
 from .card import card
 from .export import arrays_of, frame_of, outline, write_arrays
 from .interpolation import Moving, between
-from .moments import ContactState, EventState, FrictionState, Instant, Interpolated
+from .moments import ContactState, EventState, FrictionState, Instant, Interpolated, with_counts
 from .provenance import Provenance, Recorded
 from .results import RESULTS, names_of
 
@@ -130,7 +130,7 @@ class Trajectory(eqx.Module):
         provenance = self.provenance
         if isinstance(provenance, Recorded):
             provenance = dataclasses.replace(provenance, energies=chosen(provenance.energies), slip=chosen(provenance.slip))
-        events = {name: dataclasses.replace(event, count=chosen(event.count)) for name, event in self.events.items()}
+        events = with_counts(self.events, {name: chosen(event.count) for name, event in self.events.items()})
         *motion, states = chosen((self.ts, self.q, self.qdot, self.qddot, self.multipliers, self.states))
         return Trajectory(*motion, self.result, counts, works, chosen(self.friction), provenance, states, chosen(self.contacts), events)
 
@@ -167,10 +167,12 @@ class Trajectory(eqx.Module):
 
     def to_dict(self) -> dict[str, np.ndarray]:
         """All samples as NumPy arrays by flat names: "t", "q.x", "qdot.x", "qddot.x", "multipliers.rod", "states.z",
-        "friction.brake.force", "friction.brake.sticking", "contacts.floor.closed", "works.brake"; "q" where q is one array.
+        "friction.brake.force", "friction.brake.sticking", "contacts.floor.closed", "events.click.count", "works.brake"; "q" where q is one
+        array.
         """
         states = dict(q=self.q, qdot=self.qdot, qddot=self.qddot, multipliers=self.multipliers, states=self.states)
-        return arrays_of(t=self.ts, **states, friction=self.friction, contacts=self.contacts, works=self.works)
+        events = {name: {"count": event.count} for name, event in self.events.items()}
+        return arrays_of(t=self.ts, **states, friction=self.friction, contacts=self.contacts, events=events, works=self.works)
 
     def to_dataframe(self, frame: Callable | None = None) -> Any:
         """A table with a row for each sample and the columns of `to_dict`, "r[0]", "r[1]", … of an array; `jl.Experiment.from_dataframe`
@@ -200,7 +202,9 @@ class Trajectory(eqx.Module):
         numbers = jax.tree.map(lambda leaf: leaf if eqx.is_array(leaf) else None, recorded.params)
         energy = dict(zip(("h", "turned"), recorded.energies, strict=True))
         more = arrays_of(stats=self.stats, energy=energy, slip=recorded.slip, params=numbers)
-        trees = dict(q=self.q, multipliers=self.multipliers, states=self.states, params=numbers)
+        happened = {name: dict(ts=event.ts, q=event.q, qdot=event.qdot, states=event.states) for name, event in self.events.items()}
+        more |= arrays_of(happened=happened)
+        trees = dict(q=self.q, multipliers=self.multipliers, states=self.states, params=numbers, happened=happened)
         write_arrays(
             file,
             "Trajectory",

@@ -6,32 +6,55 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from .._mechanics.contact import roundings
+from .._mechanics.stick_slip import friction
 from .._model.event import Either, Rising
 from .._model.flat import Flat
 from .first_order import EquationsOfMotion
+from .protocol import Arguments
 from .state_vector import Parts
 
 
-def witness_margins(flat: Flat, t, parts: Parts) -> tuple[Float[Array, " w"], Float[Array, " w"]]:
+def witness_margins(equations: EquationsOfMotion, t, parts: Parts, args: Arguments) -> tuple[Float[Array, " w"], Float[Array, " w"]]:
     """Of each witness, its value with the sign that it has until it passes through zero, and what of it counts as rounding."""
-    value, scale = _value_and_scale(flat, t, parts, roundings(parts.q), roundings(parts.v))
+    if not equations.events:
+        return parts.sign, parts.sign
+    value, scale = _value_and_scale(equations, t, parts, args, roundings(parts.q), roundings(parts.v))
     return parts.sign * value, scale
 
 
-def _value_and_scale(flat, t, parts, of_q, of_v):
+def _value_and_scale(equations, t, parts, args, of_q, of_v):
     """Of each witness, its value, and what errors of q and q̇ amount to in it."""
-    of = lambda t, q, v: flat.witnesses(t, q, v, jax.lax.stop_gradient(parts.happened))
-    by_t, by_q, by_v = (jnp.abs(by) for by in jax.lax.stop_gradient(jax.jacfwd(of, argnums=(0, 1, 2))(t, parts.q, parts.v)))
-    return of(t, parts.q, parts.v), by_t * roundings(t[None]) + jnp.sum(by_q * of_q[None], axis=1) + jnp.sum(by_v * of_v[None], axis=1)
+    flat, _, _ = equations.mode(t, parts, args)
+    multipliers = _multipliers(equations, t, parts, args)(t, parts.q, parts.v)
+    of_loads = roundings(jnp.max(jnp.abs(multipliers), initial=0.0) * jnp.ones_like(multipliers))
+    at = t, parts.q, parts.v, multipliers
+    slopes = [jnp.abs(by).reshape(equations.events, -1) for by in jax.jacfwd(flat.witnesses, argnums=(0, 1, 2, 3))(*at)]
+    scale = sum(jnp.sum(by * of[None], axis=1) for by, of in zip(slopes, (roundings(t[None]), of_q, of_v, of_loads), strict=True))
+    return flat.witnesses(*at), jax.lax.stop_gradient(scale)
 
 
-def signs(flat: Flat, t, parts: Parts, qddot: Float[Array, " n"], of_q: Float[Array, " n"], of_v: Float[Array, " n"]) -> Float[Array, " w"]:
-    """On which side of zero each witness is; of one that is zero but for errors of q and q̇, to which side it goes."""
-    value, scale = _value_and_scale(flat, t, parts, of_q, of_v)
-    of = lambda t, q, v: flat.witnesses(t, q, v, parts.happened)
-    rate = jax.jvp(of, (t, parts.q, parts.v), (jnp.ones_like(t), parts.v, qddot))[1]
-    side = jnp.where(jnp.abs(value) > scale, value, rate)
-    return jax.lax.stop_gradient(jnp.where(side < 0, -1.0, 1.0).astype(value.dtype))
+def _multipliers(equations, t, parts, args):
+    """Those of the mode as a function of (t, q, v), where a witness asks for them."""
+    flat, mode, elements = equations.mode(t, parts, args)
+    if not flat.events_need_multipliers:
+        return lambda t, q, v: jnp.zeros(flat.rows, v.dtype)
+    if elements is None:
+        return lambda t, q, v: equations.acceleration(mode, t, q, v).multipliers
+    return lambda t, q, v: friction(flat, elements, parts.sigma, t, q, v).multipliers
+
+
+def sides(equations: EquationsOfMotion, t, parts: Parts, args: Arguments, of_q: Float[Array, " n"], of_v: Float[Array, " n"]):
+    """On which side of zero each witness is, 1 or −1; where it is zero but for errors of q and q̇, to which side it goes. And whether it is
+    farther away.
+    """
+    value, scale = _value_and_scale(equations, t, parts, args, of_q, of_v)
+    flat, mode, _ = equations.mode(t, parts, args)
+    multipliers, qddot = _multipliers(equations, t, parts, args), equations.acceleration(mode, t, parts.q, parts.v).x
+    along = lambda t, q, v: flat.witnesses(t, q, v, multipliers(t, q, v))
+    rate = jax.jvp(along, (t, parts.q, parts.v), (jnp.ones_like(t), parts.v, qddot))[1]
+    is_far = jnp.abs(value) > scale
+    side = jnp.where(jnp.where(is_far, value, rate) < 0, -1.0, 1.0).astype(value.dtype)
+    return jax.lax.stop_gradient((side, is_far))
 
 
 def matching(equations: EquationsOfMotion, sign: Float[Array, " w"]) -> Bool[Array, " w"]:
@@ -40,3 +63,8 @@ def matching(equations: EquationsOfMotion, sign: Float[Array, " w"]) -> Bool[Arr
     falls = np.array([not isinstance(direction, Rising) for direction in of])
     rises = np.array([isinstance(direction, (Rising, Either)) for direction in of])
     return jnp.where(sign > 0, falls, rises)
+
+
+def plain_witnesses(flat: Flat, t, q, v) -> Float[Array, " w"]:
+    """Those that follow the state alone; of the others, which follow constraint forces, nothing is known."""
+    return flat.witnesses(t, q, v, jnp.zeros(flat.rows, v.dtype))
