@@ -70,9 +70,9 @@ class Event:
 
     The time is located to rounding, and differentiated exactly, as is what `then` returns, which is put on the constraints. A sample at
     the time of an event shows the state behind it. Where an impact, an input that jumps or another event takes w to the other side of
-    zero, the event happens, too, but none twice at one time. Where several happen at once, those stated first come first. Events act in motions alone: to
-    `equilibrium`, `linearise`, `examine` and `equations` a system is what it is without. Any consistent units. A system takes events by
-    name: `System(..., events={"latch": Event(...)})`; a motion, too: `simulate(..., events=...)`.
+    zero, the event happens, too, but none twice at one time. Where several happen at once, those stated first come first. To
+    `equilibrium`, `linearise`, `examine` and `equations` a system is what it is without events. Any consistent units. A system takes
+    events by name: `System(..., events={"latch": Event(...)})`; a motion, too: `simulate(..., events=...)`.
 
     **Raises:** `TypeError` or `ValueError` where these are not such functions, times and numbers.
 

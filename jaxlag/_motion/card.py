@@ -27,7 +27,7 @@ def card(motion: Any) -> str:
     if motion.multipliers:
         rows.append(("start moved by", f"{np.max(motion.stats['start_moved']):.2g}"))
     for name, contact in motion.contacts.items():
-        impacts, closed = np.asarray(contact.impacts)[..., -1], np.asarray(contact.closed)
+        impacts, closed = np.asarray(contact.impacts), np.asarray(contact.closed)
         times = int(np.nanmax(impacts, initial=0))
         rows.append(("contact", f"{name!r}: {times} impact{'s' * (times != 1)}{most}, closed at {closed.sum()} of {closed.size} samples"))
     for name, event in motion.events.items():

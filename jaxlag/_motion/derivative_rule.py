@@ -66,11 +66,16 @@ def differentiable(of: DifferentiableMap) -> Callable:
             y, aux = solution(inputs, ts)
             change = _jacobian_product(of, varying, constant, ts, y, ravel_pytree(d_inputs)[0])
         if d_ts is not None:
-            shift = jax.tree.map(lambda rate: jax.vmap(jnp.multiply)(rate, d_ts), drifted(of, inputs, ts, y))
+            shift = jax.tree.map(lambda rate: _shift(rate, d_ts), drifted(of, inputs, ts, y))
             change = shift if change is None else jax.tree.map(jnp.add, change, shift)
         return (y, aux), (change, jax.tree.map(lambda _: None, aux))
 
     return solution
+
+
+def _shift(rate, d_ts):
+    """The change of samples with their times; what is not of samples, the times of events, has no rate."""
+    return jax.vmap(jnp.multiply)(rate, d_ts) if len(rate) == len(d_ts) else rate
 
 
 @jitted  # one program for all parts of y; its transpose is one, too

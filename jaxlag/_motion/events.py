@@ -1,23 +1,20 @@
 """Events that happen: what is recorded of them, and the state behind."""
 
-from typing import Any
-
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, PyTree
+from jaxtyping import Array, Bool, Float
 
 from .._mechanics.contact import roundings
 from .._mechanics.projection import nearest_state
 from .._model.event import Negative
-from .._model.state_values import of_first_order, ravelled, sampled
-from .._model.system import System
+from .._model.state_values import ravelled
 from .._program.jit import jitted
 from .first_order import EquationsOfMotion
 from .jumps import after_jump
 from .mode_changes import Change, changed
 from .protocol import Arguments
-from .state_vector import Parts, Sample
+from .state_vector import Parts
 from .witnesses import matching, sides
 
 
@@ -66,22 +63,25 @@ def _struck(equations: EquationsOfMotion, before, y) -> Bool[Array, " w"]:
 @jitted
 def _settled(equations: EquationsOfMotion, t, seen, y, args: Arguments, passed: Bool[Array, " w"], jumped: Bool[Array, ""]):
     """y behind the events whose witnesses `passed` through zero, and behind those whose witnesses these, or a jump before, have taken to
-    the other side, each of them once; and whether a mode of friction and contact is consistent there. Recorded is the state that was
-    `seen`, before a jump.
+    the other side, each of them once; and whether a mode of friction and contact is consistent there. What is recorded is the state that
+    was `seen` before all this.
     """
 
     def turn(carry):
-        seen, y, consistent, passed, done = carry
+        y, consistent, passed, done = carry
         done = done | passed
-        after, fine = _happened(equations, t, seen, y, args, passed, done)
-        return after, after, consistent & fine, _taken_across(equations, t, after, args) & ~done, done
+        after, fine = _happened(equations, t, y, args, passed, done)
+        return after, consistent & fine, _taken_across(equations, t, after, args) & ~done, done
 
     def maybe(_, carry):
-        return jax.lax.cond(jnp.any(carry[3]), turn, lambda carry: carry, carry)
+        return jax.lax.cond(jnp.any(carry[2]), turn, lambda carry: carry, carry)
 
     none = jnp.zeros_like(passed)
     passed = passed | jax.lax.cond(jumped, lambda: _taken_across(equations, t, y, args), lambda: none)
-    _, y, consistent, *_ = jax.lax.fori_loop(0, equations.events, maybe, (seen, y, jnp.array(True), passed, none))
+    before = equations.parts(seen)
+    there = jnp.concatenate([t[None], before.q, before.v, before.z, before.u])
+    y = equations.parts(y)._replace(seen=there).y
+    y, consistent, *_ = jax.lax.fori_loop(0, equations.events, maybe, (y, jnp.array(True), passed, none))
     return y, consistent
 
 
@@ -92,33 +92,22 @@ def _taken_across(equations, t, y, args):
     return is_far & (side != parts.sign)
 
 
-def _happened(equations: EquationsOfMotion, t, seen, y, args: Arguments, passed: Bool[Array, " w"], done: Bool[Array, " w"]):
+def _happened(equations: EquationsOfMotion, t, y, args: Arguments, passed: Bool[Array, " w"], done: Bool[Array, " w"]):
     """y behind events whose witnesses `passed` through zero, and whether a mode of friction and contact is consistent there; those that
     are `done` at this time do not happen again, on whichever side of zero their witnesses are now.
     """
     before = equations.parts(y)
     happens = passed & matching(equations, before.sign)
-    record = _recorded(equations, t, equations.parts(seen), happens)
-    parts = before._replace(record=record, happened=before.happened + happens)
+    parts = before._replace(happened=before.happened + happens)
     unmoved = lambda: (parts.y, jnp.array(True))
-    changes = jnp.any(happens & np.array([event.then is not None for _, event in equations.system.events]))
-    moved, consistent = jax.lax.cond(changes, lambda: _moved(equations, t, parts, args, happens), unmoved)
+    changing = np.array([event.then is not None for _, event in equations.system.events])
+    move = (lambda: _moved(equations, t, parts, args, happens)) if changing.any() else unmoved
+    moved, consistent = jax.lax.cond(jnp.any(happens & changing), move, unmoved)
     after = equations.parts(moved)
     stops = jnp.any(happens & np.array([event.stop for _, event in equations.system.events]))
     assert args.scales is not None  # events are located
     side, _ = sides(equations, t, after, args, args.scales.error(after.q), args.scales.error(after.v))
     return after._replace(sign=jnp.where(done, side, after.sign), stopped=jnp.maximum(after.stopped, stops)).y, consistent
-
-
-def _recorded(equations: EquationsOfMotion, t, parts: Parts, happens):
-    """The record, with this time and state in the next row of each event that happens."""
-    row = jnp.concatenate([t[None], parts.q, parts.v, parts.z, parts.u])
-    rows, start = parts.record.reshape(-1, equations.recorded), 0
-    for i, most in enumerate(equations.most):
-        here = happens[i] & (np.arange(len(rows)) == start + parts.happened[i].astype(int)) & (parts.happened[i] < most)
-        rows = jnp.where(here[:, None], row[None], rows)
-        start += most
-    return rows.ravel()
 
 
 def _moved(equations: EquationsOfMotion, t, parts: Parts, args: Arguments, happens):
@@ -132,34 +121,8 @@ def _moved(equations: EquationsOfMotion, t, parts: Parts, args: Arguments, happe
         z, u = (ravelled({name: states[name] for name in layout.shapes}, q.dtype) for layout in (equations.states, equations.sampled))
         changed = new._replace(q=q, v=v, z=z, u=u)
         new = jax.tree.map(lambda x, old, i=i: jnp.where(happens[i], x, old), changed, new)
-    there, _, _ = equations.mode(t, new, args)
-    nearest = nearest_state(there._replace(holonomic=there.bilateral), t, new.q, new.v)
-    return after_jump(equations, t, parts.y, new._replace(q=nearest.q, v=nearest.v).y, args, args)
-
-
-def recorded(system: System, shown: Sample, ys: Float[Array, "T y"]) -> dict[str, tuple[Array, PyTree, PyTree, dict[str, PyTree]]]:
-    """By name, the times of events and the states there, from the last state that was reached; NaN beyond the last event."""
-    if not system.events:
-        return {}
-    last = jnp.maximum(jnp.sum(jnp.isfinite(ys[:, 0])) - 1, 0)
-    y, most = ys[last], [event.most for _, event in system.events]
-    of = lambda tree: jax.tree.map(lambda x: x[0], tree)
-    parts = of(shown.q), of(shown.qdot), *({name: of(shown.states[name]) for name in kind(system)} for kind in (of_first_order, sampled))
-    sizes = [1, *(sum(x.size for x in jax.tree.leaves(part)) for part in parts)]
-    rows = y[-1 - sum(most) * sum(sizes) : -1].reshape(sum(most), sum(sizes))
-    number = y[-1 - rows.size - len(most) : -1 - rows.size]
-    found = {}
-    for i, name in enumerate(dict(system.events)):
-        mine = rows[sum(most[:i]) : sum(most[: i + 1])]
-        mine = jnp.where((np.arange(most[i]) < number[i])[:, None], mine, jnp.nan)
-        t, *columns = jnp.split(mine, np.cumsum(sizes)[:-1], axis=1)
-        q, v, z, u = (_unravelled(part, column) for part, column in zip(parts, columns, strict=True))
-        found[name] = t[:, 0], q, v, z | u
-    return found
-
-
-def _unravelled(like: PyTree, rows: Float[Array, "k n"]) -> Any:
-    """Pytrees of vectors, one for each row."""
-    leaves, structure = jax.tree.flatten(like)
-    parts = jnp.split(rows, np.cumsum([x.size for x in leaves])[:-1], axis=1) if leaves else []
-    return jax.tree.unflatten(structure, [part.reshape(-1, *x.shape) for part, x in zip(parts, leaves, strict=True)])
+    if equations.system.constraints:
+        there, _, _ = equations.mode(t, new, args)
+        nearest = nearest_state(there._replace(holonomic=there.bilateral), t, new.q, new.v)
+        new = new._replace(q=nearest.q, v=nearest.v)
+    return after_jump(equations, t, parts.y, new.y, args, args)

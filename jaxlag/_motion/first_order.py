@@ -10,16 +10,14 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, PyTree
 
-from .._mechanics.contact import contact_rows, free, gap_scales, idle, in_contact
+from .._mechanics.contact import free, in_contact
 from .._mechanics.friction_elements import FrictionElements
 from .._mechanics.friction_treatment import Regularised, StickSlip
 from .._mechanics.impact import check_impacts
 from .._mechanics.power import energy_exchange, listed_powers
 from .._mechanics.projection import Baumgarte, NoStabilisation, Projection
-from .._mechanics.saddle_point import SaddlePoint, Sound, constrained_acceleration
+from .._mechanics.saddle_point import SaddlePoint, constrained_acceleration
 from .._mechanics.stick_slip import (
-    friction,
-    friction_by_term,
     in_mode,
     redirected,
     slip_of,
@@ -33,7 +31,7 @@ from .._program.jit import jitted
 from .._program.scalarise import scalarised
 from .interval_inputs import called_elsewhere, pieces_at, warn_of_delays
 from .protocol import Arguments
-from .state_vector import Evidence, Parts, Sample, Violation
+from .state_vector import Parts
 
 PROJECTION = "projection"  # name of the work that projection does
 NEGLIGIBLE = 1e7  # times the tolerance, compared with which a slip of a thousand tolerances is negligible
@@ -139,25 +137,20 @@ class EquationsOfMotion:
         """y, taken apart."""
         beside = self.states.size, self.sampled.size, len(self.works)
         of_friction = self.rows, self.elements, min(self.elements, 1), self.elements
-        of_events = self.events, self.events, self.most.sum() * self.recorded, min(self.events, 1)
+        of_events = self.events, self.events, self.seen, min(self.events, 1)
         sizes = [self.size, self.size, *beside, *of_friction, *[self.contacts] * 5, *of_events]
         return Parts(*jnp.split(y, np.cumsum(sizes)[:-1]))
 
     @property
-    def most(self) -> np.ndarray:
-        """How many of each event are recorded."""
-        return np.array([event.most for _, event in self.system.events], int)
-
-    @property
-    def recorded(self) -> int:
-        """How many numbers are recorded of an event: the time, q, q̇ and the states."""
-        return 1 + self.controlled + self.sampled.size
+    def seen(self) -> int:
+        """How many numbers are recorded of an event, where there are any: the time, q, q̇ and the states."""
+        return 1 + self.controlled + self.sampled.size if self.events else 0
 
     @property
     def projection(self) -> Projection | None:
         """What puts steps back on the constraints, and on s = 0 where friction sticks, if anything has to."""
         chosen = self.formulation.stabilisation.projection()
-        if self.modes:
+        if self.elements or self.contacts:
             return chosen or Projection()
         return chosen if self.system.constraints else None
 
@@ -168,7 +161,7 @@ class EquationsOfMotion:
         z, u = (ravelled({name: at.values[name] for name in of.shapes}, q.dtype) for of in (self.states, self.sampled))
         of_friction = map(zeros, (self.elements, min(self.elements, 1), self.elements))
         of_contact = zeros(self.contacts), zeros(self.contacts), zeros(self.contacts) + t, *map(zeros, (self.contacts, self.contacts))
-        of_events = zeros(self.events) + 1, zeros(self.events), zeros(self.most.sum() * self.recorded), zeros(min(self.events, 1))
+        of_events = zeros(self.events) + 1, zeros(self.events), zeros(self.seen), zeros(min(self.events, 1))
         motion = q, v, z, u, zeros(len(self.works)), zeros(self.rows) + 1  # with slip, for the time being
         parts = Parts(*motion, *of_friction, *of_contact, *of_events)
         if self.sampled.size:
@@ -205,43 +198,6 @@ class EquationsOfMotion:
         """Whether there were more transitions than allowed."""
         return jnp.any(self.parts(y).transitions > self.formulation.friction.max_transitions)
 
-    def has_stopped(self, y) -> Bool[Array, ""]:
-        """Whether an event has ended the motion."""
-        return jnp.any(self.parts(y).stopped > 0)
-
-    def unrecorded(self, y) -> Bool[Array, ""]:
-        """Whether more events happened than are recorded."""
-        return jnp.any(self.parts(y).happened > self.most) if self.events else jnp.array(False)
-
-    def sample(self, t, y, params, tolerances) -> tuple[Sample, Evidence]:
-        """One sample, from y on the constraints."""
-        rtol, atol = tolerances
-        parts = self.parts(y)
-        q, v, works, sigma, held = parts.q, parts.v, parts.works, parts.sigma, parts.held
-        flat, mode, elements = self.mode(t, parts, Arguments(params))
-        states = self.states_of(t, parts).values
-        friction_states, counts, violation = {}, {}, Violation(jnp.zeros(0), jnp.zeros(0))
-        if elements is None:
-            qddot, multipliers, sound = self.acceleration(mode, t, q, v)
-        else:
-            found = friction(flat, elements, sigma, t, q, v, self.formulation.stabilisation.feedback())
-            qddot, multipliers, sound = found.qddot, found.multipliers, Sound(jnp.array(True), jnp.array(True))
-            friction_states = friction_by_term(elements, sigma, held > 0, t, q, v, found)
-            stuck, load = sticking(elements, sigma), elements.norms(found.force)
-            scale = jnp.where(stuck, jnp.abs(found.bound) + load, slip_of(elements, t, q, v, NEGLIGIBLE * (rtol * jnp.abs(v) + atol)))
-            excess = jnp.where((held > 0) | idle(flat, elements, sigma, found.bound), 0, -found.margin)
-            violation = Violation(jnp.concatenate([excess, -found.bound]), jnp.concatenate([scale, jnp.abs(found.bound)]))
-            counts = {"transitions": parts.transitions[0], "time_stuck": parts.time_stuck}
-        named = dict(zip(self.works, works, strict=True)) if self.works else None
-        if self.contacts:
-            violation = violation.beside(*_contact_violation(flat, t, parts, multipliers, rtol, atol))
-        of_contact = parts.closed > 0.5, parts.impacts, parts.changed, parts.impulse
-        contacts = dict(zip(flat.contacts, zip(*of_contact, strict=True), strict=True))
-        events = dict(zip(dict(self.system.events), parts.happened, strict=True))
-        unraveled = flat.unravel(q), flat.unravel(v), flat.unravel(qddot), flat.unravel_multipliers(multipliers)
-        sample = Sample(*unraveled, dict(states), named, friction_states, contacts, events, counts)
-        return sample, Evidence(sound, jax.lax.stop_gradient(violation))
-
 
 def _values(flat: Flat, t, q, v):
     """What all functions of a system return."""
@@ -272,14 +228,6 @@ def _updated(equations: EquationsOfMotion, t, y, args, due):
     new, old = flat.updates(t, parts.q, parts.v), equations.sampled.unravelled(parts.u)
     changed = {name: jax.tree.map(functools.partial(jnp.where, on), new[name], old[name]) for name, on in zip(old, due, strict=True)}
     return parts._replace(u=ravelled(changed, y.dtype)).y
-
-
-def _contact_violation(flat, t, parts, multipliers, rtol, atol):
-    """Of each contact, how far it is inside of its obstacle or pulls."""
-    closed, forces = parts.closed > 0.5, contact_rows(flat, multipliers)
-    allowed = gap_scales(flat, t, parts.q, parts.v, NEGLIGIBLE * (rtol * jnp.abs(parts.q) + atol), parts.v).gap
-    scale = jnp.where(closed, jnp.max(jnp.abs(multipliers), initial=0.0), allowed)
-    return jnp.where(closed, -forces, -flat.gaps(t, parts.q)), scale
 
 
 @jitted

@@ -10,7 +10,7 @@ from .._mechanics.projection import off_constraints
 from .first_order import EquationsOfMotion
 from .protocol import Arguments
 from .results import RESULTS
-from .state_vector import Evidence, Sample
+from .sample import Evidence, Sample
 
 
 def verified(

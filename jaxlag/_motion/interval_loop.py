@@ -20,6 +20,7 @@ from jaxtyping import Array, Bool, Float, Int, PyTree
 from .._model.signal import broken_signals
 from .._model.states import flow
 from .._program.whole_kernel import in_whole_kernel
+from .event_record import has_stopped, most, with_events
 from .events import behind_jump
 from .interval_inputs import Inputs, Recorded, Rows, packed
 from .protocol import Arguments
@@ -82,22 +83,25 @@ class IntervalLoop(NamedTuple):
         rounding = jnp.finfo(y0.dtype).eps * jnp.maximum(jnp.abs(first), jnp.abs(last))
         controller = ResumingController(rtol, atol, smallest=4 * rounding, norm=self.equations.error_norm)
         stepping = self._replace(solver=_with_tolerances(self.solver, controller))
-        now = lambda moving: _alone(moving.t, numbers)
+        now = lambda x: _alone(x, numbers)
 
         def turn(carry):
             moving, steps, saved, meter = carry
-            sample = steps.sample
-            (moving, shown), (steps, is_sample) = stepping._varied(controller, rounding, steps, numbers)(moving)
-            meter = self.meter.step(meter, (now(moving) - first) / (last - first))
+            sample, before = steps.sample, now(moving.y)
+            (moving, shown, there), (steps, is_sample) = stepping._varied(controller, rounding, steps, numbers)(moving)
+            for earlier, later in ((before, there), (now(there), moving.y)):
+                saved = with_events(self.equations, write, saved, self.ts.shape[0], earlier, later, now)
+            meter = self.meter.step(meter, (now(moving.t) - first) / (last - first))
             return moving, steps, write(saved, sample, shown, is_sample), meter
 
         def going_on(carry):
             moving, steps, *_ = carry
-            within = (steps.sample < self.ts.shape[0]) & (self.sample_time(steps.sample) > now(moving))  # the last may be repeated
+            within = (steps.sample < self.ts.shape[0]) & (self.sample_time(steps.sample) > now(moving.t))  # the last may be repeated
             going = (steps.result == dfx.RESULTS.successful) & (steps.accepted + steps.rejected < self.max_steps)
-            return within & going & ~self.equations.has_stopped(_alone(moving.y, numbers))
+            return within & going & ~has_stopped(self.equations, now(moving.y))
 
         moving, steps = stepping._start(controller, first, last, y0, following, numbers)
+        saved = with_events(self.equations, write, saved, self.ts.shape[0], None, y0, now)
         moving, steps, saved, meter = loop(going_on, turn, (moving, steps, saved, self.meter.init()))
         self.meter.close(meter)
         return moving, steps, saved
@@ -131,8 +135,10 @@ class IntervalLoop(NamedTuple):
             function = of_order(function, directions)
         return lambda moving: function(moving, numbers.varied)
 
-    def _step(self, controller, rounding, moving: Moving, given, steps: Steps, scales) -> tuple[tuple[Moving, Array], tuple[Steps, Any]]:
-        """One step, tried: up to the next node at most, and behind the jumps there; with y at a sample that it may end at."""
+    def _step(
+        self, controller, rounding, moving: Moving, given, steps: Steps, scales
+    ) -> tuple[tuple[Moving, Array, Array], tuple[Steps, Any]]:
+        """One step, tried, up to the next node at most and behind the jumps there; with y at a sample it may end at, and before jumps."""
         (params, origin), sample, t = given, self.sample_time(steps.sample), moving.t
         inputs, periods = self.inputs(params), self.equations.periods(params)
         signals = len(inputs.records)
@@ -161,13 +167,14 @@ class IntervalLoop(NamedTuple):
             updated = self.equations.updated(t, y, after, passed[signals:]) if ticks else y
             return behind_jump(self.equations, t, y, updated, args, after)
 
+        there = y
         y, consistent = jax.lax.cond(jumps, behind, lambda y: (y, jnp.array(True)), y)
         result = dfx.RESULTS.where(consistent, result, under_diffrax(RESULTS.no_friction))
         shown = self._moved(sample, t, y, after) if any(self.moving) else y
         changing, rest = eqx.partition(state, eqx.is_inexact_array)
         counts = steps.sample + is_sample, result, steps.accepted + keep, steps.rejected + ~keep
         steps = Steps(planned, rest, control, jumps | (steps.has_jumped & ~keep), following, *counts)
-        return (Moving(t, y, changing), shown), jax.lax.stop_gradient((steps, is_sample))
+        return (Moving(t, y, changing), shown, there), jax.lax.stop_gradient((steps, is_sample))
 
     def _moved(self, time, t, y, args):
         """y at a time that equals t, but moves otherwise with what is varied."""
@@ -218,7 +225,7 @@ def _initial_state(solver, term, t0, t1, y0, args):
 
 
 def integrated(equations, solver, max_steps, meter, y0, varied, scales, ts, tolerances, directions=(), *, reverse=False):
-    """States at the samples; and, not differentiated, the reason it ended, counts, and the `last` time and state.
+    """States at the samples and behind events; and, not differentiated, the reason it ended, counts, and the `last` time and state.
 
     `varied` are params and the time of the start. With `directions` of these, for each order, the states and y0 have their variations as
     last axes. `reverse`: whether reverse mode goes through the loop.
@@ -240,7 +247,8 @@ def integrated(equations, solver, max_steps, meter, y0, varied, scales, ts, tole
         loop = IntervalLoop(equations, solver, max_steps, meter, ts, lambda params: Inputs(of, equations.elsewhere, params), moving)
         return functools.partial(loop.run, *unpack(given))
 
-    unknown = jnp.full((ts.size - 1, *y0.shape), jnp.inf, y0.dtype)
+    length = ts.size + most(equations).sum()
+    unknown = jnp.full((length - 1, *y0.shape), jnp.inf, y0.dtype)
     saved = jnp.concatenate([y0[None], unknown])
     if reverse:
         write = lambda saved, i, y, wanted: saved.at[i].set(y, pred=wanted)
@@ -252,10 +260,10 @@ def integrated(equations, solver, max_steps, meter, y0, varied, scales, ts, tole
     space, unpack_end, _ = packed(like, [])
 
     def run(given, saved):
-        write = functools.partial(_written, ts.size, y0.size)
+        write = functools.partial(_written, length, y0.size)
         moving, steps, saved = started(given)(saved, write, jax.lax.while_loop)
         end = packed(_end(moving, steps), [])[0].astype(saved.dtype)
-        return jax.lax.dynamic_update_slice_in_dim(saved, end, ts.size * y0.size, 0)
+        return jax.lax.dynamic_update_slice_in_dim(saved, end, length * y0.size, 0)
 
     found = in_whole_kernel(run)(given, jnp.concatenate([saved.ravel(), 0 * space]))
     return _results(equations, found[: saved.size].reshape(saved.shape), unpack_end(found[saved.size :]), ts, max_steps)
@@ -285,8 +293,9 @@ def _written(length, width, saved, i, y, wanted):
 def _results(equations, ys, end, ts, max_steps):
     t, y, number, accepted, rejected, sample = end
     t = t[(0,) * t.ndim]
-    stopped = equations.has_stopped(y[(slice(None), *[0] * (y.ndim - 1))])
+    stopped = has_stopped(equations, y[(slice(None), *[0] * (y.ndim - 1))])
     repeated = (jnp.arange(ts.size) >= sample) & ((ts == t) | stopped)  # the last time, as padding has it
+    repeated = jnp.concatenate([repeated, jnp.zeros(len(ys) - ts.size, bool)])
     ys = jnp.where(repeated.reshape(-1, *[1] * y.ndim), y, ys)
     result = numbered(number)
     unfinished = (result == dfx.RESULTS.successful) & ~stopped & (ts[-1] > t) & (accepted + rejected >= max_steps)

@@ -65,12 +65,9 @@ def _margins(equations: EquationsOfMotion, t, parts: Parts, args):
     of_events = sum(witness_margins(equations, t, parts, args))
     unbounded = jnp.ones_like(parts.closed), jnp.ones_like(parts.sign)
     if elements is None:
-        closed = parts.closed > 0.5
-        forces = jax.lax.cond(
-            jnp.any(closed),
-            lambda: contact_rows(flat, equations.acceleration(mode, t, q, v).multipliers),
-            lambda: jnp.zeros_like(parts.closed),
-        )
+        closed, none = parts.closed > 0.5, lambda: jnp.zeros_like(parts.closed)
+        pressing = lambda: contact_rows(flat, equations.acceleration(mode, t, q, v).multipliers)
+        forces = jax.lax.cond(jnp.any(closed), pressing, none) if equations.contacts else none()
         return jnp.concatenate([_contact_margins(flat, t, q, closed, forces), of_events, *unbounded])
     found = friction(flat, elements, sigma, t, q, v)
     of_contacts = _contact_margins(flat, t, q, parts.closed > 0.5, contact_rows(flat, found.multipliers))

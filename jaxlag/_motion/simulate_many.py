@@ -72,8 +72,8 @@ def simulate_many(
     - `over`: what differs: "q0", "qdot0", entries of them ("q0.phi") or of `params` ("b", "wheel.c").
     - `common_steps`: True has 64 members at a time take the same steps, short enough for each of them, with the members as the last
       axis of all arithmetic: many times as fast as one by one. False lets each member take its own. Default: True, but False where there
-      is dry friction or a measured input that jumps, whose steps end at times that differ. Where one of 64 cannot go on, all stop:
-      `common_steps=False` then says which.
+      is dry friction, a contact, an event or a measured input that jumps, whose steps end at times that differ. Where one of 64 cannot
+      go on, all stop: `common_steps=False` then says which.
     - `steps`: deprecated; "common" is now `common_steps=True`, "own" `common_steps=False`.
 
     **Returns:** a `Trajectory`; each of its fields has the B members as its first axis, the samples as its second.
@@ -166,8 +166,8 @@ def _share_steps(common_steps, equations, params, own):
     obstacle = equations.modes or equations.sampled.size or signals or jump_times(params, float) is not None
     if common_steps and obstacle:
         raise ValueError(
-            "`common_steps` must be False where dry friction, a contact, an event, a jumping input or an update ends steps at its own time, or "
-            "signals differ, but is True. Leave it out."
+            "`common_steps` must be False where dry friction, a contact, an event, a jumping input or an update ends steps at its own "
+            "time, or signals differ, but is True. Leave it out."
         )
     return common_steps is not False and not obstacle
 

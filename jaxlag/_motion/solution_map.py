@@ -16,14 +16,14 @@ from .._model.signal import with_second_derivatives
 from .._model.state_values import start_values
 from .._model.system import System
 from .._model.validation import check
-from .events import recorded
+from .event_record import records
 from .first_order import EquationsOfMotion
 from .guarantees import verified
 from .integrate import SolverOptions, Variations, has_nodes, initialised, is_variational, on_nodes, states_at, with_status
 from .moments import ContactState, EventState, FrictionState
 from .protocol import Arguments, Scales
 from .provenance import Provenance
-from .state_vector import Sample
+from .sample import Sample, sample_at
 from .trajectory import Trajectory
 from .variational import derived, pushforward, split_varying
 
@@ -40,10 +40,13 @@ class Inputs(NamedTuple):
 
 
 class Samples(NamedTuple):
-    """The states y at the sample times, and what a `Trajectory` shows of them; what is not a real number is None here."""
+    """The states y at the sample times, and what a `Trajectory` shows of them, what is not a real number is None here; and by name the
+    times of events and the states there.
+    """
 
     ys: Array
     shown: Sample
+    events: dict[str, tuple]
 
 
 class Unchanging(NamedTuple):
@@ -141,15 +144,15 @@ class SolutionMap:
         equations, _ = self._equations(inputs, ts)
 
         def at(t, y):
-            shown, _ = equations.sample(t, y, inputs.params, inputs.tolerances)
-            return Samples(y, eqx.filter(shown, eqx.is_inexact_array))
+            shown, _ = sample_at(equations, t, y, inputs.params, inputs.tolerances)
+            return y, eqx.filter(shown, eqx.is_inexact_array)
 
         def of_one(t, y):
             rate = equations.rates(t, y, Arguments(inputs.params))
             found, change = jax.jvp(at, (t, y), (jnp.ones_like(t), rate))
             return jax.tree.map(lambda x, dx: jnp.where(jnp.isfinite(x), dx, 0), found, change)
 
-        return jax.vmap(of_one)(ts, samples.ys)
+        return Samples(*jax.vmap(of_one)(ts, samples.ys), jax.tree.map(jnp.zeros_like, samples.events))
 
     def _equations(self, inputs: Inputs, ts: Array) -> tuple[EquationsOfMotion, StatesAt]:
         at = self._at(inputs, ts)
@@ -168,16 +171,17 @@ def _first_time(inputs: Inputs, ts: Array) -> Array:
 
 
 def samples_at(equations: EquationsOfMotion, ts, ys, params, result, stats, tolerances) -> tuple[Samples, Unchanging]:
-    """The samples of a motion with these states, as far as they keep what a successful motion guarantees."""
+    """The samples of a motion with these states, as far as they keep what a successful motion guarantees; behind them are its events."""
+    ys, events = ys[: ts.size], records(equations, ys[ts.size :])
     last_t, last_y = stats["last"]
     times, states = jnp.concatenate([ts, last_t[None]]), jnp.concatenate([ys, last_y[None]])
-    samples = jax.vmap(lambda t, y: equations.sample(t, y, params, tolerances))(times, states)
+    samples = jax.vmap(lambda t, y: sample_at(equations, t, y, params, tolerances))(times, states)
     if equations.events:  # behind the end of a motion there is none
         states = jnp.where(states[:, -1:] > 0, jnp.nan, states)
     shown, result, reached = verified(equations, times, states, samples, params, result, tolerances)
     counts = {name: count for name, count in stats.items() if name != "last"} | {"reached": jax.lax.stop_gradient(reached)}
     changing, rest = eqx.partition(shown, eqx.is_inexact_array)
-    return Samples(ys, changing), Unchanging(result, counts, rest)
+    return Samples(ys, changing, events), Unchanging(result, counts, rest)
 
 
 def trajectory_of(system: System, options: SolverOptions, params: PyTree, ts, samples: Samples, unchanging: Unchanging) -> Trajectory:
@@ -187,5 +191,8 @@ def trajectory_of(system: System, options: SolverOptions, params: PyTree, ts, sa
     provenance = Provenance.of(system, params, options.formulation.friction)
     state, counts = (shown.q, shown.qdot, shown.qddot, shown.multipliers), unchanging.stats | shown.counts
     contacts = {name: ContactState(*of_one) for name, of_one in shown.contacts.items()}
-    events = {name: EventState(*of_one, shown.events[name]) for name, of_one in recorded(system, shown, samples.ys).items()}
+    events = {name: EventState(*of_one, shown.events[name]) for name, of_one in samples.events.items()}
+    stops = [events[name].ts for name, event in system.events if event.stop]
+    if stops:
+        counts["reached"] = jax.lax.stop_gradient(jnp.nanmin(jnp.stack([counts["reached"], *map(jnp.nanmin, stops)])))
     return Trajectory(ts, *state, unchanging.result, counts, shown.works, friction, provenance, shown.states, contacts, events)

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from .._program.jit import jitted
+from .event_record import overflows
 from .events import behind_end
 from .first_order import EquationsOfMotion
 from .mode_changes import approach, at_end, margins
@@ -184,7 +185,7 @@ class StickSlipSolver(ProjectedSolver):
             result = dfx.RESULTS.where(~ended | passed | ~cut.usable, result, under_diffrax(reason))
         result = dfx.RESULTS.where(seen.negative & ~shrinking, under_diffrax(RESULTS.negative_bound), result)
         result = dfx.RESULTS.where(self.equations.exhausted(second.y), under_diffrax(RESULTS.chattering), result)
-        result = dfx.RESULTS.where(self.equations.unrecorded(second.y), under_diffrax(RESULTS.too_many_events), result)
+        result = dfx.RESULTS.where(overflows(self.equations, second.y), under_diffrax(RESULTS.too_many_events), result)
         result = dfx.RESULTS.where(first.result == dfx.RESULTS.successful, result, first.result)
         dense = {"cut": jnp.where(ended, cut.time, t1), "first": first.dense, "second": second.dense}
         return second.y, error, dense, second.state, result
