@@ -36,6 +36,7 @@ from ._linear.linear_system import LinearSystem as LinearSystem
 from ._linear.linearise import linearise as linearise
 from ._linear.root_locus import Crossing as Crossing, RootLocus as RootLocus, root_locus as root_locus
 from ._linear.modes import Modes as Modes
+from ._linear.periodic import PeriodicOrbit as PeriodicOrbit, periodic as periodic
 from ._linear.stability_map import StabilityMap as StabilityMap, stability_map as stability_map
 from ._program.compilation_cache import keep_compiled as keep_compiled
 from ._model.contact import Contact as Contact

@@ -51,7 +51,7 @@ def root_near(residual: Residual, args: Any, guess: Float[Array, " u"], ease: Fl
         return (i < ITERATIONS) & ~done & jnp.all(jnp.isfinite(w))
 
     w, _, _ = jax.lax.while_loop(is_on_its_way, turn, (jax.lax.stop_gradient(guess), jnp.array(False), jnp.array(0)))
-    return Root(_root(residual, args, w), is_root(slope(w), residual(fixed, w), w))
+    return Root(implicit_root(residual, args, w), is_root(slope(w), residual(fixed, w), w))
 
 
 def is_root(J: Array, R: Array, w: Array) -> Bool[Array, ""]:
@@ -61,15 +61,15 @@ def is_root(J: Array, R: Array, w: Array) -> Bool[Array, ""]:
 
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(0,))
-def _root(residual: Residual, args: Any, w: Float[Array, " u"]) -> Float[Array, " u"]:
+def implicit_root(residual: Residual, args: Any, w: Float[Array, " u"]) -> Float[Array, " u"]:
     """w, which depends on args as R(args, w) = 0 says: differentiable to any order."""
     return w
 
 
-@_root.defjvp
-def _root_rule(residual, primals, tangents):
+@implicit_root.defjvp
+def _implicit_rule(residual, primals, tangents):
     (args, found), (d_args, _) = primals, tangents
-    w = _root(residual, args, found)
+    w = implicit_root(residual, args, found)
     change = jax.jvp(lambda args: residual(args, w), (args,), (d_args,))[1]
     return w, -least_change(jax.jacfwd(residual, 1)(args, w), change, 1 + jnp.abs(jax.lax.stop_gradient(w)))
 

@@ -1,0 +1,161 @@
+"""The return map of a motion: from its state at a section to the state at the next passage, or from one period of a force to the next."""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import diffrax as dfx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.flatten_util import ravel_pytree
+from jaxtyping import Array, Bool, Complex, Float, PyTree
+
+from .._mechanics.friction_treatment import Regularised, StickSlip
+from .._model.event import Event, Every
+from .._model.injection import call
+from .._model.system import System
+from .._motion.simulate import simulate
+from .._program.jit import compiled
+from .eigenvalues import eigen
+from .newton import implicit_root, is_root, least_change
+
+ITERATIONS = 30
+SECTION = "the section"  # among the events of the system
+LATER = 0.382  # of a period: whether the motion that returns does so there, too, is looked at
+
+
+class Setting(NamedTuple):
+    """What is searched for: the section, which entries of the state return, and how motions are computed."""
+
+    section: Event | Every
+    returning: tuple[int, ...]
+    friction: StickSlip | Regularised
+    solver: dfx.AbstractSolver | None
+    max_steps: int
+
+
+class Given(NamedTuple):
+    """The numbers from which the search starts."""
+
+    start: dict[str, PyTree]  # q, qdot and states
+    params: PyTree
+    t: Float[Array, ""]
+    longest: Float[Array, ""]
+    tolerances: tuple[Array, Array]
+
+
+class Orbit(NamedTuple):
+    """The state at the section, of which the entries that do not return are those of the guess; the period; the change of the state in one
+    period; eigenvalues of the return map. Whether the guess passed through the section twice, the motion returns, and does so whenever it
+    starts; and how far off it is.
+    """
+
+    start: dict[str, PyTree]
+    period: Float[Array, ""]
+    change: dict[str, PyTree]
+    multipliers: Complex[Array, " k"]
+    passes: Bool[Array, ""]
+    returns: Bool[Array, ""]
+    always: Bool[Array, ""]
+    left: Float[Array, " k"]
+
+
+class Frame(NamedTuple):
+    """Numbers of the return map: those given; the state at a first passage, the time to the next, and that in which a third is looked for."""
+
+    given: Given
+    first: Float[Array, " s"]
+    usual: Float[Array, ""]
+    longest: Float[Array, ""]
+
+
+@compiled
+def orbit_near(system: System, setting: Setting, given: Given) -> Orbit:
+    """The periodic motion that Newton's method finds from a guess, differentiable by the implicit function theorem."""
+    guess, unravel = ravel_pytree(given.start)
+    of, is_forced = np.array(setting.returning, int), isinstance(setting.section, Every)
+    usual = _forced(setting, given) if is_forced else jnp.zeros(())
+    passage = (guess, usual, usual) if is_forced else _first_passage(system, setting, given)
+    frame = Frame(given, *jax.lax.stop_gradient(passage))
+
+    def returned(frame, w, t):
+        """The state at the next passage, and how long it took."""
+        return _passage(system, setting, frame, unravel(frame.first.at[of].set(w)), t)
+
+    def residual(frame, w):
+        return returned(frame, w, frame.given.t)[0][of] - w
+
+    near = _newton(lambda w: residual(jax.lax.stop_gradient(frame), w), frame.first[of], given.tolerances)
+    w = implicit_root(residual, frame, near)
+
+    def at(t):
+        """The return from a start at another time, and its slope."""
+        return *returned(frame, w, t), jax.jacfwd(lambda w: returned(frame, w, t)[0][of])(w)
+
+    later = given.t + (1 if is_forced else LATER) * frame.usual
+    ends, times, slopes = jax.lax.map(at, jnp.stack([given.t, later]))
+    left = ends[:, of] - w[None]
+    finds = lambda left: is_root(slopes[0] - jnp.eye(w.size), left, w)
+    values, here = eigen(slopes[0]).values[::-1], frame.first.at[of].set(w)
+    checks = jnp.all(jnp.isfinite(frame.first)), finds(left[0]), finds(left[1])
+    return Orbit(unravel(here), times[0], unravel(ends[0] - here), values, *jax.lax.stop_gradient((*checks, left[0])))
+
+
+def _newton(residual: Callable, w: Float[Array, " k"], tolerances) -> Float[Array, " k"]:
+    """The root near w. The last step is as small as errors of the integration."""
+    rtol, atol = tolerances
+
+    def turn(carry):
+        w, _, i = carry
+        both = lambda w: (found := residual(w), found)
+        slope, left = jax.jacfwd(both, has_aux=True)(w)
+        step = -least_change(slope, left, 1 + jnp.abs(w))
+        return w + step, jnp.all(jnp.abs(step) <= rtol * jnp.abs(w) + atol), i + 1
+
+    def going_on(carry):
+        w, done, i = carry
+        return ~done & (i < ITERATIONS) & jnp.all(jnp.isfinite(w))
+
+    return jax.lax.while_loop(going_on, turn, (w, jnp.array(False), jnp.array(0)))[0]
+
+
+def _motion(system, setting, given, start, t, longest):
+    """The motion from a state for some time, and its passages through the section."""
+    events = dict(system.events)
+    if isinstance(setting.section, Event):
+        events[SECTION] = setting.section
+    of = dict(friction=setting.friction, solver=setting.solver, max_steps=setting.max_steps, events=events, throw=False)
+    rtol, atol = given.tolerances
+    times = jnp.stack([t, t + longest])
+    return simulate(system, start["q"], start["qdot"], times, given.params, states=start["states"], rtol=rtol, atol=atol, **of)
+
+
+def _state(q, qdot, states, i):
+    """The flat state at one of some times."""
+    return ravel_pytree(jax.tree.map(lambda x: x[i], {"q": q, "qdot": qdot, "states": states}))[0]
+
+
+def _first_passage(system, setting, given):
+    """The state at the second passage of the motion from the guess, the time since the first, and that in which a third is looked for."""
+    passages = _motion(system, setting, given, given.start, given.t, given.longest).events[SECTION]
+    usual = passages.ts[1] - passages.ts[0]
+    return _state(passages.q, passages.qdot, passages.states, 1), usual, 1.9 * usual
+
+
+def _forced(setting, given):
+    """The period of the force."""
+    period = setting.section.period
+    return jnp.asarray(call(period, "`period` of `section`", given.params) if callable(period) else period, given.t.dtype)
+
+
+def _passage(system, setting, frame: Frame, start, t):
+    """The state after one period of the force, or at the first passage that is not the present one; and the time until then."""
+    if isinstance(setting.section, Every):
+        period = _forced(setting, frame.given)
+        motion = _motion(system, setting, frame.given, start, t, period)
+        return _state(motion.q, motion.qdot, motion.states, -1), period
+    passages = _motion(system, setting, frame.given, start, t, frame.longest).events[SECTION]
+    later = passages.ts - t > frame.usual / 2
+    i = jnp.argmax(later)
+    known = lambda x: jnp.where(jnp.any(later), x, jnp.nan)
+    return known(_state(passages.q, passages.qdot, passages.states, i)), known(passages.ts[i] - t)
