@@ -61,7 +61,7 @@ class Orbit(NamedTuple):
 
 
 class Frame(NamedTuple):
-    """Numbers of the return map: those given; the state at a first passage, the time to the next, and that in which a third is looked for."""
+    """Numbers of the return map: those given; the state at a passage, the time to the next, and that in which a third is looked for."""
 
     given: Given
     first: Float[Array, " s"]
@@ -90,7 +90,13 @@ def orbit_near(system: System, setting: Setting, given: Given) -> Orbit:
 
     def at(t):
         """The return from a start at another time, and its slope."""
-        return *returned(frame, w, t), jax.jacfwd(lambda w: returned(frame, w, t)[0][of])(w)
+
+        def of_w(w):
+            after, time = returned(frame, w, t)
+            return after[of], (after, time)
+
+        slope, (after, time) = jax.jacfwd(of_w, has_aux=True)(w)
+        return after, time, slope
 
     later = given.t + (1 if is_forced else LATER) * frame.usual
     ends, times, slopes = jax.lax.map(at, jnp.stack([given.t, later]))

@@ -5,7 +5,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from .._mechanics.contact import roundings
 from .._mechanics.projection import nearest_state
 from .._model.event import Negative
 from .._model.state_values import ravelled
@@ -26,8 +25,7 @@ def behind_end(equations: EquationsOfMotion, t, y, args: Arguments, ended: Bool[
     yes = jnp.array(True)
     same = lambda: Change(y, yes, yes, yes, yes)
     change = jax.lax.cond(jnp.any(modes), lambda: changed(equations, t, y, args, modes), same) if modes.size else same()
-    passed = passed | _struck(equations, y, change.y)
-    after, consistent = _settled(equations, t, y, change.y, args, passed, jnp.any(modes))
+    after, consistent = _settled(equations, t, y, change.y, args, passed | _struck(equations, y, change.y))
     return change._replace(y=after, consistent=change.consistent & consistent)
 
 
@@ -36,20 +34,15 @@ def behind_jump(equations: EquationsOfMotion, t, y0, y, before: Arguments, args:
     after, consistent = after_jump(equations, t, y0, y, before, args)
     if not equations.events:
         return after, consistent
-    after, also = _settled(equations, t, y, after, args, _struck(equations, y, after), jnp.array(True))
+    after, also = _settled(equations, t, y, after, args, _struck(equations, y, after))
     return after, consistent & also
 
 
 def begun(equations: EquationsOfMotion, t, y, args: Arguments) -> tuple[Float[Array, " y"], Bool[Array, ""]]:
-    """y at the start, with the sides of zero on which the witnesses are, and behind the events of those that are `Negative` already; and
-    whether a mode of friction and contact is consistent there.
+    """y at the start, behind the events of witnesses that are `Negative` already and of impacts there; and whether a mode of friction and
+    contact is consistent there.
     """
-    parts = equations.parts(y)
-    errors = (roundings(1 + jnp.abs(jax.lax.stop_gradient(x))) for x in (parts.q, parts.v))
-    side, _ = sides(equations, t, parts, args, *errors)
-    due = np.array([isinstance(event.direction, Negative) for _, event in equations.system.events]) & (side < 0)
-    y = parts._replace(sign=jnp.where(due, 1, side)).y
-    return _settled(equations, t, y, y, args, due | _struck(equations, None, y), jnp.array(False))
+    return _settled(equations, t, y, y, args, _struck(equations, None, y))
 
 
 def _struck(equations: EquationsOfMotion, before, y) -> Bool[Array, " w"]:
@@ -61,53 +54,44 @@ def _struck(equations: EquationsOfMotion, before, y) -> Bool[Array, " w"]:
 
 
 @jitted
-def _settled(equations: EquationsOfMotion, t, seen, y, args: Arguments, passed: Bool[Array, " w"], jumped: Bool[Array, ""]):
+def _settled(equations: EquationsOfMotion, t, seen, y, args: Arguments, passed: Bool[Array, " w"]):
     """y behind the events whose witnesses `passed` through zero, and behind those whose witnesses these, or a jump before, have taken to
     the other side, each of them once; and whether a mode of friction and contact is consistent there. What is recorded is the state that
     was `seen` before all this.
     """
 
     def turn(carry):
-        y, consistent, passed, done = carry
+        y, consistent, passed, done, _ = carry
+        parts = equations.parts(y)
+        side, is_far = sides(equations, t, parts, args)
+        is_new = parts.sign == 0  # at the start
+        before = jnp.where(is_new, 1, parts.sign)
+        passed = (passed | (is_new & _due(equations) & (side < 0)) | (~is_new & is_far & (side != parts.sign))) & ~done
         done = done | passed
-        after, fine = _happened(equations, t, y, args, passed, done)
-        return after, consistent & fine, _taken_across(equations, t, after, args) & ~done, done
+        happens = passed & matching(equations, before)
+        stops = jnp.any(happens & np.array([event.stop for _, event in equations.system.events]))
+        sign, stopped = jnp.where(done | is_new, side, parts.sign), jnp.maximum(parts.stopped, stops)
+        parts = parts._replace(sign=sign, happened=parts.happened + happens, stopped=stopped)
+        changing = np.array([event.then is not None for _, event in equations.system.events])
+        unmoved = lambda: (parts.y, jnp.array(True))
+        move = (lambda: _moved(equations, t, parts, args, happens)) if changing.any() else unmoved
+        moves = jnp.any(happens & changing)
+        y, fine = jax.lax.cond(moves, move, unmoved)
+        return y, consistent & fine, jnp.zeros_like(passed), done, moves
 
-    def maybe(_, carry):
-        return jax.lax.cond(jnp.any(carry[2]), turn, lambda carry: carry, carry)
-
-    none = jnp.zeros_like(passed)
-    passed = passed | jax.lax.cond(jumped, lambda: _taken_across(equations, t, y, args), lambda: none)
     before = equations.parts(seen)
     there = jnp.concatenate([t[None], before.q, before.v, before.z, before.u])
-    y = equations.parts(y)._replace(seen=there).y
-    y, consistent, *_ = jax.lax.fori_loop(0, equations.events, maybe, (y, jnp.array(True), passed, none))
+    yes, none = jnp.array(True), jnp.zeros_like(passed)
+    carry = equations.parts(y)._replace(seen=there).y, yes, passed, none, yes
+    most = equations.events if any(event.then for _, event in equations.system.events) else 0
+    maybe = lambda _, carry: jax.lax.cond(carry[-1], turn, lambda carry: carry, carry)
+    y, consistent, *_ = jax.lax.fori_loop(0, most + 1, maybe, carry)
     return y, consistent
 
 
-def _taken_across(equations, t, y, args):
-    """Which witnesses are beyond zero, but for rounding, without having passed through it."""
-    parts = equations.parts(y)
-    side, is_far = sides(equations, t, parts, args, roundings(parts.q), roundings(parts.v))
-    return is_far & (side != parts.sign)
-
-
-def _happened(equations: EquationsOfMotion, t, y, args: Arguments, passed: Bool[Array, " w"], done: Bool[Array, " w"]):
-    """y behind events whose witnesses `passed` through zero, and whether a mode of friction and contact is consistent there; those that
-    are `done` at this time do not happen again, on whichever side of zero their witnesses are now.
-    """
-    before = equations.parts(y)
-    happens = passed & matching(equations, before.sign)
-    parts = before._replace(happened=before.happened + happens)
-    unmoved = lambda: (parts.y, jnp.array(True))
-    changing = np.array([event.then is not None for _, event in equations.system.events])
-    move = (lambda: _moved(equations, t, parts, args, happens)) if changing.any() else unmoved
-    moved, consistent = jax.lax.cond(jnp.any(happens & changing), move, unmoved)
-    after = equations.parts(moved)
-    stops = jnp.any(happens & np.array([event.stop for _, event in equations.system.events]))
-    assert args.scales is not None  # events are located
-    side, _ = sides(equations, t, after, args, args.scales.error(after.q), args.scales.error(after.v))
-    return after._replace(sign=jnp.where(done, side, after.sign), stopped=jnp.maximum(after.stopped, stops)).y, consistent
+def _due(equations):
+    """Which events happen where their witness is negative at the start."""
+    return np.array([isinstance(event.direction, Negative) for _, event in equations.system.events])
 
 
 def _moved(equations: EquationsOfMotion, t, parts: Parts, args: Arguments, happens):

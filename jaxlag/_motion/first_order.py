@@ -161,7 +161,7 @@ class EquationsOfMotion:
         z, u = (ravelled({name: at.values[name] for name in of.shapes}, q.dtype) for of in (self.states, self.sampled))
         of_friction = map(zeros, (self.elements, min(self.elements, 1), self.elements))
         of_contact = zeros(self.contacts), zeros(self.contacts), zeros(self.contacts) + t, *map(zeros, (self.contacts, self.contacts))
-        of_events = zeros(self.events) + 1, zeros(self.events), zeros(self.seen), zeros(min(self.events, 1))
+        of_events = zeros(self.events), zeros(self.events), zeros(self.seen), zeros(min(self.events, 1))
         motion = q, v, z, u, zeros(len(self.works)), zeros(self.rows) + 1  # with slip, for the time being
         parts = Parts(*motion, *of_friction, *of_contact, *of_events)
         if self.sampled.size:

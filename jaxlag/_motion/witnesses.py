@@ -18,19 +18,23 @@ def witness_margins(equations: EquationsOfMotion, t, parts: Parts, args: Argumen
     """Of each witness, its value with the sign that it has until it passes through zero, and what of it counts as rounding."""
     if not equations.events:
         return parts.sign, parts.sign
-    value, scale = _value_and_scale(equations, t, parts, args, roundings(parts.q), roundings(parts.v))
-    return parts.sign * value, scale
+    value, scale_of = _value_and_scale(equations, t, parts, args)
+    return parts.sign * value, scale_of(roundings(parts.q), roundings(parts.v))
 
 
-def _value_and_scale(equations, t, parts, args, of_q, of_v):
+def _value_and_scale(equations, t, parts, args):
     """Of each witness, its value, and what errors of q and q̇ amount to in it."""
     flat, _, _ = equations.mode(t, parts, args)
     multipliers = _multipliers(equations, t, parts, args)(t, parts.q, parts.v)
     of_loads = roundings(jnp.max(jnp.abs(multipliers), initial=0.0) * jnp.ones_like(multipliers))
     at = t, parts.q, parts.v, multipliers
     slopes = [jnp.abs(by).reshape(equations.events, -1) for by in jax.jacfwd(flat.witnesses, argnums=(0, 1, 2, 3))(*at)]
-    scale = sum(jnp.sum(by * of[None], axis=1) for by, of in zip(slopes, (roundings(t[None]), of_q, of_v, of_loads), strict=True))
-    return flat.witnesses(*at), jax.lax.stop_gradient(scale)
+
+    def scale(of_q, of_v):
+        errors = roundings(t[None]), of_q, of_v, of_loads
+        return jax.lax.stop_gradient(sum(jnp.sum(by * of[None], axis=1) for by, of in zip(slopes, errors, strict=True)))
+
+    return flat.witnesses(*at), scale
 
 
 def _multipliers(equations, t, parts, args):
@@ -43,18 +47,19 @@ def _multipliers(equations, t, parts, args):
     return lambda t, q, v: friction(flat, elements, parts.sigma, t, q, v).multipliers
 
 
-def sides(equations: EquationsOfMotion, t, parts: Parts, args: Arguments, of_q: Float[Array, " n"], of_v: Float[Array, " n"]):
-    """On which side of zero each witness is, 1 or −1; where it is zero but for errors of q and q̇, to which side it goes. And whether it is
-    farther away.
+def sides(equations: EquationsOfMotion, t, parts: Parts, args: Arguments) -> tuple[Float[Array, " w"], Bool[Array, " w"]]:
+    """On which side of zero each witness is, 1 or −1; where it is zero but for errors of the integration, to which side it goes. And
+    whether it is farther away than by rounding.
     """
-    value, scale = _value_and_scale(equations, t, parts, args, of_q, of_v)
+    assert args.scales is not None  # events are located
+    value, scale_of = _value_and_scale(equations, t, parts, args)
     flat, mode, _ = equations.mode(t, parts, args)
     multipliers, qddot = _multipliers(equations, t, parts, args), equations.acceleration(mode, t, parts.q, parts.v).x
     along = lambda t, q, v: flat.witnesses(t, q, v, multipliers(t, q, v))
     rate = jax.jvp(along, (t, parts.q, parts.v), (jnp.ones_like(t), parts.v, qddot))[1]
-    is_far = jnp.abs(value) > scale
+    is_far = jnp.abs(value) > scale_of(args.scales.error(parts.q), args.scales.error(parts.v))
     side = jnp.where(jnp.where(is_far, value, rate) < 0, -1.0, 1.0).astype(value.dtype)
-    return jax.lax.stop_gradient((side, is_far))
+    return jax.lax.stop_gradient((side, jnp.abs(value) > scale_of(roundings(parts.q), roundings(parts.v))))
 
 
 def matching(equations: EquationsOfMotion, sign: Float[Array, " w"]) -> Bool[Array, " w"]:
