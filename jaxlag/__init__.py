@@ -70,6 +70,7 @@ from ._model.signal import Signal as Signal
 from ._model.signal_interpolation import Cubic as Cubic, Linear as Linear, ZeroOrderHold as ZeroOrderHold
 from ._model.states import Sampled as Sampled, State as State
 from ._model.system import System as System
+from ._motion.moments import ContactState as ContactState, EventState as EventState
 from ._motion.trajectory import (
     Instant as Instant,
     Interpolated as Interpolated,

@@ -47,14 +47,14 @@ class Equilibrium(eqx.Module):
         if not is_concrete(self):
             return "Equilibrium(traced)"
         value = lambda tree: ", ".join(
-            f"{name} = {x:.6g}" for name, x in zip(entry_names(tree, "q"), _without_dust(np.asarray(ravel_pytree(tree)[0])), strict=True)
+            f"{name} = {x:.6g}" for name, x in zip(entry_names(tree, "q"), without_dust(np.asarray(ravel_pytree(tree)[0])), strict=True)
         )
         rows = [("at", value(self.q))]
         if np.any(ravel_pytree(self.qdot)[0]):
             rows.append(("moving with", value(self.qdot)))
         rows += [(name, value(tree)) for name, tree in (("states", self.states), ("multipliers", self.multipliers)) if tree]
         for name, (force, bound) in self.friction.items():
-            *_, largest = _without_dust(np.asarray([*bound, np.max(np.abs(force), initial=0.0)]))
+            *_, largest = without_dust(np.asarray([*bound, np.max(np.abs(force), initial=0.0)]))
             rows.append(("friction", f"{name}: {largest:.4g} of {np.min(bound):.4g} that it can hold"))
         rows.append(("stability", self.stability))
         if self.undecided:
@@ -64,7 +64,7 @@ class Equilibrium(eqx.Module):
         )
 
 
-def _without_dust(x: np.ndarray) -> np.ndarray:
+def without_dust(x: np.ndarray) -> np.ndarray:
     """With 0 for what is zero within rounding, as the search sees it: in parts of 1 + |x|."""
     return np.where(np.abs(x) <= 8 * np.finfo(x.dtype).eps * (1 + np.max(np.abs(x), initial=0.0)), 0.0, x)
 

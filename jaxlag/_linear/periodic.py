@@ -3,7 +3,6 @@
 from collections.abc import Sequence
 from typing import Any
 
-import diffrax as dfx
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -22,6 +21,7 @@ from .._motion.integrate import tolerances_of
 from .._motion.simulate import simulate
 from .._motion.trajectory import Trajectory
 from .._program.jit import is_concrete, seen
+from .equilibrium import without_dust
 from .return_map import Given, Orbit, Setting, orbit_near
 
 FINER = 1e-2  # of the usual tolerances
@@ -61,9 +61,8 @@ class PeriodicOrbit(eqx.Module):
     def __repr__(self) -> str:
         if not is_concrete((self.q, self.period, self.multipliers)):
             return "PeriodicOrbit(traced)"
-        value = lambda tree, name: ", ".join(
-            f"{entry} = {x:.6g}" for entry, x in zip(entry_names(tree, name), np.asarray(ravel_pytree(tree)[0]), strict=True)
-        )
+        numbers = lambda tree: without_dust(np.asarray(ravel_pytree(tree)[0]))
+        value = lambda tree, name: ", ".join(f"{entry} = {x:.6g}" for entry, x in zip(entry_names(tree, name), numbers(tree), strict=True))
         rows = [("period", f"{self.period:.8g}"), ("at", value(self.q, "q")), ("moving with", value(self.qdot, "q"))]
         if self.states:
             rows.append(("states", value(self.states, "")))
@@ -87,7 +86,7 @@ def periodic(
     t: Any = 0.0,
     states: PyTree = None,
     friction: StickSlip | Regularised = StickSlip(),
-    solver: dfx.AbstractSolver | None = None,
+    solver: Any = None,
     rtol: Any = None,
     atol: Any = None,
     max_steps: int = 100_000,
@@ -134,12 +133,12 @@ def periodic(
     q0, qdot0 = state(q0, qdot0, ("q0", "qdot0"))
     dtype = jax.tree.leaves(q0)[0].dtype
     params, states = parameters(params, q0), given_states(system, states, q0)
-    given = _given(section, longest, t, dtype)
+    t, longest = _given(section, longest, t, dtype)
     rtol, atol = (x if own is not None else FINER * x for x, own in zip(tolerances_of(rtol, atol, dtype), (rtol, atol), strict=True))
-    at = start_values(system, states, given[0], q0, qdot0, params)
+    at = start_values(system, states, t, q0, qdot0, params)
     start = {"q": q0, "qdot": qdot0, "states": at}
     setting = Setting(section, _returning(system, q0, at, cyclic), friction, solver, max_steps)
-    found = orbit_near(system, setting, Given(start, params, *given, (rtol, atol)))
+    found = orbit_near(system, setting, Given(start, params, t, longest, (rtol, atol)))
     values = seen(found)
     names = [name for part in ("q", "qdot", "states") for name in entry_names(start[part], part)]
     if values is not None:
@@ -149,7 +148,7 @@ def periodic(
     returns = np.isin(np.arange(entries.size), setting.returning)
     shown = found.start, found.period, unravel(jnp.where(returns, 0, entries)), found.multipliers
     start, period, drift, multipliers = jax.tree.map(lambda x: jnp.where(is_one, x, jnp.nan), shown)
-    return PeriodicOrbit(start["q"], start["qdot"], start["states"], period, drift, multipliers, given[0], params, system)
+    return PeriodicOrbit(start["q"], start["qdot"], start["states"], period, drift, multipliers, t, params, system)
 
 
 def _given(section, longest, t, dtype):

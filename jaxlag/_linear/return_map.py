@@ -1,9 +1,8 @@
 """The return map of a motion: from its state at a section to the state at the next passage, or from one period of a force to the next."""
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
-import diffrax as dfx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -30,7 +29,7 @@ class Setting(NamedTuple):
     section: Event | Every
     returning: tuple[int, ...]
     friction: StickSlip | Regularised
-    solver: dfx.AbstractSolver | None
+    solver: Any  # of diffrax, or None
     max_steps: int
 
 
@@ -107,7 +106,7 @@ def orbit_near(system: System, setting: Setting, given: Given) -> Orbit:
     return Orbit(unravel(here), times[0], unravel(ends[0] - here), values, *jax.lax.stop_gradient((*checks, left[0])))
 
 
-def _newton(residual: Callable, w: Float[Array, " k"], tolerances) -> Float[Array, " k"]:
+def _newton(residual: Callable, w: Float[Array, " k"], tolerances: tuple[Array, Array]) -> Float[Array, " k"]:
     """The root near w. The last step is as small as errors of the integration."""
     rtol, atol = tolerances
 
@@ -154,7 +153,7 @@ def _forced(setting, given):
     return jnp.asarray(call(period, "`period` of `section`", given.params) if callable(period) else period, given.t.dtype)
 
 
-def _passage(system, setting, frame: Frame, start, t):
+def _passage(system: System, setting: Setting, frame: Frame, start: dict[str, PyTree], t: Any) -> tuple[Array, Array]:
     """The state after one period of the force, or at the first passage that is not the present one; and the time until then."""
     if isinstance(setting.section, Every):
         period = _forced(setting, frame.given)

@@ -121,7 +121,7 @@ class Event:
 
 def events_of(given: Any, contacts: Collection[str]) -> tuple[tuple[str, Event], ...]:
     """The events of a system, by name, whose contacts have these names."""
-    terms = () if given is None else tuple(given.items()) if isinstance(given, Mapping) else ((None, given),)
+    terms: tuple[Any, ...] = () if given is None else tuple(given.items()) if isinstance(given, Mapping) else ((None, given),)
     for name, event in terms:
         if not isinstance(name, str) or not isinstance(event, Event):
             raise TypeError(

@@ -31,9 +31,9 @@ def card(motion: Any) -> str:
         times = int(np.nanmax(impacts, initial=0))
         rows.append(("contact", f"{name!r}: {times} impact{'s' * (times != 1)}{most}, closed at {closed.sum()} of {closed.size} samples"))
     for name, event in motion.events.items():
-        times = np.sort(np.ravel(event.ts[np.isfinite(event.ts)]))
-        first = f", first at t = {times[0]:.6g}" if times.size else ""
-        rows.append(("event", f"{name!r}: {times.size} time{'s' * (times.size != 1)}{' in all' * bool(batch)}{first}"))
+        when = np.asarray(event.ts)[np.isfinite(event.ts)]
+        first = f", first at t = {when.min():.6g}" if when.size else ""
+        rows.append(("event", f"{name!r}: {when.size} time{'s' * (when.size != 1)}{' in all' * bool(batch)}{first}"))
     if motion.friction:
         transitions, stuck = (np.nan_to_num(motion.stats[name]) for name in ("transitions", "time_stuck"))  # NaN where not reached
         rows.append(("friction", f"{int(transitions.max())} transitions, stuck for {stuck.max():.4g}{most}"))

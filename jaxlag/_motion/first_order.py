@@ -162,8 +162,8 @@ class EquationsOfMotion:
         of_friction = map(zeros, (self.elements, min(self.elements, 1), self.elements))
         of_contact = zeros(self.contacts), zeros(self.contacts), zeros(self.contacts) + t, *map(zeros, (self.contacts, self.contacts))
         of_events = zeros(self.events), zeros(self.events), zeros(self.seen), zeros(min(self.events, 1))
-        motion = q, v, z, u, zeros(len(self.works)), zeros(self.rows) + 1  # with slip, for the time being
-        parts = Parts(*motion, *of_friction, *of_contact, *of_events)
+        works, slipping = zeros(len(self.works)), zeros(self.rows) + 1  # for the time being
+        parts = Parts(q, v, z, u, works, slipping, *(*of_friction, *of_contact, *of_events))
         if self.sampled.size:
             y = self.updated(t, parts.y, args, [True] * len(self.sampled_names))
             parts = self.parts(self.projected(t, y, args) if self.projection else y)._replace(works=parts.works)

@@ -5,7 +5,6 @@ control and their stages are diffrax's and the solver's; the loop around them, s
 are the derivative of each step and not of the loop, which stays the same.
 """
 
-import dataclasses
 import functools
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -26,7 +25,7 @@ from .interval_inputs import Inputs, Recorded, Rows, packed
 from .protocol import Arguments
 from .results import RESULTS, number_of, numbered, under_diffrax
 from .runge_kutta import ExplicitRungeKutta
-from .step_size import ResumingController
+from .step_size import ResumingController, with_tolerances
 from .variational import derived, with_variations
 
 
@@ -82,7 +81,7 @@ class IntervalLoop(NamedTuple):
         rtol, atol = numbers.tolerances
         rounding = jnp.finfo(y0.dtype).eps * jnp.maximum(jnp.abs(first), jnp.abs(last))
         controller = ResumingController(rtol, atol, smallest=4 * rounding, norm=self.equations.error_norm)
-        stepping = self._replace(solver=_with_tolerances(self.solver, controller))
+        stepping = self._replace(solver=with_tolerances(self.solver, controller))
         now = lambda x: _alone(x, numbers)
 
         def turn(carry):
@@ -199,21 +198,6 @@ def _alone(x: Array, numbers: Numbers) -> Array:
 def _with_zeros(x: Array, size: int) -> Array:
     """With variations of zero as a last axis of this size."""
     return with_variations(x, jnp.zeros((*x.shape, size - 1), x.dtype))
-
-
-def _with_tolerances(solver, controller):
-    """An implicit solver, with the tolerances of the steps for its equations, as diffrax has it."""
-    inner = getattr(solver, "solver", solver)
-    if not isinstance(inner, dfx.AbstractImplicitSolver):
-        return solver
-    names = [name for name in ("rtol", "atol", "norm") if not _is_given(getattr(inner.root_finder, name))]
-    root_finder = dataclasses.replace(inner.root_finder, **{name: getattr(controller, name) for name in names})
-    inner = dataclasses.replace(inner, root_finder=root_finder)
-    return dataclasses.replace(solver, solver=inner) if hasattr(solver, "solver") else inner
-
-
-def _is_given(tolerance):
-    return callable(tolerance) or eqx.is_inexact_array_like(tolerance)
 
 
 def _initial_state(solver, term, t0, t1, y0, args):

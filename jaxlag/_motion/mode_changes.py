@@ -31,6 +31,7 @@ from .state_vector import Parts, Start
 from .witnesses import plain_witnesses, witness_margins
 
 CONVERGED = 1e-9  # of the motion, the time that infinitely many impacts may yet take when they are summed up,
+OFTEN = 64  # parts of a step, in each of which what has no bounds is looked at
 LOW = 10  # or, in roundings of the gap, the height of the last flight
 
 
@@ -91,9 +92,14 @@ class Approach(NamedTuple):
     may_arrive: Callable
 
 
-def approach(equations: EquationsOfMotion, path: Callable, t, y, args: Arguments) -> Approach:
-    """Bounds of gaps and witnesses and of their rates, where there are any. What rises or falls all the time is seen at the ends."""
-    closed, sign = equations.parts(y).closed > 0.5, equations.parts(y).sign
+def approach(equations: EquationsOfMotion, path: Callable, t0, t1, args: Arguments) -> Approach:
+    """Bounds of gaps and witnesses and of their rates, where there are any. What rises or falls all the time is seen at the ends; what has
+    no bounds is looked at more often.
+    """
+    t, parts = t0, equations.parts(path(t0))
+    closed, sign = parts.closed > 0.5, parts.sign
+    flat, _, _ = equations.mode(t, parts, args)
+    often = lambda start, end: end - start > (t1 - t0) / OFTEN
 
     def along(function):
         def at(t):
@@ -105,23 +111,24 @@ def approach(equations: EquationsOfMotion, path: Callable, t, y, args: Arguments
     of_gaps = along(lambda flat, t, parts: flat.gaps(t, parts.q))
     of_events = along(lambda flat, t, parts: sign * plain_witnesses(flat, t, parts.q, parts.v))
     known = [(of, watched) for of, watched in ((of_gaps, ~closed), (of_events, jnp.ones(equations.events, bool))) if watched.size]
-    is_known = all(bound is not None for of, _ in known for bound in of)
-    flat, _, _ = equations.mode(t, equations.parts(y), args)
+    is_known = not flat.events_need_multipliers and all(bound is not None for of, _ in known for bound in of)
 
     def may_arrive(start, end):
         found = [jnp.zeros(equations.elements, bool)]
         for (value, rate), watched in known:
             if value is None or rate is None:
-                found.append(jnp.zeros_like(watched))
+                found.append(watched & often(start, end))
             else:
                 (low, _), (falls, rises) = value(start, end), rate(start, end)
                 found.append(watched & (low < 0) & (falls < 0) & (rises > 0))
+        if flat.events_need_multipliers:
+            found[-1] = found[-1] | often(start, end)
         return jnp.concatenate(found)
 
     def stays_away(start, end):
         return jnp.all(jnp.concatenate([watched & (value(start, end)[0] > 0) for (value, _), watched in known]))
 
-    can_tell = is_known and known and not equations.elements and not flat.events_need_multipliers
+    can_tell = is_known and known and not equations.elements
     return Approach(stays_away if can_tell else None, may_arrive)
 
 

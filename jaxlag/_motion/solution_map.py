@@ -152,7 +152,8 @@ class SolutionMap:
             found, change = jax.jvp(at, (t, y), (jnp.ones_like(t), rate))
             return jax.tree.map(lambda x, dx: jnp.where(jnp.isfinite(x), dx, 0), found, change)
 
-        return Samples(*jax.vmap(of_one)(ts, samples.ys), jax.tree.map(jnp.zeros_like, samples.events))
+        ys, shown = jax.vmap(of_one)(ts, samples.ys)
+        return Samples(ys, shown, jax.tree.map(jnp.zeros_like, samples.events))
 
     def _equations(self, inputs: Inputs, ts: Array) -> tuple[EquationsOfMotion, StatesAt]:
         at = self._at(inputs, ts)

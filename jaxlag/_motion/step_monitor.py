@@ -84,17 +84,15 @@ def first_end(
         ts = jnp.where(np.arange(ts.size) == ts.size - 1, high, ts)
         part = jnp.diff(ts)[:, None]
         value, slope, change = look(ts)
-        hidden = jax.vmap(hides)(ts[:-1], ts[1:])
+        hidden = jax.vmap(hides)(ts[:-1], ts[1:]) & (part > brief)
         largest = jnp.maximum(largest, jnp.max(jnp.abs(value), axis=0))
         value = value + jnp.where(np.arange(2 * elements) < elements, 0, 1e-9 * largest)[None]  # a bound of zero is none that is negative
         beyond = jnp.any(value[1:] < 0, axis=1)
-        doubtful = jnp.any(
-            _dips(value, slope, part) & (part > near) | (hidden | (value[:-1] + value[1:] < change)) & (part > brief), axis=1
-        )
+        doubtful = jnp.any(_dips(value, slope, part) & (part > near) | hidden | (value[:-1] + value[1:] < change) & (part > brief), axis=1)
         wanted = beyond | (doubtful & ~found)
         i = jnp.where(jnp.any(wanted), jnp.argmax(wanted), LOOKS - 1)  # the end itself may be beyond by rounding alone
         onward = ~found & ~jnp.any(wanted)
-        hit = ~onward & beyond[i]
+        hit = ~onward & beyond[i] & (found | ~jnp.any(hidden[i]))  # of several ends in it, the first
         new = lambda now, before: jnp.where(hit, now, before)
         return _Search(
             jnp.where(onward, high, ts[i]),

@@ -1,8 +1,10 @@
 """Step size control that ends by a reason where numbers are not finite, and resumes behind jumps of an input."""
 
+import dataclasses
 from typing import Any
 
 import diffrax as dfx
+import equinox as eqx
 import jax.numpy as jnp
 
 from .results import RESULTS, under_diffrax
@@ -41,3 +43,18 @@ class ResumingController(GuardedController):
         planned = jnp.where(keep, jnp.maximum(t1 - t0, planned), t1 - t0)
         result = dfx.RESULTS.where(keep | (planned >= self.smallest), result, dfx.RESULTS.dt_min_reached)
         return keep, t0, t0 + planned, made_jump, (planned, state), result
+
+
+def with_tolerances(solver: Any, controller: Any) -> Any:
+    """An implicit solver, with the tolerances of the steps for its equations, as diffrax has it."""
+    inner = getattr(solver, "solver", solver)
+    if not isinstance(inner, dfx.AbstractImplicitSolver):
+        return solver
+    names = [name for name in ("rtol", "atol", "norm") if not _is_given(getattr(inner.root_finder, name))]
+    root_finder = dataclasses.replace(inner.root_finder, **{name: getattr(controller, name) for name in names})
+    inner = dataclasses.replace(inner, root_finder=root_finder)
+    return dataclasses.replace(solver, solver=inner) if hasattr(solver, "solver") else inner
+
+
+def _is_given(tolerance):
+    return callable(tolerance) or eqx.is_inexact_array_like(tolerance)

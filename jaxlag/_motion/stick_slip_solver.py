@@ -198,7 +198,7 @@ class StickSlipSolver(ProjectedSolver):
         of, modes = lambda t, y, start: margins(self.equations, t, y, args, start), self.equations.modes
         if not (self.equations.contacts or self.equations.events):
             return first_end(of, path.evaluate, t0, t1, modes, args.scales, exactly)
-        between = approach(self.equations, path.evaluate, t0, path.evaluate(t0), args)
+        between = approach(self.equations, path.evaluate, t0, t1, args)
         watched = lambda: first_end(of, path.evaluate, t0, t1, modes, args.scales, exactly, between.may_arrive)
         if between.stays_away is None:
             return watched()

@@ -137,6 +137,13 @@ def _select(_, which, *cases):
     return jnp.where(known, one[0], low), jnp.where(known, one[1], high)
 
 
+def _reduce_prod(params, x):
+    """A product of elements, one after the other."""
+    axes = params["axes"]
+    ends = [jnp.moveaxis(end, axes, range(len(axes))).reshape(-1, *np.delete(end.shape, axes)) for end in x]
+    return functools.reduce(lambda x, y: _product({}, x, y), zip(*ends, strict=True))
+
+
 def _dot_general(params, x, y):
     """A product of matrices, by midpoints and radii."""
     product = functools.partial(jax.lax.dot_general, **{key: params[key] for key in ("dimension_numbers", "precision")})
@@ -175,6 +182,7 @@ INTERVAL_RULES: dict[str, Callable[..., Interval]] = {
     "sub": lambda _, x, y: (x[0] - y[1], x[1] - y[0]) if x is not y else hull(jnp.zeros_like(x[0])),
     "mul": _product,
     "div": _quotient,
+    "reduce_prod": _reduce_prod,
     "abs": lambda _, x: _even(jnp.abs, x),
     "square": lambda _, x: _even(jnp.square, x),
     "integer_pow": _integer_power,
@@ -210,5 +218,8 @@ INCREASING = ARRAY_OPERATIONS | {
     "atanh", "asin", "atan", "erf", "logistic", "floor", "ceil", "round", "sign", "and", "or",
 }  # fmt: skip
 DECREASING = {"neg", "rsqrt", "acos", "erfc", "not"}
-MAY_OVERFLOW = {"add", "add_any", "sub", "mul", "neg", "div", "abs", "square", "integer_pow", "pow", "reduce_sum", "cumsum", "dot_general"}
+MAY_OVERFLOW = {
+    "add", "add_any", "sub", "mul", "neg", "div", "abs", "square", "integer_pow", "pow", "reduce_sum", "reduce_prod", "cumsum",
+    "dot_general",
+}  # fmt: skip
 LOGICAL = {"and", "or", "not", "reduce_and", "reduce_or"}  # on other integers they are neither increasing nor decreasing

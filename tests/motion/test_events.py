@@ -1,4 +1,4 @@
-"""Events: located, recorded, differentiated; against closed forms and SciPy's events."""
+"""Events: located, recorded, differentiated; against closed forms and SciPy's events. At jumps and in great number: `test_event_kinds`."""
 
 import jax
 import jax.numpy as jnp
@@ -87,7 +87,7 @@ def test_a_rope_that_breaks():
         lambda q, qdot: 0.5 * (qdot @ qdot) - G * q[1],
         holonomic={"rope": lambda q, whole: whole * (q @ q - 1.0)},
         states={"whole": jl.State(lambda: 0.0, start=1.0)},
-        events={"breaks": jl.Event(lambda q, qdot, F: F - (qdot @ qdot - G * q[1]), lambda: {"states": {"whole": 0.0}}, most=1)},
+        events={"breaks": jl.Event(lambda multipliers, F: F + 2 * multipliers["rope"], lambda: {"states": {"whole": 0.0}}, most=1)},
     )
 
     def end(F):
