@@ -12,14 +12,15 @@ TEXTS = {
     "docs/architecture.md": "architecture.md",
 }
 REFERENCE = {
-    "Systems": "System Contact Event Falling Rising Either Negative Every State Sampled virtual_work rate substitute "
-    "Signal ZeroOrderHold Linear Cubic dissipation.sliding dissipation.viscous dissipation.drag dissipation.power_law dissipation.stribeck dissipation.speed",
+    "Systems": "System Contact Event Falling Rising Either Negative Every State Sampled "
+    "virtual_work rate substitute Signal ZeroOrderHold Linear Cubic "
+    "dissipation.sliding dissipation.viscous dissipation.drag dissipation.power_law dissipation.stribeck dissipation.speed",
     "At one state": "acceleration Acceleration mass_matrix momentum energy constraint_jacobian constraint_residual constraint_force powers "
     "Residual consistent_state examine Examination",
     "Motions": "simulate simulate_many Trajectory FrictionState ContactState EventState RESULTS Instant Interpolated load Dop853 Dopri5 "
     "Projection Baumgarte NoStabilisation StickSlip Regularised keep_compiled",
-    "Near a steady state": "equilibrium steady Equilibrium linearise LinearSystem Modes root_locus RootLocus Crossing periodic PeriodicOrbit "
-    "stability_map StabilityMap",
+    "Near a steady state": "equilibrium steady Equilibrium linearise LinearSystem Modes root_locus RootLocus Crossing periodic "
+    "PeriodicOrbit stability_map StabilityMap",
     "Identification": "Experiment ModalTest FrequencyResponseTest fit fit_each Fit Channel Interval Prediction regress Regression Regress "
     "validate Validation compare Comparison information Information Huber learnt.ConvexDissipation learnt.PassiveDissipation "
     "learnt.Potential learnt.ConvexPotential",
