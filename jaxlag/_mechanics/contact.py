@@ -100,6 +100,15 @@ def roundings(x: Float[Array, " n"]) -> Float[Array, " n"]:
     return little * jnp.abs(jax.lax.stop_gradient(x)) + little**2
 
 
+def roundings_of_rates(flat: Flat, t, q, v) -> Float[Array, " n"]:
+    """Of each velocity, what counts as rounding where an impact gives the energy of some to others: that of the largest it could be."""
+    t, q, v = jax.lax.stop_gradient((t, q, v))
+    M = inertia(flat, t, q, v)[0]
+    mass = jnp.diagonal(M.as_matrix())
+    largest = jnp.sqrt(jnp.maximum(v @ M.mv(v), 0) / jnp.where(mass > 0, mass, jnp.inf))
+    return roundings(jnp.maximum(jnp.abs(v), largest))
+
+
 class Contacts(NamedTuple):
     """Contacts with g = 0 and ġ = 0, to choose the closed ones from: those chosen so far, how often they changed, and what of their forces
     and accelerations counts as rounding.

@@ -8,6 +8,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.interpreters import partial_eval as pe
 from jaxtyping import Array, Float, PyTree
 
 from .._program.jit import compiled, is_concrete
@@ -162,6 +163,10 @@ def check(system: System, t: Array, q: Arrays, qdot: Arrays, params: PyTree, sta
                 raise ValueError(
                     f"{role(slot, name)} must return one gap, a real number, but returned {described(out)}. Give each contact its name."
                 )
+            if slot == "unilateral" and not _uses_q(function, role(slot, name), params, q, t=t, **beside):
+                raise ValueError(
+                    f"{role(slot, name)} must depend on q, but does not: no force could keep it open. Write the distance to the obstacle."
+                )
     for name, function in system.force:
         label, state = role("force", name), {"t": t, "q": q, "qdot": qdot, "multipliers": _multipliers(system, t, q, qdot, params, beside)}
         _shape_of(function, label, params, functools.partial(flat_like, q, label), **state, **beside)
@@ -236,6 +241,14 @@ def _multipliers(system, t, q, qdot, params, beside):
     ]
     shapes = [_shape_of(f, label, params, t=t, q=q, **velocity, **beside) for label, f, velocity in slots]
     return dict(zip(system.constraints, jax.tree.map(lambda s: jnp.zeros(s.shape, s.dtype), shapes), strict=True))
+
+
+def _uses_q(function, label, params, q, /, **state):
+    """Whether the program of a function uses any coordinate."""
+    numbers, rest = eqx.partition(params, eqx.is_array)
+    program = lambda q, numbers, state: call(function, label, eqx.combine(numbers, rest), q=q, **state)
+    jaxpr = jax.make_jaxpr(program)(q, numbers, state).jaxpr
+    return any(pe.dce_jaxpr(jaxpr, [True] * len(jaxpr.outvars))[1][: len(jax.tree.leaves(q))])
 
 
 def _shape_of(function, label, params, then=lambda out: out, /, **state):

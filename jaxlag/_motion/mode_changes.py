@@ -17,6 +17,7 @@ from .._mechanics.contact import (
     idle,
     on_contact,
     roundings,
+    roundings_of_rates,
     select_closed,
 )
 from .._mechanics.friction_elements import FrictionElements
@@ -191,7 +192,7 @@ def behind_contact(equations: EquationsOfMotion, t, parts: Parts, args: Argument
     """
     flat, _, elements = equations.mode(t, parts, args)
     closed, q, before = parts.closed > 0.5, parts.q, parts.v
-    scales = gap_scales(flat, t, q, before, errors[0], roundings(before))
+    scales = gap_scales(flat, t, q, before, errors[0], roundings_of_rates(flat, t, q, before))
     near = closed | of_contact | (jax.lax.stop_gradient(flat.gaps(t, q)) <= scales.gap)
     opening = of_contact & closed
     hits = near & ~opening & (gap_rates(flat, t, q, before) < -scales.rate)

@@ -143,6 +143,8 @@ class StickSlipSolver(ProjectedSolver):
         """What is seen along a piece: of the whole step when its mode ends, of the rest whether all is fine."""
         seen = self._seen(start, end, done.dense, args, ~rest)
         fine = ~(seen.ended | seen.unsure | seen.negative)
+        if not self.equations.elements:
+            fine |= ~split.cut.consistent  # nothing can follow
         return jax.lax.cond(
             rest,
             lambda: split._replace(second=done, cut=split.cut._replace(usable=split.cut.usable & fine)),
@@ -180,7 +182,8 @@ class StickSlipSolver(ProjectedSolver):
         error = jnp.where(refused, jnp.inf, error)
         error = jnp.where(is_hidden(rates, _nodes(self.solver), t0, t1, y0, args.scales), jnp.inf, error)
         consistent = ~ended | cut.consistent | ~cut.usable
-        result = dfx.RESULTS.where(consistent, dfx.RESULTS.successful, under_diffrax(RESULTS.no_friction))
+        none = RESULTS.no_friction if self.equations.elements else RESULTS.beyond_reach  # as between walls that close in
+        result = dfx.RESULTS.where(consistent, dfx.RESULTS.successful, under_diffrax(none))
         for passed, reason in ((cut.dissipates, RESULTS.energy_gained), (cut.impulsive, RESULTS.not_impulsive)):
             result = dfx.RESULTS.where(~ended | passed | ~cut.usable, result, under_diffrax(reason))
         result = dfx.RESULTS.where(seen.negative & ~shrinking, under_diffrax(RESULTS.negative_bound), result)

@@ -42,6 +42,22 @@ def test_a_gap_is_one_number():
         jl.simulate(plane, jnp.ones(2), -jnp.ones(2), jnp.array([0.0, 1.0]))
 
 
+@pytest.mark.parametrize("gap", [lambda q: 0.3, lambda t: 0.5 - t, lambda w: w], ids=["a number", "of time", "of params"])
+def test_a_gap_between_things_that_are_both_fixed(gap):
+    fixed = jl.System(fall, unilateral={"floor": floor, "walls": gap})
+    with pytest.raises(ValueError, match="`unilateral` 'walls' must depend on q, but does not"):
+        jl.simulate(fixed, 1.0, 0.0, jnp.array([0.0, 1.0]), {"w": 0.3})
+
+
+def test_walls_that_close_in():
+    """What lies between them can go nowhere, which is the reason, at the time when they touch it on both sides."""
+    press = jl.System(fall, unilateral={"below": floor, "above": lambda t, q: 1.5 - 2 * t - q})
+    motion = jl.simulate(press, 1.0, 0.0, jnp.linspace(0, 1, 5), throw=False)
+    assert motion.result == jl.RESULTS.beyond_reach
+    np.testing.assert_allclose(motion.stats["reached"], 0.75, rtol=1e-9)
+    np.testing.assert_array_equal(np.isfinite(motion.q), [True, True, True, True, False])
+
+
 def test_a_start_inside_an_obstacle_is_put_on_it():
     motion = jl.simulate(ball, -0.25, 0.0, jnp.array([0.0, 1.0]))
     np.testing.assert_allclose(motion.q, 0, atol=1e-15)
