@@ -41,6 +41,10 @@ class Experiment(eqx.Module):
     - `delay`: by how much the sensors lag behind the motion, a number, or a function that names parameters. Before the delay is over,
       they show the state at ts[0].
 
+    - `events`: by the name of an event of the system, the times at which it was seen to happen, the first, the second and so on, as clicks
+      in a recording of sound; NaN for one that was missed. Each is a channel beside those of `values`, a mapping then, with a `sigma` of
+      its own. A motion in which fewer happen does not fit.
+
     Units are any consistent set.
 
     **Raises:** `ValueError` or `TypeError` where times, values and sigma are not real numbers or do not fit each other, the start is not
@@ -65,6 +69,7 @@ class Experiment(eqx.Module):
     observe: Callable = eqx.field(static=True)
     unknown: tuple[str, ...] = eqx.field(static=True)
     delay: Callable | float | None = eqx.field(static=True)
+    events: tuple[str, ...] = eqx.field(static=True)  # channels of `values` that are times of events, in their first rows
 
     def __init__(
         self,
@@ -78,6 +83,7 @@ class Experiment(eqx.Module):
         params: Mapping[str, Any] | None = None,
         unknown: Sequence[str] = (),
         delay: Callable | float | None = None,
+        events: Mapping[str, Any] | None = None,
     ):
         self.q0, self.qdot0 = state(q0, qdot0, ("q0", "qdot0"))
         for which, tree in (("q0", self.q0), ("qdot0", self.qdot0)):
@@ -85,12 +91,14 @@ class Experiment(eqx.Module):
                 raise ValueError(f"`{which}` must be finite, but has a missing value. Give a guess, and name it in `unknown`.")
         dtype = jax.tree.leaves(self.q0)[0].dtype
         self.ts = sample_times(ts, dtype)
-        self.values = _measured(values, self.ts, dtype)
+        values = _measured(values, self.ts, dtype)
+        self.observe = Coordinates.named_by(values, self.q0) if observe is None else observe
+        self.values = _with_events(values, events, self.ts, dtype)
+        self.events = tuple(events or ())
         self.sigma = None if sigma is None else _deviations(sigma, self.values)
         if params is not None and not isinstance(params, Mapping):
             raise TypeError(f"`params` of an experiment must be a mapping, but is a {type(params).__name__}. Name its entries in a dict.")
         self.params = dict(parameters(params or {}, self.q0))
-        self.observe = Coordinates.named_by(self.values, self.q0) if observe is None else observe
         check_function(self.observe, "`observe`")
         self.unknown = (unknown,) if isinstance(unknown, str) else tuple(unknown)
         if callable(delay):
@@ -175,6 +183,25 @@ def with_own(params: PyTree, own: Mapping[str, Any]) -> PyTree:
             "Use a dict; the present params may be one of its entries."
         )
     return {**params, **own}
+
+
+def _with_events(values, events, ts, dtype):
+    """The measured values, and in the first rows of channels of their own the times of events."""
+    if not events:
+        return values
+    if not isinstance(values, Mapping) or not isinstance(events, Mapping) or set(values) & set(events):
+        raise TypeError("`values` must be a mapping of channels where there are `events`, of other names, but is not. Name the channels.")
+    channels = dict(values)
+    for name, given in events.items():
+        times = numbers(given, f"`events[{name!r}]`", dtype)
+        if times.ndim != 1 or times.size > ts.size:
+            raise ValueError(
+                f"`events[{name!r}]` must be a list of at most {ts.size} times, as many as samples, but has shape {times.shape}. "
+                "Give more samples; missing ones may be NaN."
+            )
+        xnp = numpy_for(times)
+        channels[name] = xnp.concatenate([times, xnp.full(ts.size - times.size, xnp.nan, dtype)])
+    return channels
 
 
 def _measured(values, ts, dtype):

@@ -42,6 +42,7 @@ class ExperimentBatch:
     tangent_basis: Any
     observe: Callable = dataclasses.field(metadata={"static": True})
     delay: Any = dataclasses.field(metadata={"static": True})
+    events: tuple[str, ...] = dataclasses.field(metadata={"static": True})  # channels that are times of events
     own: tuple[str, ...] = dataclasses.field(metadata={"static": True})  # entries of params that are unknown
     members: tuple[int, ...] = dataclasses.field(metadata={"static": True})  # indices of the experiments
     mesh: Mesh | None = dataclasses.field(default=None, metadata={"static": True})  # the devices they are distributed over
@@ -70,7 +71,7 @@ def batches_of(system: System, params: PyTree, experiments: Sequence[Experiment]
     for i, e in enumerate(experiments):
         rest = (e.q0, e.qdot0, e.params, bases[i])
         shapes = [np.shape(x)[1:] for x in jax.tree.leaves(e.values)], [np.shape(x) for x in jax.tree.leaves(rest)]
-        kind = e.observe, e.delay, _unknown_params(e), jax.tree.structure((e.values, rest)), str(shapes)
+        kind = e.observe, e.delay, e.events, _unknown_params(e), jax.tree.structure((e.values, rest)), str(shapes)
         kinds.setdefault(kind, []).append(i)
     return tuple(_batch([experiments[i] for i in members], [bases[i] for i in members], members) for members in kinds.values())
 
@@ -103,7 +104,8 @@ def _batch(experiments, bases, members):
     arrays, others = eqx.partition(padded, eqx.is_array)
     together = eqx.combine(jax.tree.map(lambda *leaves: xnp.stack(leaves), *arrays), others[0])
     first = experiments[0]
-    return _distributed(ExperimentBatch(*together, first.observe, first.delay, _unknown_params(first), tuple(members)))
+    kind = first.observe, first.delay, first.events, _unknown_params(first)
+    return _distributed(ExperimentBatch(*together, *kind, tuple(members)))
 
 
 def _distributed(batch):

@@ -13,7 +13,7 @@ from jaxtyping import PyTree
 from .._model.deprecation import renamed
 from .._model.numbers import count
 from .._model.system import System
-from .._model.validation import without_contacts
+from .._model.validation import without_contacts, without_events
 from .._motion.progress import Steps, compiling
 from .experiment import Experiment, measured
 from .lead_in import Regress, inside_bounds, led_in
@@ -118,6 +118,7 @@ def fit(
     line = Steps(steps) if progress else None
     if segments > 1:
         without_contacts(system, "`fit` with `segments`")
+        without_events(system, "`fit` with `segments`")
     of_segments = cut(problem, recordings, segments) if segments > 1 else Segments(problem, tuple(range(len(recordings))), ())
     with compiling("the fit", progress):
         try:

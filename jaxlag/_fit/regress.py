@@ -11,7 +11,7 @@ from jaxtyping import PyTree
 
 from .._model.numbers import number
 from .._model.system import System
-from .._model.validation import without_contacts
+from .._model.validation import without_contacts, without_events
 from .experiment import Experiment, measured
 from .parameters import Free
 from .rounding import plus_minus
@@ -130,6 +130,7 @@ def regress(
             "Put their recorded values into params as `Signal`s, in a system without these states, or use `fit`."
         )
     without_contacts(system, "`regress`")
+    without_events(system, "`regress`")
     experiments, params = measured(experiments, params)
     params = Free.of(params, free, bounds).with_default_starts()
     chosen = Free.of(params, free, bounds)

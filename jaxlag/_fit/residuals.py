@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
-from jaxtyping import PyTree
+from jaxtyping import Array, PyTree
 
 from .._model.injection import call
 from .._model.system import System
@@ -44,7 +44,17 @@ class Model:
             return call(e.observe, "`observe`", params, **state, **states, states=states)
 
         channels = jax.vmap(seen)(motion.ts, motion.q, motion.qdot, motion.qddot, motion.multipliers, motion.states)
-        return (channels if e.delay is None else jax.tree.map(lambda x: x[1:], channels)), motion
+        channels = channels if e.delay is None else jax.tree.map(lambda x: x[1:], channels)
+        return (channels | self._times(e, motion) if e.events else channels), motion
+
+    def _times(self, e: ExperimentBatch, motion: Trajectory) -> dict[str, Array]:
+        """When events happen, in rows of the length of the samples; NaN beyond the last."""
+        for name in e.events:
+            if name not in motion.events:
+                there = ", ".join(motion.events) or "none"
+                raise ValueError(f"`events` must name events of the system, but holds {name!r}. There are {there}.")
+        times = {name: motion.events[name].ts[: e.ts.size] for name in e.events}
+        return {name: jnp.concatenate([ts, jnp.full(e.ts.size - ts.size, jnp.nan, ts.dtype)]) for name, ts in times.items()}
 
 
 class Evaluation(NamedTuple):
@@ -63,7 +73,7 @@ def _evaluate(model, free, e, y, z, scale):
 
     def weighted(p, v, s):
         there = jnp.isfinite(v)
-        r = jnp.where(there, (p - jnp.where(there, v, 0)) / s, 0)
+        r = jnp.where(there, (jnp.where(there, p, 0) - jnp.where(there, v, 0)) / s, 0)
         return r if model.loss is None else scale * model.loss.root(r / scale)
 
     r = ravel_pytree(jax.tree.map(weighted, channels, e.values, e.sigma))[0]

@@ -213,6 +213,14 @@ def without_contacts(system: System, label: str) -> None:
         )
 
 
+def without_events(system: System, label: str) -> None:
+    """Refuses systems with events, where these must not be."""
+    for name, _ in system.events:
+        raise ValueError(
+            f"`system` must have no events in {label}, but has {name!r}. Take `system.with_events(None)` and records between the events."
+        )
+
+
 def at_state(core: Callable[..., Any], system: System, q: Any, qdot: Any, params: Any, t: Any, states: Any = None) -> Any:
     """`core(flat, t, q, v)` of the checked system at a state given by the user; compiled once for each `core` and `system`."""
     q, qdot = state(q, qdot)
