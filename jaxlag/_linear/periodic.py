@@ -36,6 +36,7 @@ class PeriodicOrbit(eqx.Module):
     - `multipliers`: the Floquet multipliers, eigenvalues of the derivative of the return map by all of its state that returns, the largest
       first: a small deviation is multiplied by them in a period. Deviations along the motion and off the constraints do not last: 0.
     - `is_stable`: whether all of them are less than 1 in absolute value.
+    - `t`, `params`, `system`: the time at the section, and what was given.
     """
 
     q: PyTree
@@ -54,7 +55,7 @@ class PeriodicOrbit(eqx.Module):
         return jnp.all(jnp.abs(self.multipliers) < 1)
 
     def motion(self, samples: int = 201, **settings: Any) -> Trajectory:
-        """One period of it, as `simulate(..., **settings)` gives it."""
+        """One period of it at some `samples`, as `simulate` gives it with these `settings`."""
         ts = self.t + self.period * jnp.linspace(0, 1, samples)
         return simulate(self.system, self.q, self.qdot, ts, self.params, states=self.states, **settings)
 

@@ -5,7 +5,6 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.interpreters import partial_eval as pe
 from jaxtyping import Array, Bool, PyTree
 
 from .._model.flat import Flat
@@ -13,6 +12,7 @@ from .._model.paths import entry_names
 from .._model.system import System
 from .._model.validation import at_state, coordinates
 from .._program.jit import is_concrete
+from .._program.walker import used_arguments
 from .lagrange import constraint_rows, inertia
 from .saddle_point import NO_INERTIA
 
@@ -89,15 +89,8 @@ def not_affine_in(flat: Flat, t, q, v) -> Bool[Array, " n"]:
     """
     slope = jax.jacfwd(flat.nonholonomic, argnums=2)
     t, q, v = jax.lax.stop_gradient((t, q, v))
-    if flat.nonholonomic(t, q, v).size == 0 or not _uses_velocity(slope, t, q, v):
+    if flat.nonholonomic(t, q, v).size == 0 or not used_arguments(slope, t, q, v)[2]:
         return jnp.zeros(v.size, bool)
     here, there = slope(t, q, v), slope(t, q, v + (1 + jnp.abs(v)) * (1 + np.arange(v.size, dtype=v.dtype) / v.size))
     uneven = jnp.abs(here - there) > jnp.finfo(v.dtype).eps ** 0.5 * jnp.max(jnp.abs(here) + jnp.abs(there))
     return jnp.any(uneven, axis=0)
-
-
-def _uses_velocity(function, t, q, v) -> bool:
-    """Whether any operation of the program of a function of (t, q, v) uses v."""
-    closed = jax.make_jaxpr(function)(t, q, v)
-    _, used = pe.dce_jaxpr(closed.jaxpr, [True] * len(closed.jaxpr.outvars))
-    return used[2]

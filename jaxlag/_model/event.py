@@ -16,12 +16,12 @@ from .pickling import picklable, unpickled
 
 @dataclasses.dataclass(frozen=True)
 class Falling:
-    """An event happens where `when` becomes negative."""
+    """An event happens where `when` becomes negative, and not where it becomes positive."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Rising:
-    """An event happens where `when` becomes positive."""
+    """An event happens where `when` becomes positive, and not where it becomes negative."""
 
 
 @dataclasses.dataclass(frozen=True)

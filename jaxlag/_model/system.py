@@ -125,7 +125,7 @@ class System:
                 _check_position(role(slot, name), function, dict(self.states))
 
     def with_events(self, events: Mapping[str, Event] | None) -> "System":
-        """The system with these events in place of its own."""
+        """The system with these `events`, by name, in place of its own; with none for None."""
         fields = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
         new = object.__new__(System)
         for name, value in (fields | {"events": events_of(events, [name for name, _ in self.unilateral])}).items():

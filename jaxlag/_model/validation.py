@@ -8,10 +8,10 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.interpreters import partial_eval as pe
 from jaxtyping import Array, Float, PyTree
 
 from .._program.jit import compiled, is_concrete
+from .._program.walker import used_arguments
 from .event import merged
 from .flat import Flat, StatesAt, bind, flat_like
 from .injection import call, check_entries, described, missing
@@ -255,8 +255,7 @@ def _uses_q(function, label, params, q, /, **state):
     """Whether the program of a function uses any coordinate."""
     numbers, rest = eqx.partition(params, eqx.is_array)
     program = lambda q, numbers, state: call(function, label, eqx.combine(numbers, rest), q=q, **state)
-    jaxpr = jax.make_jaxpr(program)(q, numbers, state).jaxpr
-    return any(pe.dce_jaxpr(jaxpr, [True] * len(jaxpr.outvars))[1][: len(jax.tree.leaves(q))])
+    return any(jax.tree.leaves(used_arguments(program, q, numbers, state)[0]))
 
 
 def _shape_of(function, label, params, then=lambda out: out, /, **state):

@@ -7,7 +7,9 @@ intervals, sums of matrix products, numbers of quantities) and what an equation 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any
 
+import jax
 from jax.extend import core
+from jax.interpreters import partial_eval as pe
 
 CALLS = ("jit", "pjit", "closed_call", "core_call", "remat", "remat2", "checkpoint")  # equations that call a program and do nothing else
 CALLS_WITH_DERIVATIVE_RULE = ("custom_jvp_call", "custom_vjp_call", "custom_vjp_call_jaxpr")
@@ -76,3 +78,10 @@ def primitive_names(program: Any) -> Iterator[str]:
 def count_equations(program: Any) -> int:
     """The number of equations, those of the programs it calls included."""
     return sum(1 for _ in primitive_names(program))
+
+
+def used_arguments(function: Callable, *arguments: Any) -> Any:
+    """Which numbers of its arguments any operation of the program of a function uses: structured like the arguments, of truth values."""
+    jaxpr = jax.make_jaxpr(function)(*arguments).jaxpr
+    _, used = pe.dce_jaxpr(jaxpr, [True] * len(jaxpr.outvars))
+    return jax.tree.unflatten(jax.tree.structure(arguments), used)
