@@ -175,17 +175,18 @@ class StickSlipSolver(ProjectedSolver):
         """What diffrax asks of a step, from its pieces."""
         (first, second, cut, seen), ended = split, split.seen.ended
         error = jnp.where(ended, jnp.maximum(jnp.abs(first.error), jnp.abs(second.error)), first.error)
-        # Where a bound has turned negative, steps shrink until the motion has come as far as it goes.
-        shrinking = seen.negative & (t1 - t0 > BARELY * args.scales.duration)
+        jammed = ended & cut.usable & ~cut.consistent & (self.equations.elements == 0)  # as between walls that close in
+        # There, and where a bound has turned negative, steps shrink until the motion has come as far as it goes.
+        shrinking = (seen.negative | jammed) & (t1 - t0 > BARELY * args.scales.duration)
         rates = lambda t, y: self.equations.rates(t, y, args)
-        refused = (ended & ~cut.usable) | seen.unsure | shrinking
+        refused = (ended & ~cut.usable) | seen.unsure | shrinking | jammed
         error = jnp.where(refused, jnp.inf, error)
         error = jnp.where(is_hidden(rates, _nodes(self.solver), t0, t1, y0, args.scales), jnp.inf, error)
-        consistent = ~ended | cut.consistent | ~cut.usable
-        none = RESULTS.no_friction if self.equations.elements else RESULTS.beyond_reach  # as between walls that close in
+        consistent = ~ended | cut.consistent | ~cut.usable | shrinking
+        none = RESULTS.no_friction if self.equations.elements else RESULTS.beyond_reach
         result = dfx.RESULTS.where(consistent, dfx.RESULTS.successful, under_diffrax(none))
         for passed, reason in ((cut.dissipates, RESULTS.energy_gained), (cut.impulsive, RESULTS.not_impulsive)):
-            result = dfx.RESULTS.where(~ended | passed | ~cut.usable, result, under_diffrax(reason))
+            result = dfx.RESULTS.where(~ended | passed | ~cut.usable | jammed, result, under_diffrax(reason))
         result = dfx.RESULTS.where(seen.negative & ~shrinking, under_diffrax(RESULTS.negative_bound), result)
         result = dfx.RESULTS.where(self.equations.exhausted(second.y), under_diffrax(RESULTS.chattering), result)
         result = dfx.RESULTS.where(overflows(self.equations, second.y), under_diffrax(RESULTS.too_many_events), result)
