@@ -12,7 +12,7 @@ TEXTS = {
     "docs/architecture.md": "architecture.md",
 }
 REFERENCE = {
-    "Systems": "System Contact Event Falling Rising Either Negative Every State Sampled "
+    "Systems": "System Contact Newton Poisson Event Falling Rising Either Negative Every State Sampled "
     "virtual_work rate substitute Signal ZeroOrderHold Linear Cubic "
     "dissipation.sliding dissipation.viscous dissipation.drag dissipation.power_law dissipation.stribeck dissipation.speed",
     "At one state": "acceleration Acceleration mass_matrix momentum energy constraint_jacobian constraint_residual constraint_force powers "

@@ -39,7 +39,7 @@ from ._linear.modes import Modes as Modes
 from ._linear.periodic import PeriodicOrbit as PeriodicOrbit, periodic as periodic
 from ._linear.stability_map import StabilityMap as StabilityMap, stability_map as stability_map
 from ._program.compilation_cache import keep_compiled as keep_compiled
-from ._model.contact import Contact as Contact
+from ._model.contact import Contact as Contact, Newton as Newton, Poisson as Poisson
 from ._model.event import (
     Either as Either,
     Event as Event,

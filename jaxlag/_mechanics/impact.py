@@ -1,13 +1,15 @@
 """Impact: velocities that jump where contacts close.
 
-    M (q̇⁺ − q̇⁻) = GᵀΛ + friction,   ġ⁺ + e min(ġ⁻, 0) ≥ 0,  Λ ≥ 0,  one of them zero      of the contacts that touch
+    M (q̇⁺ − q̇⁻) = GᵀΛ + friction,   ġ⁺ + e min(ġ⁻, 0) ≥ 0,  Λ ≥ 0,  one of them zero      of the contacts that touch (Newton)
                                      ġ⁺ = 0 and a⁺ = 0                                     of all other constraints
 
+By Poisson's law there are two such impacts, both without e: the compression, with the impulses Λᶜ, and the expansion, with Λ ≥ e Λᶜ.
 Friction takes the impulses for the forces it follows: D is homogeneous in them. So an impact is the acceleration of a system at rest in a
 time of its own, in which q̇⁺ stands for q̈ and Λ for λ, and the laws of contact and friction are those of `contact` and `stick_slip`.
 Source: Glocker, Set-Valued Force Laws, chapter 10; Pfeiffer & Glocker, Multibody Dynamics with Unilateral Contacts, chapter 8.
 """
 
+import functools
 from typing import NamedTuple
 
 import jax
@@ -38,10 +40,42 @@ class Impact(NamedTuple):
     impulsive: Bool[Array, ""]
 
 
+class Phase(NamedTuple):
+    """q̇ after an impact, or after a phase of one; the impulses of the contacts; works by name; whether there is a solution, and friction is
+    homogeneous; the energy that is gained, and all that is exchanged.
+    """
+
+    v: Float[Array, " n"]
+    impulses: Float[Array, " c"]
+    works: dict[str, Float[Array, ""]]
+    consistent: Bool[Array, ""]
+    impulsive: Bool[Array, ""]
+    gained: Float[Array, ""]
+    exchanged: Float[Array, ""]
+
+
 def impact(flat: Flat, elements: FrictionElements | None, t, q, v, near: Bool[Array, " c"], e: Float[Array, " c"]) -> Impact:
-    """The impact of the contacts that are `near`, some of which approach; `e`: their restitution."""
+    """The impact of the contacts that are `near`, some of which approach; `e`: their restitution.
+
+    By Poisson's law compression, as without restitution, and then expansion, in which e of the impulses is given.
+    """
+    of_poisson = np.array(flat.poisson, bool)
+    returned = jnp.where(of_poisson, 0, e * jnp.minimum(gap_rates(flat, t, q, v), 0))
+    phases = [_phase(flat, elements, t, q, v, near, returned)]
+    if of_poisson.any():
+        (compression,) = phases
+        phases.append(_phase(flat, elements, t, q, compression.v, near, returned, jnp.where(of_poisson, e * compression.impulses, 0)))
+    total = functools.partial(functools.reduce, jnp.add)
+    impulses, gained, exchanged = (total([getattr(phase, name) for phase in phases]) for name in ("impulses", "gained", "exchanged"))
+    works = {name: total([phase.works[name] for phase in phases]) for name in phases[0].works}
+    consistent, impulsive = (jnp.all(jnp.stack([getattr(phase, name) for phase in phases])) for name in ("consistent", "impulsive"))
+    return Impact(phases[-1].v, impulses, works, consistent, *jax.lax.stop_gradient((gained <= RISE * exchanged, impulsive)))
+
+
+def _phase(flat, elements, t, q, v, near, returned, given=None) -> Phase:
+    """An impact in which ġ⁺ + `returned` ≥ 0 and impulses are at least those `given`."""
     approach = gap_rates(flat, t, q, v)
-    fast, of_impact = _in_fast_time(flat, elements, t, q, v, e * jnp.minimum(approach, 0))
+    fast, of_impact = _in_fast_time(flat, elements, t, q, v, returned, given)
     zero, origin = jnp.zeros_like(t), jnp.zeros_like(q)
     if elements is None or of_impact is None:
         chosen = select_closed(fast, zero, origin, origin, near)
@@ -56,21 +90,22 @@ def impact(flat: Flat, elements: FrictionElements | None, t, q, v, near: Bool[Ar
         after, multipliers = found.qddot, found.multipliers
         lost = found.force @ (elements.slip(t, q, v) + elements.slip(t, q, after))
         rubbed = friction_by_term(of_impact, sigma, held, zero, origin, origin, found)
-        twice = bounds(of_impact, sigma, zero, origin, origin, 2 * multipliers)
+        twice = bounds(of_impact, sigma, zero, origin, origin, 2 * multipliers + _at_contacts(flat, given))
         impulsive = jnp.all(jnp.abs(twice - 2 * found.bound) <= RISE * (jnp.abs(twice) + jnp.abs(found.bound)))
-    impulses = contact_rows(flat, multipliers)
-    departure = gap_rates(flat, t, q, after)
-    given = impulses @ (approach + departure) + lost
+    multipliers = multipliers + _at_contacts(flat, given)
+    impulses, departure = contact_rows(flat, multipliers), gap_rates(flat, t, q, after)
+    gained = impulses @ (approach + departure) + lost
     exchanged = jnp.abs(impulses) @ (jnp.abs(approach) + jnp.abs(departure))
-    dissipates = jax.lax.stop_gradient(given <= RISE * exchanged)
-    return Impact(
-        after,
-        impulses,
-        _works(flat, elements, t, q, (v + after) / 2, multipliers, rubbed),
-        consistent,
-        dissipates,
-        jax.lax.stop_gradient(impulsive),
-    )
+    works = _works(flat, elements, t, q, (v + after) / 2, multipliers, rubbed)
+    return Phase(after, impulses, works, consistent, impulsive, gained, exchanged)
+
+
+def _at_contacts(flat, given):
+    """Impulses of the contacts among those of all rows."""
+    if given is None:
+        return 0
+    before, behind = flat.rows_of_bilateral, flat.rows - flat.rows_of_bilateral - given.size
+    return jnp.concatenate([jnp.zeros(before, given.dtype), given, jnp.zeros(behind, given.dtype)])
 
 
 def _works(flat, elements, t, q, mean, multipliers, rubbed):
@@ -106,10 +141,12 @@ def check_impacts(flat: Flat, elements: FrictionElements | None, treatment: Stic
         )
 
 
-def _in_fast_time(flat, elements, t, q, v, returned):
+def _in_fast_time(flat, elements, t, q, v, returned, given):
     """The system of an impact: x stands for a change of q, its acceleration from rest for q̇⁺."""
     M = inertia(flat, t, q, v)[0]
     momentum = M.mv(v)
+    if given is not None:
+        momentum = momentum + jax.vjp(lambda v: gap_rates(flat, t, q, v), v)[1](given)[0]
     rates = lambda v: (jax.jvp(flat.bilateral, (t, q), (jnp.ones_like(t), v))[1], gap_rates(flat, t, q, v), flat.nonholonomic(t, q, v))
     drift = rates(jnp.zeros_like(v))
     along = lambda x: jax.jvp(rates, (jnp.zeros_like(v),), (x,))[1]  # affine in q̇
@@ -124,14 +161,14 @@ def _in_fast_time(flat, elements, t, q, v, returned):
     fast = fast._replace(holonomic=lambda s, x: jnp.concatenate([fast.bilateral(s, x), jnp.zeros_like(drift[1])]))
     if elements is None:
         return fast._replace(needs_multipliers=False), None
-    at_rest = elements.slip(t, q, jnp.zeros_like(v))
+    at_rest, all_given = elements.slip(t, q, jnp.zeros_like(v)), _at_contacts(flat, given)
 
     def slip(s, x, w):
         return jax.jvp(lambda v: elements.slip(t, q, v), (jnp.zeros_like(v),), (w,))[1] + s * at_rest
 
     def impulsive(D):
         """D of the impulses: what does not follow them is finite, and has no part in an impact."""
-        return lambda s, x, w, impulses, u: D(t, q, v, impulses, u) - D(t, q, v, jnp.zeros_like(impulses), u)
+        return lambda s, x, w, impulses, u: D(t, q, v, impulses + all_given, u) - D(t, q, v, jnp.zeros_like(impulses), u)
 
     potentials = {name: impulsive(D) for name, D in elements.potentials.items()}
     return fast, elements._replace(slip=slip, potentials=potentials, near_rest=0.0)

@@ -9,6 +9,16 @@ from .numbers import number
 
 
 @dataclasses.dataclass(frozen=True)
+class Newton:
+    """Newton's law of restitution: a contact departs e times as fast as it approached."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Poisson:
+    """Poisson's law of restitution: in the expansion that follows the compression, a contact gives back e times the impulse of that."""
+
+
+@dataclasses.dataclass(frozen=True)
 class Contact:
     r"""A contact that pushes and never pulls, and the restitution of its impacts.
 
@@ -16,15 +26,18 @@ class Contact:
        \dot g^+ + e\,\dot g^- \ge 0, \quad \Lambda \ge 0, \quad (\dot g^+ + e\,\dot g^-)\,\Lambda = 0 \text{ in an impact} $$
 
     **Arguments:** `gap`: g(t, q), a real number, the distance to the obstacle; negative inside of it. `restitution`: e from 0 to 1, a
-    number, or a function of `params`, their entries and `speed`, the rate −ġ⁻ of approach. What is beyond 0 and 1 counts as these. Any
-    consistent units.
+    number, or a function of `params`, their entries and `speed`, the rate −ġ⁻ of approach. What is beyond 0 and 1 counts as these.
+    `law`: `Newton()`, the one above, or `Poisson()`: an impact with e = 0, the compression, and then one in which the contact gives back
+    Λ ≥ e Λᶜ. They differ where impacts are coupled by friction or other contacts; Poisson's gives a contact that does not approach none
+    of the restitution of others. Any consistent units.
 
-    Impacts follow Newton's law; those of several contacts at one time, and the contacts that are closed already, Moreau's: all at once,
-    as one complementarity problem. A system takes contacts by name: `System(..., unilateral={"table": Contact(gap, restitution=0.8)})`.
+    The impacts of several contacts at one time, and the contacts that are closed already, follow Moreau's law: all at once, as one
+    complementarity problem. A system takes contacts by name: `System(..., unilateral={"table": Contact(gap, restitution=0.8)})`.
 
     **Raises:** `TypeError` or `ValueError` where `gap` is no function, or `restitution` neither a function nor a number from 0 to 1.
 
-    **Source:** Glocker, Set-Valued Force Laws, chapters 5 and 10; Moreau, in Nonsmooth Mechanics and Applications (1988).
+    **Source:** Glocker, Set-Valued Force Laws, chapters 5 and 10; Moreau, in Nonsmooth Mechanics and Applications (1988); Pfeiffer &
+    Glocker, Multibody Dynamics with Unilateral Contacts, chapter 8 (Poisson's law).
 
     ```python
     import jax.numpy as jnp
@@ -40,8 +53,11 @@ class Contact:
 
     gap: Callable
     restitution: Any = 0.0
+    law: Newton | Poisson = Newton()
 
     def __post_init__(self):
+        if not isinstance(self.law, (Newton, Poisson)):
+            raise TypeError(f"`law` must be `Newton()` or `Poisson()`, but is {self.law!r}. Take one of these.")
         check_function(self.gap, "`gap`")
         if callable(self.restitution):
             check_function(self.restitution, "`restitution`")

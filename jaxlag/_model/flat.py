@@ -10,6 +10,7 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float, PyTree
 
+from .contact import Poisson
 from .event import Every, merged
 from .injection import asks_for, call, described, needs
 from .signal import at_time
@@ -40,6 +41,7 @@ class Flat(NamedTuple):
     events_need_multipliers: bool
     holonomic_names: tuple[str, ...]
     contacts: tuple[str, ...]
+    poisson: tuple[bool, ...]  # which of them follow Poisson's law
     terms: tuple[str, ...]
     rows: int  # of G, those of the user's constraints
     rows_of_bilateral: int  # of those, the first, of `holonomic` alone
@@ -81,6 +83,7 @@ def bind(system: System, like: PyTree, params: PyTree, states: StatesAt | None =
         events_need_multipliers=any(callable(event.when) and asks_for(event.when, "multipliers") for _, event in system.events),
         holonomic_names=tuple(name for name, _ in (*system.holonomic, *system.unilateral)),
         contacts=tuple(name for name, _ in system.unilateral),
+        poisson=tuple(isinstance(law, Poisson) for _, law in system.laws),
         terms=system.terms,
         rows=bound.rows,
         rows_of_bilateral=bound.rows_of_bilateral,

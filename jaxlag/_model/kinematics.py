@@ -121,7 +121,10 @@ def substitute(system: System, coordinates: Callable) -> System:
         dissipation=pulled("dissipation", _PulledBack),
         force=pulled("force", _PulledForce),
         holonomic=pulled("holonomic", _PulledPosition),
-        unilateral={name: Contact(gap, dict(system.restitution)[name]) for name, gap in pulled("unilateral", _PulledPosition).items()},
+        unilateral={
+            name: Contact(gap, dict(system.restitution)[name], dict(system.laws)[name])
+            for name, gap in pulled("unilateral", _PulledPosition).items()
+        },
         nonholonomic=pulled("nonholonomic", _PulledBack),
         one_sided=system.one_sided,
         states={name: _pulled_state(state, coordinates) for name, state in system.states},

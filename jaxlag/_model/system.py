@@ -4,7 +4,7 @@ import dataclasses
 from collections.abc import Callable, Collection, Mapping
 from typing import Any
 
-from .contact import Contact
+from .contact import Contact, Newton, Poisson
 from .event import Event, events_of
 from .injection import check_function, needs
 from .pickling import picklable, unpickled
@@ -51,8 +51,8 @@ class System:
       `with_events(...)` gives the system with others.
 
     **Fields:** `lagrangian`, `dissipation`, `force`, `holonomic`, `unilateral` and `nonholonomic`, each a tuple of (name, function);
-    `restitution`, a tuple of (name, number or function); `one_sided`, a tuple of names; `states`, `events`, tuples of (name, state) and
-    (name, event).
+    `restitution` and `laws`, tuples of (name, number or function) and of (name, law); `one_sided`, a tuple of names; `states` and `events`,
+    tuples of (name, state) and of (name, event).
 
     Any consistent set of units. Functions may return plain numbers, integers or lists, which become floating arrays. A system is
     immutable, hashable and compared by its functions. Create it once: one created again from new functions is compiled again. What was
@@ -81,6 +81,7 @@ class System:
     unilateral: Terms
     nonholonomic: Terms
     restitution: tuple[tuple[str, Any], ...]
+    laws: tuple[tuple[str, Newton | Poisson], ...]
     one_sided: tuple[str, ...]
     states: Named
     events: tuple[tuple[str, Event], ...]
@@ -101,6 +102,7 @@ class System:
         contacts = _contacts(unilateral)
         gaps = {name: contact.gap for name, contact in contacts.items()}
         object.__setattr__(self, "restitution", tuple((name, contact.restitution) for name, contact in contacts.items()))
+        object.__setattr__(self, "laws", tuple((name, contact.law) for name, contact in contacts.items()))
         for slot, given in zip(SLOTS, (lagrangian, dissipation, force, holonomic, gaps, nonholonomic), strict=True):
             object.__setattr__(self, slot, _terms(slot, given))
         if not self.lagrangian:
@@ -141,7 +143,7 @@ class System:
     def __reduce__(self) -> Any:
         references = {slot: {name: picklable(f, role(slot, name)) for name, f in getattr(self, slot)} for slot in SLOTS}
         restitution = {name: picklable(e, f"`restitution` of {name!r}") if callable(e) else e for name, e in self.restitution}
-        return _unpickled, (references, self.one_sided, dict(self.states), restitution, dict(self.events))
+        return _unpickled, (references, self.one_sided, dict(self.states), restitution, dict(self.events), dict(self.laws))
 
     def __repr__(self) -> str:
         def listed(slot: str, terms: Terms) -> str:
@@ -163,9 +165,10 @@ class System:
         return (*(name for name, _ in (*self.dissipation, *self.force)), *self.constraints, EXPLICIT_TIME)
 
 
-def _unpickled(references: Any, one_sided: Any, states: Any = None, restitution: Any = None, events: Any = None) -> System:
+def _unpickled(references: Any, one_sided: Any, states: Any = None, restitution: Any = None, events: Any = None, laws: Any = ()) -> System:
     slots = {slot: {name: unpickled(f) for name, f in terms.items()} for slot, terms in references.items()}
-    contacts = {name: Contact(slots["unilateral"][name], unpickled(e)) for name, e in (restitution or {}).items()}
+    laws = dict(laws)
+    contacts = {name: Contact(slots["unilateral"][name], unpickled(e), laws.get(name, Newton())) for name, e in (restitution or {}).items()}
     return System(**slots | {"unilateral": contacts}, one_sided=one_sided, states=states, events=events)
 
 

@@ -118,10 +118,13 @@ def initialised(equations: EquationsOfMotion, at: StatesAt, params, scales: Scal
         (nearest.determined, RESULTS.no_inertia),
         (nearest.defined, RESULTS.undefined),
     )
-    if not equations.events:
-        return Initial(start.y, moved, conditions)
-    y, consistent = begun(equations, t0, start.y, Arguments(params, scales))
-    return Initial(y, moved, (*conditions, (consistent, RESULTS.no_friction)))
+    y = start.y
+    if equations.events:
+        y, consistent = begun(equations, t0, y, Arguments(params, scales))
+        conditions = (*conditions, (consistent, RESULTS.no_friction))
+    if equations.works:  # counted from behind an impact and events at the start
+        y = equations.parts(y)._replace(works=jnp.zeros(len(equations.works), y.dtype)).y
+    return Initial(y, moved, conditions)
 
 
 def with_status(ys, result, conditions, inputs) -> tuple[Array, RESULTS]:
