@@ -191,6 +191,7 @@ WINGS = {  # each imports only from those above it, and each file of a wing only
         "derivation",
         "coordinate_elimination",
         "symbol_tree",
+        "contact_laws",
         "symbolic_system",
         "operating_point",
         "linearisation",

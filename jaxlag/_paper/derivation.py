@@ -8,6 +8,17 @@ from .derivative import derivative
 from .simplify import Simplifier
 
 
+class ContactLaw(NamedTuple):
+    """A contact as formulas: symbols of its gap and of the rate of that, the gap, the symbol of its force, and the law of its impacts."""
+
+    gap: Symbol
+    rate: Symbol
+    formula: Expr
+    multiplier: Symbol
+    restitution: Expr
+    by_impulse: bool  # Poisson's law, not Newton's
+
+
 class SymbolicSystem(NamedTuple):
     """A system as formulas of its symbols."""
 
@@ -19,13 +30,14 @@ class SymbolicSystem(NamedTuple):
     L: Expr
     D: Expr
     Q: Matrix
-    g: Matrix
+    g: Matrix  # and the gaps of contacts, as if all were closed
     a: Matrix
     z: tuple[Symbol, ...] = ()  # states of first order
     zdot: tuple[Symbol, ...] = ()
     rates: tuple[Expr, ...] = ()  # of these
     u: tuple[Symbol, ...] = ()  # sampled states
     updates: tuple[Expr | None, ...] = ()  # of these; None where they have no formula
+    contacts: tuple[ContactLaw, ...] = ()
 
 
 class Steps(NamedTuple):
@@ -75,9 +87,10 @@ def equations_of_motion(s: SymbolicSystem, steps: Steps, simplify: Simplifier) -
 
 
 def residuals(s: SymbolicSystem, steps: Steps) -> list[Expr]:
-    """What is zero for the right q̈ and λ: M q̈ − f − Gᵀλ and G q̈ + γ."""
-    qddot = Matrix(len(s.qddot), 1, s.qddot)
-    return [*(steps.M * qddot - steps.f - steps.reaction), *(steps.G * qddot + steps.gamma)]
+    """What is zero for the right q̈ and λ: M q̈ − f − Gᵀλ and G q̈ + γ, but for contacts, which may be open."""
+    qddot, holonomic = Matrix(len(s.qddot), 1, s.qddot), len(s.g) - len(s.contacts)
+    rows = list(steps.G * qddot + steps.gamma)
+    return [*(steps.M * qddot - steps.f - steps.reaction), *rows[:holonomic], *rows[len(s.g) :]]
 
 
 def total_derivative(s: SymbolicSystem, formula: Expr) -> Expr:

@@ -8,6 +8,7 @@ from jaxtyping import PyTree
 
 from .._model.deprecation import warn_renamed
 from .._model.system import System
+from .._model.validation import without_contacts
 from .linearised_result import LinearisedEquations
 from .result import Details, Equations, arranged
 from .to_sympy import require_sympy
@@ -66,8 +67,8 @@ def equations(
       for a mapping of numbers. Symbols have the names of the entries: `Theta_s` is Θₛ, the velocity of `phi` is φ̇; entries of arrays are
       counted from 1. All symbols are real.
     - `multipliers`: `False` expresses coordinates by others where holonomic constraints are linear in them, and finds the multipliers
-      of these constraints afterwards (Lagrange's equations of the second kind); `True` keeps all coordinates and all multipliers (of the
-      first kind).
+      of these constraints afterwards (Lagrange's equations of the second kind); `True`, and wherever there are contacts, keeps all
+      coordinates and all multipliers (of the first kind).
     - `positive`: names of parameters, coordinates or multipliers to be taken as positive, so that √(l²) is l.
     - `linearised_at`: an equilibrium, as a tree like q of numbers, text or SymPy expressions, e.g. `{"phi": 0, "y": "l - m*g/c"}`; or a
       pair (q, q̇), a steady motion at these constant rates. In a mapping, coordinates may be left out: constraints determine them, or they
@@ -75,6 +76,7 @@ def equations(
     - `inputs`: with `linearised_at`, names of parameters u that change with time; their deviations stand on the right-hand side.
     - `style`: the old spelling of `multipliers`: `"first kind"` is `True`, `"second kind"` is `False`.
 
+    Contacts follow the equations of motion: g ≥ 0, λ ≥ 0, g λ = 0, and ġ⁺ = −e ġ⁻ in an impact; q̈ and other λ are given by theirs.
     States beside q follow the equations of motion: ż = rate, and u⁺ = update of a sampled one where that has a formula.
 
     **Returns:** `Equations`, whose multipliers have the sign of M q̈ = f + Gᵀλ. With `linearised_at`, `LinearisedEquations`:
@@ -127,7 +129,9 @@ def equations(
     if linearised_at is not None:
         from .linearised import linearised
 
+        without_contacts(system, "`equations` with `linearised_at`")
         return linearised(system, full, steps, linearised_at, inputs, parameters, coordinates, constants, states)
+    multipliers = multipliers or bool(full.contacts)
     eliminated = {} if multipliers else eliminate_coordinates(full, simplify)
     reduced, reduced_steps, qddot, reactions = reduce_system(full, steps, eliminated, simplify)
     details = Details(
@@ -141,16 +145,20 @@ def equations(
         paths=constants.paths,
         simplify=simplify,
         notation=Notation(full, parameters),
+        contacts=full.contacts,
     )
+    holonomic = reduced.g[: len(reduced.g) - len(full.contacts), :]
     return Equations(
         with_multipliers=multipliers,
-        **{name: getattr(reduced, name) for name in ("t", "q", "qdot", "qddot", "L", "D", "Q", "g", "a")},
+        **{name: getattr(reduced, name) for name in ("t", "q", "qdot", "qddot", "L", "D", "Q", "a")},
+        g=holonomic,
         **{name: getattr(reduced_steps, name) for name in ("M", "f", "G", "gamma")},
         params=jax.tree.map(lambda symbols: arranged(symbols.shape, iter(symbols.flat)), constants.symbols),
         motion=derivation.equations_of_motion(reduced, reduced_steps, simplify),
         rates=dict(zip(reduced.zdot, map(simplify, reduced.rates), strict=True)),
         updates={u: formula and simplify(formula) for u, formula in zip(reduced.u, reduced.updates, strict=True)},
         eliminated=eliminated,
+        contacts={name: contact.formula for (name, _), contact in zip(system.unilateral, full.contacts, strict=True)},
         _details=details,
     )
 

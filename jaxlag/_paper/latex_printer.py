@@ -62,6 +62,10 @@ class Latex(Textbook, LatexPrinter):
         """u^{+}."""
         return f"{self._print(symbol)}^{{+}}"
 
+    def before(self, symbol: Symbol) -> str:
+        """u^{-}."""
+        return f"{self._print(symbol)}^{{-}}"
+
     def partial(self, name: str, symbol: Symbol) -> str:
         r"""\partial L / \partial \dot\varphi."""
         return rf"\frac{{\partial {name}}}{{\partial {self._print(symbol)}}}"

@@ -18,7 +18,8 @@ class Notation:
         kinds = tuple(parameters), s.multipliers, (s.t, *s.q, *s.z, *s.u), (*s.qdot, *s.zdot), s.qddot
         self.kind = {symbol: kind for kind, symbols in enumerate(kinds) for symbol in symbols}
         self.place = {symbol: i for i, symbol in enumerate(self.kind)}
-        derived = (1, s.q, s.qdot), (2, s.q, s.qddot), (1, s.z, s.zdot)
+        gaps, rates = ([getattr(contact, name) for contact in s.contacts] for name in ("gap", "rate"))
+        derived = (1, s.q, s.qdot), (2, s.q, s.qddot), (1, s.z, s.zdot), (1, gaps, rates)
         self.dotted = {y: (x.name, dots) for dots, xs, ys in derived for x, y in zip(xs, ys, strict=True)}
         self.deviations: frozenset[Symbol] = frozenset()  # symbols of names such as δphi, which are written δφ
 

@@ -16,7 +16,7 @@ from .._program.expressions import filled
 
 MOST_OPERATIONS = 150  # of a solution that is still shown
 
-Section = list[tuple[str, str]]  # left and right sides
+Section = list[tuple[str, ...]]  # left and right sides, and the relation between them where it is not equality
 
 
 @dataclasses.dataclass(frozen=True, eq=False, repr=False)
@@ -37,6 +37,7 @@ class Equations:
     - `rates`: the rates of the states of first order, by the symbol of ż; `updates`: those of the sampled states, by the symbol of u, None
       where an update has no formula.
     - `eliminated`: the coordinates that constraints express by the remaining ones, and their formulas.
+    - `contacts`: the gaps of contacts, by name; their rows of G stand behind those of g, as if all were closed.
 
     ```python
     import jaxlag as jl
@@ -66,6 +67,7 @@ class Equations:
     rates: dict
     updates: dict
     eliminated: dict
+    contacts: dict
     _details: "Details"
 
     @property
@@ -129,19 +131,28 @@ class Equations:
     def _program(self) -> Any:
         from .codegen import Program
 
+        if self.contacts:
+            raise ValueError(
+                "a program must be of a system without contacts that open and close, but there are some. State those that stay closed as "
+                "`holonomic`."
+            )
         if self.rates or self.updates:
             raise ValueError("a program must be of a system without states beside q, but there are some. Write them as parameters.")
         details = self._details
         return Program(self.t, self.q, self.qdot, self.qddot, details.paths, details.multipliers, details.residuals, details.solution)
 
     def _sections(self, printer: Any) -> Iterator[Section]:
-        """Eliminated coordinates; equations of motion and constraints; where there are multipliers, the solution for q̈ and λ."""
+        """Eliminated coordinates; equations of motion and constraints; laws of contact; where there are multipliers, the solution."""
+        from .contact_laws import contact_lines
+
         details = self._details
         equal = lambda left, right: (printer.doprint(left), printer.doprint(right))
         yield [equal(x, formula) for x, formula in self.eliminated.items()]
         yield [*(equal(e.lhs, e.rhs) for e in self.motion), *((printer.doprint(residual), "0") for residual in (*self.g, *self.a))]
         updated = [(printer.after(u), printer.doprint(formula)) for u, formula in self.updates.items() if formula is not None]
         yield [*(equal(v, formula) for v, formula in self.rates.items()), *updated]
+        for contact in details.contacts:
+            yield list(contact_lines(contact, printer))
         if details.multipliers:
             solution = [(x, details.solution[x]) for x in (*self.qddot, *details.multipliers) if x in details.solution]
             yield [equal(x, formula) for x, formula in solution if formula.count_ops() < MOST_OPERATIONS]
@@ -161,13 +172,15 @@ class Details:
     paths: list  # each parameter's symbol and how Python reaches it
     simplify: Any  # `simplify.Simplifier`
     notation: Any  # `notation.Notation`
+    contacts: tuple = ()  # of `derivation.ContactLaw`
 
     @functools.cached_property
     def solution(self) -> dict:
         """Formulas of q̈ and λ, where they are short enough to read."""
         from .linear_solve import solve_linear
 
-        return solve_linear(self.residuals, (*self.free, *self.multipliers), self.simplify)
+        given = {contact.multiplier for contact in self.contacts}
+        return solve_linear(self.residuals, (*self.free, *(x for x in self.multipliers if x not in given)), self.simplify)
 
 
 class Derivation:
@@ -224,10 +237,13 @@ def arranged(shape: tuple, formulas: Iterable) -> Any:
 
 def lines(sections: Iterable[Section]) -> str:
     """Sections as text, with an empty line between them."""
-    return "\n\n".join("\n".join(f"{left} = {right}" for left, right in section) for section in sections if section)
+    said = lambda left, right, relation="=": f"{left} {relation} {right}"
+    return "\n\n".join("\n".join(said(*line) for line in section) for section in sections if section)
 
 
 def aligned(sections: Iterable[Section]) -> str:
     """Sections as an `aligned` environment of LaTeX."""
-    rows = [f"{left} &= {right}" for section in sections for left, right in section]
+    signs = {"=": "=", "≥": r"\ge"}
+    said = lambda left, right, relation="=": f"{left} &{signs[relation]} {right}"
+    rows = [said(*line) for section in sections for line in section]
     return "\\begin{aligned}\n" + " \\\\\n".join(rows) + "\n\\end{aligned}"

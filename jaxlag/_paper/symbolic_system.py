@@ -12,13 +12,15 @@ import sympy
 from jaxtyping import PyTree
 from sympy import Matrix, Symbol
 
+from .._mechanics.contact import in_contact
 from .._mechanics.lagrange import applied_force, constraint_rows, inertia
 from .._model.flat import Flat, StatesAt, bind, rows_by_name
 from .._model.state_values import of_first_order, ravelled, sampled, start_values
 from .._model.system import System
-from .._model.validation import check, coordinates, parameters, without_contacts
+from .._model.validation import check, coordinates, parameters
 from .._program.expressions import Algebra, filled
 from .._program.interpreter import evaluate
+from .contact_laws import contact_laws
 from .derivation import Steps, SymbolicSystem
 from .formulas import formulas
 from .symbol_tree import SymbolTree, symbol_tree
@@ -56,7 +58,6 @@ def trace_system(
     system: System, q: SymbolTree, params: SymbolTree, states: States, positive: Collection[str]
 ) -> tuple[SymbolicSystem, dict[str, PyTree]]:
     """L, D, Q, g, a and what drives the states of a system as formulas, and the indices of each constraint's multipliers."""
-    without_contacts(system, "`equations`")
     like = coordinates(q.example, "q")
     values = parameters(params.example, like)
     check(system, jnp.zeros((), jax.tree.leaves(like)[0].dtype), like, like, values, states.tree.numbers)
@@ -90,14 +91,17 @@ def trace_system(
         updated = tuple(formulas(updates, *state, params.symbols, states.tree.symbols))
     except NotImplementedError:  # measured inputs and other programs of controllers, on which the mechanics does not depend
         updated = (None,) * len(states.u)
-    drawn = dict(z=states.z, zdot=states.zdot, rates=tuple(rates), u=states.u, updates=updated)
+    holonomic = flat.rows_of_bilateral
+    contacts = contact_laws(system, list(g[holonomic:]), multipliers[holonomic : len(g)], params)
+    drawn = dict(contacts=contacts, z=states.z, zdot=states.zdot, rates=tuple(rates), u=states.u, updates=updated)
     symbols = t, tuple(x), tuple(v), tuple(a), tuple(multipliers)
     return SymbolicSystem(*symbols, L[()], D[()], Q, g, nonholonomic, **drawn), multiplier_rows
 
 
 def bound(system: System, like: PyTree, numbers: PyTree, params: SymbolTree, at: StatesAt) -> Flat:
-    """The system over flat vectors, with numbers for the symbols of its parameters."""
-    return bind(system, jax.tree.map(lambda leaf: jnp.zeros(leaf.shape), like), eqx.combine(numbers, params.rest), at)
+    """The system over flat vectors, with numbers for the symbols of its parameters, and all contacts closed."""
+    flat = bind(system, jax.tree.map(lambda leaf: jnp.zeros(leaf.shape), like), eqx.combine(numbers, params.rest), at)
+    return in_contact(flat, jnp.ones(len(flat.contacts), bool))
 
 
 def _multiplier_names(rows: dict[str, np.ndarray]) -> list[str]:

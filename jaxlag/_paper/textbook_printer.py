@@ -54,7 +54,11 @@ class Textbook(Printer):
         raise NotImplementedError
 
     def after(self, symbol: Symbol) -> str:
-        """A sampled state after its update, u⁺."""
+        """A sampled state after its update, or a rate after an impact, u⁺."""
+        raise NotImplementedError
+
+    def before(self, symbol: Symbol) -> str:
+        """A rate before an impact, ġ⁻."""
         raise NotImplementedError
 
     def _print_Symbol(self, symbol: Symbol, style: Any = None) -> str:

@@ -85,6 +85,10 @@ class Unicode(Textbook, StrPrinter):
         """u⁺."""
         return f"{self._print(symbol)}⁺"
 
+    def before(self, symbol: Symbol) -> str:
+        """u⁻."""
+        return f"{self._print(symbol)}⁻"
+
     def partial(self, name: str, symbol: Symbol) -> str:
         """∂L/∂φ̇."""
         return f"∂{name}/∂{self._print(symbol)}"

@@ -333,7 +333,7 @@ NOTEBOOK_SYSTEMS = {  # by notebook and name: its coordinates
     "14_damping_that_destabilises.column": {"phi1", "phi2"},
 }
 RECORDED = {"11_driven_pendulum.pendulum"}  # driven by a recorded `Signal`, which has no formula
-WITH_CONTACTS = {f"15_bouncing_rocking_pecking.{name}" for name in ("ball", "block", "woodpecker")}  # which `equations` refuses
+WITH_CONTACTS = {f"15_bouncing_rocking_pecking.{name}" for name in ("ball", "block", "woodpecker")}  # `test_contact_equations`
 FROM_EXAMPLES = {"13_bicycle"}  # defines no system of its own
 SOLVED_BY_NUMBERS = {"05_closed_loops.four_bar", "05_closed_loops.platform"}  # for their formulas one would wait for minutes
 

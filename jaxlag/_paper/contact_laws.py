@@ -1,0 +1,46 @@
+"""Contacts on paper: the complementarity of gap and force, and the law of impacts."""
+
+from collections.abc import Iterator
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+from sympy import Symbol
+
+from .._model.contact import Poisson
+from .._model.injection import call
+from .._model.system import System
+from .._program.expressions import filled
+from .derivation import ContactLaw
+from .formulas import formulas
+from .symbol_tree import SymbolTree
+
+
+def contact_laws(system: System, gaps: list[Any], multipliers: list[Symbol], params: SymbolTree) -> tuple[ContactLaw, ...]:
+    """Those of a system, with its gaps as formulas and the symbols of its contact forces."""
+    found = []
+    for (name, given), (_, law), formula, multiplier in zip(system.restitution, system.laws, gaps, multipliers, strict=True):
+        gap, rate = (Symbol(f"{letter}_{name}", real=True) for letter in ("g", "gdot"))
+
+        def restitution(speed, numbers, given=given, name=name):
+            values = eqx.combine(numbers, params.rest)
+            return jnp.asarray(call(given, f"`restitution` of {name!r}", values, speed=speed) if callable(given) else given, float)
+
+        e = formulas(restitution, filled((), [-rate]), params.symbols)[()]
+        found.append(ContactLaw(gap, rate, formula, multiplier, e, isinstance(law, Poisson)))
+    return tuple(found)
+
+
+def contact_lines(contact: ContactLaw, printer: Any) -> Iterator[tuple[str, ...]]:
+    """Left and right sides and the relation between them: g ≥ 0, λ ≥ 0, g λ = 0; and ġ⁺ = −e ġ⁻ in an impact, or Λ⁺ = e Λ⁻ of the impulses
+    of expansion and compression.
+    """
+    text, e = printer.doprint, contact.restitution
+    yield text(contact.gap), text(contact.formula)
+    yield text(contact.gap), "0", "≥"
+    yield text(contact.multiplier), "0", "≥"
+    yield f"{text(contact.gap)} {text(contact.multiplier)}", "0"
+    impulse = Symbol(contact.multiplier.name.replace("lambda", "Lambda"), real=True)
+    symbol, factor = (impulse, e) if contact.by_impulse else (contact.rate, -e)
+    shown = f"({text(factor)}) " if e.is_Add else f"{text(factor)} " if e != 1 else text(factor).rstrip("1")
+    yield printer.after(symbol), "0" if e == 0 else shown + printer.before(symbol)
