@@ -125,11 +125,11 @@ def ends(modes):
             yield event(lambda t, y, i=i, mode=mode: mode * (W_T[:, i] @ y[3:]))
 
 
-def simulated(until, ts):
+def simulated(until, ts, start=START):
     """The states at some times; of each impact the time, the contacts that were struck, u behind it and its normal impulses; and the
     times and modes in between.
     """
-    t, (q, u), modes = 0.0, START, None
+    t, (q, u), modes = 0.0, start, None
     states, impacts, course = [], [], []
     while t < until:
         gaps = W_N.T @ q + G0

@@ -93,3 +93,26 @@ def test_the_woodpecker_against_events():
         np.testing.assert_allclose(contact.impulse[behind], np.cumsum([impulses[i] for *_, impulses in impacts]), rtol=1e-9, atol=1e-15)
     bearing = np.array([next(modes for since, modes in reversed(course) if since <= t)[1] for t in ts])
     np.testing.assert_array_equal(motion.contacts["lower"].closed, bearing != by_hand.OPEN)
+
+
+@pytest.mark.slow
+def test_the_cycle_of_the_woodpecker():
+    """Its period, how far it falls in it, and what is left of a deviation after it (a Floquet multiplier): it is stable."""
+    turns = jl.Event(lambda qdot: qdot[2], direction=jl.Rising())  # of the bird
+    orbit = jl.periodic(woodpecker, *by_hand.START, section=turns, longest=0.6, cyclic=["q[0]"])
+    near = orbit.period + np.linspace(-2e-4, 2e-4, 9)
+
+    def returned(deviation):
+        """The state by hand where the bird turns again."""
+        start = np.asarray(orbit.q) + np.array([0, 0, deviation]), np.asarray(orbit.qdot)
+        states = np.asarray(by_hand.simulated(near[-1], near, start)[0])
+        when = np.polyfit(states[:, 5], near - orbit.period, 5)[-1]
+        return when, [np.polyfit(near - orbit.period, states[:, i], 5) @ when ** np.arange(5, -1, -1) for i in range(3)]
+
+    (when, there), (_, above), (_, below) = (returned(d) for d in (0.0, 1e-5, -1e-5))
+    np.testing.assert_allclose(when, 0, atol=1e-9)
+    np.testing.assert_allclose(there, orbit.q + orbit.drift, atol=1e-8)
+    np.testing.assert_allclose(orbit.multipliers[0], (above[2] - below[2]) / 2e-5, rtol=1e-4)
+    np.testing.assert_allclose(orbit.multipliers[1:], 0, atol=1e-6)
+    np.testing.assert_allclose([orbit.period, orbit.drift[0]], [0.146, -19.5e-3], rtol=4e-3)  # Glocker's digits
+    assert orbit.is_stable
