@@ -27,7 +27,8 @@ from .axes import (
 def forces(trajectory: Trajectory, names: Sequence[str] | None = None, *, units: Units = None, axes: Any = None) -> Any:
     r"""The multipliers λ over time, one panel for each constraint, with a ring wherever one changes sign.
 
-    For a constraint that is `one_sided` in `System`, the times at which it would have to pull are shaded.
+    For a constraint that is `one_sided` in `System`, the times at which it would have to pull are shaded; for a contact those at which it
+    is closed, and impulses of its impacts stand as stems on an axis of their own, on the right.
 
     $$ M\ddot q = f + G^T\lambda $$
 
@@ -38,7 +39,7 @@ def forces(trajectory: Trajectory, names: Sequence[str] | None = None, *, units:
 
     - `trajectory`: one motion, as `simulate` returns it.
     - `names`: the constraints to draw, in this order. Default: all.
-    - `units`: units by name of constraint, and of `"t"`, written on the axes, e.g. `{"t": "s", "rod": "N"}`.
+    - `units`: units by name of constraint, and of `"t"`, written on the axes, e.g. `{"t": "s", "rod": "N"}`; those of impulses follow.
     - `axes`: matplotlib axes to draw in, as many as there are constraints. Default: a new figure with a common time axis.
 
     **Returns:** the axes, an array of shape (constraints,).
@@ -75,7 +76,8 @@ def forces(trajectory: Trajectory, names: Sequence[str] | None = None, *, units:
         crossings = np.concatenate([_sign_changes(np.asarray(trajectory.ts), samples) for samples in entries.values()])
         if crossings.size:
             ax.plot(crossings, 0 * crossings, "o", markerfacecolor="white", markeredgecolor="black", label="λ changes sign")
-        if crossings.size or pulled:
+        touches = name in trajectory.contacts and _contact(ax, trajectory, name, units)
+        if crossings.size or pulled or touches:
             if len(entries) == 1:
                 ax.lines[0].set_label(None)
                 legend_above(ax)
@@ -139,6 +141,26 @@ def friction(trajectory: Trajectory, names: Sequence[str] | None = None, *, unit
         if has_several or intervals:
             legend_above(upper)
     return drawn
+
+
+def _contact(ax, trajectory, name, units):
+    """Shades the times at which a contact is closed and draws the impulses of its impacts; whether there are any."""
+    ts, contact = np.asarray(trajectory.ts), trajectory.contacts[name]
+    closed = _intervals(ts, contact.closed)
+    for i, interval in enumerate(closed):
+        ax.axvspan(*interval, color=GREY, alpha=0.35, linewidth=0, label=None if i else "closed")
+    impulses, changed = np.diff(contact.impulse), np.asarray(contact.changed)[1:]
+    struck = impulses > 0
+    times = np.where((changed > ts[:-1]) & (changed <= ts[1:]), changed, ts[1:])[struck]
+    if times.size:
+        (low, high), top, right = ax.get_ylim(), 1.1 * np.max(impulses[struck]), ax.twinx()
+        right.vlines(times, 0, impulses[struck], color=COLOURS[1])
+        right.plot(times, impulses[struck], "o", markersize=4, color=COLOURS[1])
+        ax.plot([], [], "-o", markersize=4, color=COLOURS[1], label="impulse")
+        right.set_ylim(top * min(low / high, 0) if high > 0 else 0, top)
+        unit, time = (units or {}).get(name), (units or {}).get("t")
+        right.set_ylabel(label(f"Λ {name}", {f"Λ {name}": f"{unit} {time}"} if unit and time else None))
+    return bool(closed) or bool(times.size)
 
 
 def _sign_changes(ts, samples):

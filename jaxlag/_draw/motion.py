@@ -31,7 +31,8 @@ def motion(trajectory: Trajectory, names: Sequence[str] | None = None, *, units:
 
     $$ q_i(t), \qquad i = 1 \dots n $$
 
-    A coordinate that is an array has one line for each entry, `r[0]`, `r[1]`, …. Samples that were not reached are omitted.
+    A coordinate that is an array has one line for each entry, `r[0]`, `r[1]`, …. Samples that were not reached are omitted. Dotted lines
+    stand at the times of events.
 
     **Arguments:**
 
@@ -60,6 +61,12 @@ def motion(trajectory: Trajectory, names: Sequence[str] | None = None, *, units:
     """
     shown = channels(one_motion(trajectory).q, "q") | channels(trajectory.states, "states")
     drawn, _ = over_time(trajectory, shown, names, "coordinate", units, axes)
+    for ax in drawn:
+        for i, (name, event) in enumerate(trajectory.events.items()):
+            for j, time in enumerate(np.asarray(event.ts)[np.isfinite(event.ts)]):
+                ax.axvline(time, color=colour(i + 1), linewidth=0.8, linestyle=":", label=None if j or ax is not drawn[0] else name)
+    if np.size(drawn) and any(np.isfinite(event.ts).any() for event in trajectory.events.values()):
+        legend_above(drawn[0])
     return drawn
 
 

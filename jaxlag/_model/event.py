@@ -93,7 +93,7 @@ class Event:
     then: Callable | None = None
     stop: bool = False
     direction: Falling | Rising | Either | Negative = Either()
-    most: int = 16
+    most: int = 100
 
     def __post_init__(self):
         if callable(self.when):
@@ -112,7 +112,7 @@ class Event:
             )
         if not isinstance(self.stop, (bool, np.bool_)):
             raise TypeError(f"`stop` must be True or False, but is {self.stop!r}. Take one of these.")
-        count(self.most, "`most`", least=1, cure="The default is 16.")
+        count(self.most, "`most`", least=1, cure="The default is 100.")
 
     def __reduce__(self) -> Any:
         of = lambda x, label: picklable(x, label) if callable(x) else x

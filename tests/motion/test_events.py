@@ -29,7 +29,7 @@ def test_turning_points_are_counted(direction, first):
     expected = every[first::2] if first is not None else every
     turn = motion.events["turn"]
     np.testing.assert_allclose(turn.ts[: len(expected)], expected, rtol=1e-10)
-    assert np.all(np.isnan(turn.ts[len(expected) :])) and turn.ts.shape == (16,)
+    assert np.all(np.isnan(turn.ts[len(expected) :])) and turn.ts.shape == (100,)
     np.testing.assert_allclose(turn.q[: len(expected)], np.sin(2 * expected) / 2, atol=1e-10)
     np.testing.assert_array_equal(turn.count, np.searchsorted(expected, TIMES))
 

@@ -56,7 +56,7 @@ g_wall λ_wall = 0
 @pytest.mark.parametrize(
     ("restitution", "said"),
     [(0.0, "ġ_stop⁺ = 0"), (1.0, "ġ_stop⁺ = −ġ_stop⁻"), (0.25, "ġ_stop⁺ = −¼ ġ_stop⁻"), (lambda a, b: a + b, "ġ_stop⁺ = (−a − b) ġ_stop⁻")],
-    ids=str,
+    ids=["none", "all", "a quarter", "a sum"],
 )
 def test_restitution(restitution, said):
     mass = jl.System(lambda q, qdot, m: 0.5 * m * qdot**2, unilateral={"stop": jl.Contact(lambda q, l: l - q, restitution)})
