@@ -68,11 +68,12 @@ class Event:
     - `direction`: `Falling()`, `Rising()`, `Either()`, the default, or `Negative()`, as `Falling()` and at the start, too.
     - `most`: how many are recorded; one more ends the motion with that reason.
 
-    The time is located to rounding, and differentiated exactly, as is what `then` returns, which is put on the constraints. A sample at
-    the time of an event shows the state behind it. Where an impact, an input that jumps or another event takes w to the other side of
-    zero, the event happens, too, but none twice at one time. Where several happen at once, those stated first come first. To
-    `equilibrium`, `linearise`, `examine` and `equations` a system is what it is without events. Any consistent units. A system takes
-    events by name: `System(..., events={"latch": Event(...)})`; a motion, too: `simulate(..., events=...)`.
+    The time is located to rounding, and differentiated exactly, as is what `then` returns, which is put on the constraints and outside of
+    obstacles. A sample at the very time of an event shows the state before or behind it, as rounding has it. Where an impact, an input
+    that jumps or another event takes w to the other side of zero, the event happens, too, but none twice at one time. Where several
+    happen at once, those stated first come first. To `equilibrium`, `linearise`, `examine` and `equations` a system is what it is without
+    events. Any consistent units. A system takes events by name: `System(..., events={"latch": Event(...)})`; a motion, too:
+    `simulate(..., events=...)`.
 
     **Raises:** `TypeError` or `ValueError` where these are not such functions, times and numbers.
 

@@ -5,14 +5,16 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from .._mechanics.contact import gap_rates, gap_scales, outside
 from .._mechanics.projection import nearest_state
 from .._model.event import Negative
+from .._model.flat import Flat
 from .._model.state_values import ravelled
 from .._program.jit import jitted
 from .first_order import EquationsOfMotion
 from .jumps import after_jump
 from .mode_changes import Change, changed
-from .protocol import Arguments
+from .protocol import Arguments, Scales
 from .state_vector import Parts
 from .witnesses import matching, sides
 
@@ -77,7 +79,7 @@ def _settled(equations: EquationsOfMotion, t, seen, y, args: Arguments, passed: 
         move = (lambda: _moved(equations, t, parts, args, happens)) if changing.any() else unmoved
         moves = jnp.any(happens & changing)
         y, fine = jax.lax.cond(moves, move, unmoved)
-        return y, consistent & fine, jnp.zeros_like(passed), done, moves
+        return y, consistent & fine, _struck(equations, parts.y, y), done, moves
 
     before = equations.parts(seen)
     there = jnp.concatenate([t[None], before.q, before.v, before.z, before.u])
@@ -107,6 +109,16 @@ def _moved(equations: EquationsOfMotion, t, parts: Parts, args: Arguments, happe
         new = jax.tree.map(lambda x, old, i=i: jnp.where(happens[i], x, old), changed, new)
     if equations.system.constraints:
         there, _, _ = equations.mode(t, new, args)
-        nearest = nearest_state(there._replace(holonomic=there.bilateral), t, new.q, new.v)
-        new = new._replace(q=nearest.q, v=nearest.v)
+        q = outside(there, t, new.q, new.v)
+        nearest = nearest_state(there._replace(holonomic=there.bilateral), t, q, new.v)
+        new = new._replace(q=nearest.q, v=nearest.v, closed=_still_closed(there, t, nearest.q, nearest.v, new.closed, args.scales))
     return after_jump(equations, t, parts.y, new.y, args, args)
+
+
+def _still_closed(flat: Flat, t, q, v, closed, scales: Scales | None):
+    """Which contacts are still closed where q̇ has changed: not those that it opens, or that it makes strike."""
+    if not flat.contacts:
+        return closed
+    assert scales is not None  # contacts are located
+    resting = jnp.abs(gap_rates(flat, t, q, v)) <= gap_scales(flat, t, q, v, scales.error(q), scales.error(v)).rate
+    return jnp.where(resting, closed, 0)

@@ -179,6 +179,35 @@ def test_friction_and_events(mu):
     assert np.max(np.abs(motion.balance())) < 1e-9
 
 
+pushed = jl.System(
+    weight,
+    unilateral={"floor": jl.Contact(height, 0.5)},
+    events={"push": jl.Event([0.5], lambda: {"qdot": -1.0}), "click": jl.Event("floor")},
+)
+
+
+def test_an_event_that_makes_an_impact():
+    """What lies on the floor is pushed into it: it leaves with half the speed, and the impact is an event, too."""
+    motion = jl.simulate(pushed, 0.0, 0.0, jnp.array([0.0, 0.45, 0.55]))
+    for name in ("push", "click"):
+        np.testing.assert_allclose(motion.events[name].ts[:2], [0.5, np.nan], rtol=1e-14)
+    np.testing.assert_allclose(motion.qdot[1:], [0.0, 0.5 - 0.05 * G], atol=1e-12)
+    np.testing.assert_allclose(motion.events["click"].qdot[0], 0.0, atol=1e-12)  # before all that happens there
+
+
+@pytest.mark.usefixtures("single_precision")
+@pytest.mark.filterwarnings("ignore:jaxlag runs in single precision")
+def test_single_precision_under_vmap():
+    """The second turning point of an oscillator, 3π/(2ω) after it has passed through zero, and its derivative."""
+    swing = jl.System(lambda q, qdot, c: 0.5 * qdot**2 - 0.5 * c * q**2, events={"turn": jl.Event(rising)})
+    second = lambda c: jl.simulate(swing, 0.0, 1.0, jnp.linspace(0, 10, 11), {"c": c}).events["turn"].ts[1]
+    c = jnp.array([1.0, 4.0, 9.0])
+    found, slope = jax.jit(jax.vmap(jax.value_and_grad(second)))(c)
+    assert found.dtype == jnp.float32
+    np.testing.assert_allclose(found, 1.5 * np.pi / np.sqrt(c), rtol=1e-4)
+    np.testing.assert_allclose(slope, -0.75 * np.pi / np.asarray(c) ** 1.5, rtol=1e-3)
+
+
 def test_clear_errors():
     for make, said in (
         (lambda: jl.Every(0.0), "`period` must be positive"),
