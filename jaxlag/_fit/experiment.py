@@ -92,10 +92,10 @@ class Experiment(eqx.Module):
         dtype = jax.tree.leaves(self.q0)[0].dtype
         self.ts = sample_times(ts, dtype)
         values = _measured(values, self.ts, dtype)
-        self.observe = Coordinates.named_by(values, self.q0) if observe is None else observe
         self.values = _with_events(values, events, self.ts, dtype)
         self.events = tuple(events or ())
         self.sigma = None if sigma is None else _deviations(sigma, self.values)
+        self.observe = Coordinates.named_by(values, self.q0) if observe is None else observe
         if params is not None and not isinstance(params, Mapping):
             raise TypeError(f"`params` of an experiment must be a mapping, but is a {type(params).__name__}. Name its entries in a dict.")
         self.params = dict(parameters(params or {}, self.q0))

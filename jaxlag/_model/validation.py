@@ -79,7 +79,7 @@ def _parameters(params, dtype, name):
 
 
 def _parameter(leaf, dtype, label):
-    if isinstance(leaf, (int, float)) and not isinstance(leaf, bool):
+    if isinstance(leaf, (int, float)) and type(leaf) is not bool:
         return np.asarray(leaf, dtype)
     if type(leaf) is np.ndarray and leaf.dtype == dtype:  # the common one
         return np.array(leaf)

@@ -8,7 +8,7 @@ import jax
 import numpy as np
 from jaxtyping import PyTree
 
-from .._model.signal import is_signal
+from .._model.signal import Signal, is_signal
 from .._program.jit import is_called_by_python, is_concrete, jitted
 from .moments import with_counts
 from .provenance import Provenance
@@ -36,7 +36,7 @@ def padded_signals(params: PyTree) -> PyTree:
             return node
         return eqx.tree_at(lambda signal: (signal.ts, signal.values), node, (_padded(node.ts), _padded(node.values)))
 
-    has_signals = any(map(is_signal, jax.tree.leaves(params, is_leaf=is_signal)))
+    has_signals = any(issubclass(kind, Signal) for kind in {*map(type, jax.tree.leaves(params, is_leaf=is_signal))})
     return jax.tree.map(longer, params, is_leaf=is_signal) if has_signals and is_called_by_python() else params
 
 
