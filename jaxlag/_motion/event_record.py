@@ -12,7 +12,7 @@ from .first_order import EquationsOfMotion
 
 def most(equations: EquationsOfMotion) -> np.ndarray:
     """How many of each event are recorded."""
-    return np.array([event.most for _, event in equations.system.events], int)
+    return np.array([event.most for _, event in equations.system.events] if equations.events else [], int)
 
 
 def with_events(equations: EquationsOfMotion, write: Callable, saved, samples: int, before: Float[Array, " y"] | None, y, number: Callable):
@@ -20,6 +20,8 @@ def with_events(equations: EquationsOfMotion, write: Callable, saved, samples: i
 
     `number(y)` is y without its variations.
     """
+    if not equations.events:
+        return saved
     now = equations.parts(number(y)).happened
     earlier = jnp.zeros_like(now) if before is None else equations.parts(before).happened
     start = samples
@@ -44,7 +46,7 @@ def records(equations: EquationsOfMotion, rows: Float[Array, "r y"]) -> dict[str
 
 def has_stopped(equations: EquationsOfMotion, y) -> Bool[Array, ""]:
     """Whether an event has ended the motion."""
-    return jnp.any(equations.parts(y).stopped > 0)
+    return jnp.any(equations.parts(y).stopped > 0) if equations.events else jnp.array(False)
 
 
 def overflows(equations: EquationsOfMotion, y) -> Bool[Array, ""]:

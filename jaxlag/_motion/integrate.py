@@ -22,7 +22,7 @@ from .._model.signal import broken_signals, moves_smoothly
 from .._program.single_kernel import in_one_kernel
 from .events import begun
 from .first_order import EquationsOfMotion, Formulation
-from .interval_loop import integrated
+from .interval_loop import integrated, varied_along
 from .mode_changes import started
 from .progress import Bar
 from .protocol import Arguments, FirstOrderSystem, Scales
@@ -141,10 +141,13 @@ def with_status(ys, result, conditions, inputs) -> tuple[Array, RESULTS]:
 def states_at(
     equations: FirstOrderSystem, options: SolverOptions, adjoint: dfx.AbstractAdjoint, t0, y0, ts, args: Arguments, tolerances
 ) -> tuple[Array, RESULTS, dict]:
-    """States at the samples, by diffrax, the reason it stopped, and, among the counts, the `last` time and state that it reached."""
-    if has_nodes(equations, args.params):
-        reverse = not isinstance(adjoint, dfx.ForwardMode)
-        return on_nodes(equations, options, y0, (args.params, t0), args.scales, ts, tolerances, reverse=reverse)
+    """States at the samples, the reason it stopped, and, among the counts, the `last` time and state that it reached.
+
+    By diffrax's own loop what has no nodes and is differentiated in reverse mode, or by an adjoint that the user has chosen, or is a batch.
+    """
+    reverse, single = not isinstance(adjoint, dfx.ForwardMode), options.adjoint is None and args.own is None
+    if has_nodes(equations, args.params) or (single and not reverse):
+        return on_nodes(equations, options, t0, y0, ts, args, tolerances, reverse=reverse)
     rtol, atol = tolerances
     rounding = jnp.finfo(y0.dtype).eps * jnp.maximum(jnp.abs(ts[0]), jnp.abs(ts[-1]))
     alone = in_one_kernel if isinstance(adjoint, dfx.ForwardMode) else lambda function: function
@@ -193,16 +196,19 @@ def has_nodes(equations: FirstOrderSystem, params: PyTree) -> bool:
 
 
 def on_nodes(
-    equations: FirstOrderSystem, options: SolverOptions, y0, varied, scales, ts, tolerances, *, directions=(), reverse=False
+    equations: FirstOrderSystem, options: SolverOptions, t0, y0, ts, args: Arguments, tolerances, *, directions=(), reverse=False
 ) -> tuple[Array, RESULTS, dict]:
-    """States at the samples, from node to node, as `states_at`; `varied` are params and t0, along whose directions of each order there
-    are variations.
-    """
+    """States at the samples, from node to node, as `states_at`, with their variations along directions of (params, t0) for each order."""
     adjoint = dfx.RecursiveCheckpointAdjoint() if reverse else dfx.ForwardMode()
-    solver = _wrapped(options, equations, equations.projected if equations.projection else None, adjoint)
-    meter = Meter() if options.progress else dfx.NoProgressMeter()
-    numbers = y0, varied, scales, ts, tolerances
-    ys, (result, stats) = integrated(equations, solver, options.max_steps, meter, *numbers, directions, reverse=reverse)
+    meter, dense = Meter() if options.progress else dfx.NoProgressMeter(), not has_nodes(equations, args.params)
+    projected = in_one_kernel(equations.projected) if dense else equations.projected
+    solver = _wrapped(options, equations, projected if equations.projection else None, adjoint)
+    numbers = y0, t0, args, ts, tolerances
+    ys, (result, stats) = integrated(equations, solver, options.max_steps, meter, *numbers, directions, reverse=reverse, dense=dense)
+    if dense and equations.projection:
+        along = [(of_params, None) for of_params, _ in directions]
+        projected = varied_along(lambda y, given: (equations.projected(given[1], y, args._replace(params=given[0])), None), along)
+        ys = jax.vmap(lambda t, y: projected(y, (args.params, t))[0])(ts, ys)
     return ys, from_diffrax(result), stats
 
 

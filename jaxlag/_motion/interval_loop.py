@@ -1,12 +1,15 @@
 """Integration from node to node: a node is a sample of the motion, or a time at which an input jumps or bends or a state is updated.
 
-A step ends at each node, so that between two of them an input is a constant or a line, which need not be looked up. The steps, their
-control and their stages are diffrax's and the solver's; the loop around them, short as it is, runs in one kernel on a CPU. Variations
-are the derivative of each step and not of the loop, which stays the same.
+A step ends at each node, so that between two of them an input is a constant or a line, which need not be looked up. Where there is
+nothing but samples, steps go on over these, and their dense output says what is there. The steps, their control and their stages are
+diffrax's and the solver's; the loop around them, short as it is, runs in one kernel on a CPU. Variations are the derivative of each step
+and not of the loop, which stays the same.
+
+Source: Hairer, Nørsett & Wanner, Solving Ordinary Differential Equations I, section I.14: this gives what the variational equations would.
 """
 
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import diffrax as dfx
@@ -18,6 +21,7 @@ from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from .._model.signal import broken_signals
 from .._model.states import flow
+from .._program.single_kernel import in_one_kernel
 from .._program.whole_kernel import in_whole_kernel
 from .event_record import has_stopped, most, with_events
 from .events import behind_jump
@@ -25,7 +29,7 @@ from .interval_inputs import Inputs, Recorded, Rows, packed
 from .protocol import Arguments
 from .results import RESULTS, number_of, numbered, under_diffrax
 from .runge_kutta import ExplicitRungeKutta
-from .step_size import ResumingController, with_tolerances
+from .step_size import GuardedController, ResumingController, with_tolerances
 from .variational import derived, with_variations
 
 
@@ -51,13 +55,21 @@ class Steps(NamedTuple):
     rejected: Int[Array, ""]
 
 
+class Reached(NamedTuple):
+    """Where a step has come: y at a sample it may end at, and before the jumps there; and its dense output, where that is of use."""
+
+    shown: Array
+    there: Array
+    dense: PyTree
+
+
 class Numbers(NamedTuple):
     """The numbers that the loop reads at each turn."""
 
     varied: tuple[PyTree, Array]  # params, and the time at which the motion begins
-    scales: Any
+    args: Arguments  # without params
     tolerances: tuple[Array, Array]
-    directions: tuple  # of these two, for each order
+    directions: tuple  # of what is varied, for each order
 
 
 class IntervalLoop(NamedTuple):
@@ -70,6 +82,7 @@ class IntervalLoop(NamedTuple):
     ts: Rows
     inputs: Callable[[PyTree], Inputs]
     moving: tuple[bool, ...]  # which jumps move with what is varied
+    dense: bool  # whether there is nothing but samples, which the dense output of the steps then shows
 
     def sample_time(self, sample: Int[Array, ""]) -> Float[Array, ""]:
         """Of a sample of the motion, or of the last."""
@@ -80,18 +93,23 @@ class IntervalLoop(NamedTuple):
         first, last = (self.ts.at(i)[0] for i in (0, self.ts.shape[0] - 1))
         rtol, atol = numbers.tolerances
         rounding = jnp.finfo(y0.dtype).eps * jnp.maximum(jnp.abs(first), jnp.abs(last))
-        controller = ResumingController(rtol, atol, smallest=4 * rounding, norm=self.equations.error_norm)
+        smallest = {"dtmin": 4 * rounding, "force_dtmin": False} if self.dense else {"smallest": 4 * rounding}
+        control = GuardedController if self.dense else ResumingController
+        controller = control(rtol, atol, norm=self.equations.error_norm, **smallest)
         stepping = self._replace(solver=with_tolerances(self.solver, controller))
         now = lambda x: _alone(x, numbers)
 
         def turn(carry):
             moving, steps, saved, meter = carry
-            sample, before = steps.sample, now(moving.y)
-            (moving, shown, there), (steps, is_sample) = stepping._varied(controller, rounding, steps, numbers)(moving)
-            for earlier, later in ((before, there), (now(there), moving.y)):
-                saved = with_events(self.equations, write, saved, self.ts.shape[0], earlier, later, now)
+            sample, before = steps.sample, jax.tree.map(now, moving)
+            (moving, reached), (steps, is_sample) = stepping._varied(controller, rounding, steps, numbers)(moving)
             meter = self.meter.step(meter, (now(moving.t) - first) / (last - first))
-            return moving, steps, write(saved, sample, shown, is_sample), meter
+            if self.dense:
+                steps, saved = stepping._sampled(steps, (before.t, now(moving.t)), reached.dense, numbers, saved, write)
+                return moving, steps, saved, meter
+            for earlier, later in ((before.y, reached.there), (now(reached.there), moving.y)):
+                saved = with_events(self.equations, write, saved, self.ts.shape[0], earlier, later, now)
+            return moving, steps, write(saved, sample, reached.shown, is_sample), meter
 
         def going_on(carry):
             moving, steps, *_ = carry
@@ -106,11 +124,12 @@ class IntervalLoop(NamedTuple):
         return moving, steps, saved
 
     def _start(self, controller, first, last, y0, following, numbers: Numbers) -> tuple[Moving, Steps]:
-        """The first step is planned as diffrax plans it."""
-        term, y = dfx.ODETerm(self.equations.rates), _alone(y0, numbers)
+        """What is there before the first step."""
+        term, y = self._term(), _alone(y0, numbers)
         params, origin = numbers.varied
-        args = Arguments(self.inputs(params).pieces(following), numbers.scales)
-        t1, controller_state = controller.init(term, first, last, y, None, args, self.solver.func, self.solver.error_order(term))
+        args = numbers.args._replace(params=self.inputs(params).pieces(following))
+        planned = FIRST_STEP if self.dense else None  # and otherwise as the rates and their change suggest
+        t1, controller_state = controller.init(term, first, last, y, planned, args, self.solver.func, self.solver.error_order(term))
         state, is_new = _initial_state(self.solver, term, first, t1, y, args)
         changing, rest = eqx.partition(state, eqx.is_inexact_array)
         unvaried = lambda x: functools.reduce(_with_zeros, y0.shape[y.ndim :], x)
@@ -121,24 +140,28 @@ class IntervalLoop(NamedTuple):
     def _varied(self, controller, rounding, steps: Steps, numbers: Numbers) -> Callable:
         """A step of what moves and its value at a sample, with their variations along the directions of what is varied, for each order."""
 
-        def of_order(function, directions):
-            def varied(moving, given):
-                alone, change = (jax.tree.map(lambda x, part=part: x[part], moving) for part in ((..., 0), (..., slice(1, None))))
-                (value, change), aux = derived(lambda both: function(*both), (change, directions))((alone, given))
-                return jax.tree.map(with_variations, value, change), aux
-
-            return varied
-
-        function = lambda moving, given: self._step(controller, rounding, moving, given, steps, numbers.scales)
-        for directions in numbers.directions:
-            function = of_order(function, directions)
+        function = lambda moving, given: self._step(controller, rounding, moving, given, steps, numbers.args)
+        function = varied_along(function, numbers.directions)
         return lambda moving: function(moving, numbers.varied)
 
-    def _step(
-        self, controller, rounding, moving: Moving, given, steps: Steps, scales
-    ) -> tuple[tuple[Moving, Array, Array], tuple[Steps, Any]]:
-        """One step, tried, up to the next node at most and behind the jumps there; with y at a sample it may end at, and before jumps."""
-        (params, origin), sample, t = given, self.sample_time(steps.sample), moving.t
+    def _sampled(self, steps: Steps, between, dense, numbers: Numbers, saved, write: Callable) -> tuple[Steps, Any]:
+        """With the samples of the last step, if it was kept, from its dense output."""
+        start, end = between
+        path = lambda dense, t: (self.solver.interpolation_cls(t0=start, t1=end, **dense).evaluate(t), None)
+        at = varied_along(path, [None] * len(numbers.directions))
+
+        def sampled(carry):
+            i, saved = carry
+            return i + 1, write(saved, i, at(dense, self.sample_time(i))[0], jnp.array(True))
+
+        is_within = lambda carry: (carry[0] < self.ts.shape[0]) & (self.sample_time(carry[0]) <= end) & (start < end)
+        i, saved = jax.lax.while_loop(is_within, sampled, (steps.sample, saved))
+        return steps._replace(sample=i), saved
+
+    def _step(self, controller, rounding, moving: Moving, given, steps: Steps, args) -> tuple[tuple[Moving, Reached], tuple[Steps, Any]]:
+        """One step, tried, up to the next node at most and behind the jumps there."""
+        (params, origin), t = given, moving.t
+        sample = self.ts.at(self.ts.shape[0] - 1)[0] if self.dense else self.sample_time(steps.sample)
         inputs, periods = self.inputs(params), self.equations.periods(params)
         signals = len(inputs.records)
         ticks = [(origin + i * period).astype(t.dtype) for i, period in zip(steps.following[signals:], periods, strict=True)]
@@ -146,9 +169,9 @@ class IntervalLoop(NamedTuple):
         coming = [*inputs.times(steps.following, t), *ticks]
         node, end = functools.reduce(lambda first, time: jnp.where(time + rounding < first, time, first), coming, sample), t + steps.length
         t1 = jnp.where(end + rounding >= node, node, end)
-        args = Arguments(inputs.pieces(steps.following), scales)
+        args, after = args._replace(params=inputs.pieces(steps.following)), args
         state = eqx.combine(moving.solver_state, steps.solver_state)
-        keep, y, state, planned, control, result = self._tried(controller, t, t1, moving.y, args, state, steps)
+        keep, y, state, dense, planned, control, result = self._tried(controller, t, t1, moving.y, args, state, steps)
 
         t = jnp.where(keep, t1, t)
         passed = [keep & (t1 == node) & (time <= node + rounding) for time in coming]
@@ -160,34 +183,38 @@ class IntervalLoop(NamedTuple):
                 t = jnp.where(by, time, t)
         jump = [*inputs.jump, *[True] * len(ticks)]
         jumps = functools.reduce(jnp.logical_or, (by for by, jumps in zip(passed, jump, strict=True) if jumps), jnp.array(False))
-        after = Arguments(inputs.pieces(following), scales)
+        after = after._replace(params=inputs.pieces(following))
 
         def behind(y):
             updated = self.equations.updated(t, y, after, passed[signals:]) if ticks else y
             return behind_jump(self.equations, t, y, updated, args, after)
 
         there = y
-        y, consistent = jax.lax.cond(jumps, behind, lambda y: (y, jnp.array(True)), y)
-        result = dfx.RESULTS.where(consistent, result, under_diffrax(RESULTS.no_friction))
-        shown = self._moved(sample, t, y, after) if any(self.moving) else y
+        if any(jump):
+            y, consistent = jax.lax.cond(jumps, behind, lambda y: (y, jnp.array(True)), y)
+            result = dfx.RESULTS.where(consistent, result, under_diffrax(RESULTS.no_friction))
+        reached = Reached(self._moved(sample, t, y, after) if any(self.moving) else y, there, dense if self.dense else None)
         changing, rest = eqx.partition(state, eqx.is_inexact_array)
-        counts = steps.sample + is_sample, result, steps.accepted + keep, steps.rejected + ~keep
+        counts = steps.sample + (is_sample & (not self.dense)), result, steps.accepted + keep, steps.rejected + ~keep
         steps = Steps(planned, rest, control, jumps | (steps.has_jumped & ~keep), following, *counts)
-        return (Moving(t, y, changing), shown, there), jax.lax.stop_gradient((steps, is_sample))
+        return (Moving(t, y, changing), reached), jax.lax.stop_gradient((steps, is_sample))
+
+    def _term(self) -> dfx.ODETerm:
+        return dfx.ODETerm(in_one_kernel(self.equations.rates) if self.dense else self.equations.rates)
 
     def _moved(self, time, t, y, args):
         """y at a time that equals t, but moves otherwise with what is varied."""
         return flow(time, t, (y, self.equations.rates(t, y, args)))
 
     def _tried(self, controller, t0, t1, y0, args, state, steps: Steps):
-        """A step of the solver, and whether it is kept."""
-        term = dfx.ODETerm(self.equations.rates)
-        y1, error, _, new, result = self.solver.step(term, t0, t1, y0, args, state, steps.has_jumped)
+        """A step of the solver and its dense output, and whether it is kept."""
+        term = self._term()
+        y1, error, dense, new, result = self.solver.step(term, t0, t1, y0, args, state, steps.has_jumped)
         *states, error = jax.lax.stop_gradient((t0, t1, y0, y1, error))
         more = error, self.solver.error_order(term), steps.controller_state
         keep, t, end, _, control, controlled = controller.adapt_step_size(*states, args, *more)
         y, state = jax.tree.map(lambda new, old: jnp.where(keep, new, old), (y1, new), (y0, state))
-        return keep, y, state, end - t, control, dfx.RESULTS.where(result == dfx.RESULTS.successful, controlled, result)
+        return keep, y, state, dense, end - t, control, dfx.RESULTS.where(result == dfx.RESULTS.successful, controlled, result)
 
 
 def _alone(x: Array, numbers: Numbers) -> Array:
@@ -208,13 +235,30 @@ def _initial_state(solver, term, t0, t1, y0, args):
     return jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), jax.eval_shape(make)), jnp.array(True)
 
 
-def integrated(equations, solver, max_steps, meter, y0, varied, scales, ts, tolerances, directions=(), *, reverse=False):
+FIRST_STEP = 0.01  # diffrax's own; six steps at most that are refused make it a millionth, a few that are kept as long as need be
+
+
+def varied_along(function: Callable, orders: Sequence) -> Callable:
+    """A function (x, given) ↦ (value, aux) of x with variations as last axes, along directions of `given` for each order."""
+
+    def of_order(function, directions):
+        def varied(x, given):
+            alone, change = (jax.tree.map(lambda leaf, part=part: leaf[part], x) for part in ((..., 0), (..., slice(1, None))))
+            (value, change), aux = derived(lambda both: function(*both), (change, directions))((alone, given))
+            return jax.tree.map(with_variations, value, change), aux
+
+        return varied
+
+    return functools.reduce(of_order, orders, function)
+
+
+def integrated(equations, solver, max_steps, meter, y0, origin, args, ts, tolerances, directions=(), *, reverse=False, dense=False):
     """States at the samples and behind events; and, not differentiated, the reason it ended, counts, and the `last` time and state.
 
-    `varied` are params and the time of the start. With `directions` of these, for each order, the states and y0 have their variations as
-    last axes. `reverse`: whether reverse mode goes through the loop.
+    `origin` is the time of the start. With `directions` of (params, origin), for each order, the states and y0 have their variations as
+    last axes. `reverse`: whether reverse mode goes through the loop; `dense`: whether there are no nodes but samples.
     """
-    params, origin = varied
+    params, args = args.params, args._replace(params=None)
     start = jax.lax.stop_gradient(ts[0])
     following = tuple(jnp.searchsorted(s.times.astype(ts.dtype), start, side="right").astype(int) for s in broken_signals(params))
     following = (*following, *[jnp.array(1)] * len(equations.periods(params)))  # the first updates are in y0
@@ -222,13 +266,13 @@ def integrated(equations, solver, max_steps, meter, y0, varied, scales, ts, tole
     recorded = Recorded.of(equations.elsewhere, params, tuple(of_params for of_params, _ in directions))
     along = tuple(zip(recorded.directions, (of_origin for _, of_origin in directions), strict=True))
     large = [ts, *(array for signal in recorded.signals.values() for array in (signal.ts, signal.values))]
-    numbers = Numbers((recorded.params, origin), scales, tolerances, along)
+    numbers = Numbers((recorded.params, origin), args, tolerances, along)
     given, unpack, rows = packed((y0, following, numbers), large)
 
     def started(given):
         ts, *columns = rows(given)
         of = {k: (*columns[2 * i : 2 * i + 2], s.interpolation) for i, (k, s) in enumerate(recorded.signals.items())}
-        loop = IntervalLoop(equations, solver, max_steps, meter, ts, lambda params: Inputs(of, equations.elsewhere, params), moving)
+        loop = IntervalLoop(equations, solver, max_steps, meter, ts, lambda params: Inputs(of, equations.elsewhere, params), moving, dense)
         return functools.partial(loop.run, *unpack(given))
 
     length = ts.size + most(equations).sum()
@@ -240,7 +284,7 @@ def integrated(equations, solver, max_steps, meter, y0, varied, scales, ts, tole
         moving, steps, ys = started(given)(saved, write, checkpointed)
         return _results(equations, ys, _end(moving, steps), ts, max_steps)
 
-    like = y0[(0, *[slice(None)] * len(directions))], y0, *[jnp.zeros((), int)] * 4
+    like = y0[(0,) * (y0.ndim - len(directions))], y0, *[jnp.zeros((), int)] * 4
     space, unpack_end, _ = packed(like, [])
 
     def run(given, saved):
@@ -276,8 +320,9 @@ def _written(length, width, saved, i, y, wanted):
 
 def _results(equations, ys, end, ts, max_steps):
     t, y, number, accepted, rejected, sample = end
-    t = t[(0,) * t.ndim]
-    stopped = has_stopped(equations, y[(slice(None), *[0] * (y.ndim - 1))])
+    alone = lambda x: x[(..., *[0] * t.ndim)]  # without its variations
+    last = alone(t), alone(y)
+    t, stopped = last[0], has_stopped(equations, last[1])
     repeated = (jnp.arange(ts.size) >= sample) & ((ts == t) | stopped)  # the last time, as padding has it
     repeated = jnp.concatenate([repeated, jnp.zeros(len(ys) - ts.size, bool)])
     ys = jnp.where(repeated.reshape(-1, *[1] * y.ndim), y, ys)
@@ -285,4 +330,4 @@ def _results(equations, ys, end, ts, max_steps):
     unfinished = (result == dfx.RESULTS.successful) & ~stopped & (ts[-1] > t) & (accepted + rejected >= max_steps)
     result = dfx.RESULTS.where(unfinished, dfx.RESULTS.max_steps_reached, result)
     stats = {"num_steps": accepted + rejected, "num_accepted_steps": accepted, "num_rejected_steps": rejected}
-    return ys, (result, stats | {"last": jax.lax.stop_gradient((t, y[(slice(None), *[0] * (y.ndim - 1))]))})
+    return ys, (result, stats | {"last": jax.lax.stop_gradient(last)})

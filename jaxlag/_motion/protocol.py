@@ -3,7 +3,7 @@
 import abc
 import dataclasses
 from collections.abc import Callable
-from typing import Any, NamedTuple, Protocol, runtime_checkable
+from typing import Any, ClassVar, NamedTuple, Protocol, runtime_checkable
 
 import jax
 import jax.numpy as jnp
@@ -84,7 +84,13 @@ class AugmentedSystem(abc.ABC):
     """A smooth `FirstOrderSystem` whose y has one more axis, its last: of variations, or of the members of a batch."""
 
     equations: FirstOrderSystem
-    modes = 0
+    modes = contacts = events = 0
+    elsewhere: ClassVar = frozenset()
+    varying_periods: ClassVar = ()
+
+    def periods(self, params: PyTree) -> list[Array]:
+        """None: no state is sampled."""
+        return []
 
     @property
     def controlled(self) -> int:

@@ -19,7 +19,7 @@ from .._model.validation import check
 from .event_record import records
 from .first_order import EquationsOfMotion
 from .guarantees import verified
-from .integrate import SolverOptions, Variations, has_nodes, initialised, is_variational, on_nodes, states_at, with_status
+from .integrate import SolverOptions, Variations, initialised, is_variational, on_nodes, states_at, with_status
 from .moments import ContactState, EventState, FrictionState
 from .protocol import Arguments, Scales
 from .provenance import Provenance
@@ -85,11 +85,10 @@ class SolutionMap:
 
     def push(self, inputs: Inputs, directions: tuple[Inputs, ...], ts: Array) -> tuple[Any, Unchanging]:
         """The samples and their derivatives along directions, for each order; by the variational equations where they hold."""
+        if self.options.adjoint is not None:
+            return pushforward(self.solve)(inputs, directions, ts)
         equations, at = self._equations(inputs, ts)
         varying = [split_varying(inputs, of_order)[0].params for of_order in directions]
-        by_steps = has_nodes(equations, inputs.params) and self.options.adjoint is None
-        if not by_steps and not is_variational(equations, self.options, varying, inputs.params):
-            return pushforward(self.solve)(inputs, directions, ts)
 
         def initial(inputs):
             params = with_second_derivatives(inputs.params)
@@ -102,15 +101,15 @@ class SolutionMap:
             variations = variations.along(of_order, (of_order.params, None), of_order.t0, arguments)
         y0, start = variations.initial(inputs)
         smooth, tolerances = with_second_derivatives(inputs.params), inputs.tolerances
-        if by_steps:
-            numbers = (smooth, at.t), Scales.of(tolerances, ts, smooth), ts, tolerances
+        args = Arguments(smooth, Scales.of(tolerances, ts, smooth))
+        if is_variational(equations, self.options, varying, inputs.params):
+            args = args._replace(directions=variations.directions)
+            ys, result, stats = on_nodes(variations.equations, self.options, at.t, y0, ts, args, tolerances)
+            last_t, last_y = stats["last"]
+            stats = stats | {"last": (last_t, last_y[(..., *[0] * len(directions))])}
+        else:
             along = tuple((of_order.params, of_order.t0) for of_order in directions)
-            found = on_nodes(equations, self.options, y0, *numbers, directions=along)
-            return self._samples_and_variations(equations, inputs, directions, ts, *found, start)
-        args = Arguments(smooth, directions=variations.directions)
-        ys, result, stats = states_at(variations.equations, self.options, dfx.ForwardMode(), at.t, y0, ts, args, tolerances)
-        last_t, last_y = stats["last"]
-        stats = stats | {"last": (last_t, last_y[(..., *[0] * len(directions))])}
+            ys, result, stats = on_nodes(equations, self.options, at.t, y0, ts, args, tolerances, directions=along)
         return self._samples_and_variations(equations, inputs, directions, ts, ys, result, stats, start)
 
     def _samples_and_variations(self, equations, inputs, directions, ts, ys, result, stats, start):
