@@ -1,6 +1,7 @@
 """What is recorded of events: each is a row behind the samples of a motion."""
 
 from collections.abc import Callable
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -10,12 +11,12 @@ from jaxtyping import Array, Bool, Float, PyTree
 from .first_order import EquationsOfMotion
 
 
-def most(equations: EquationsOfMotion) -> np.ndarray:
+def most(equations: Any) -> np.ndarray:
     """How many of each event are recorded."""
     return np.array([event.most for _, event in equations.system.events] if equations.events else [], int)
 
 
-def with_events(equations: EquationsOfMotion, write: Callable, saved, samples: int, before: Float[Array, " y"] | None, y, number: Callable):
+def with_events(equations: Any, write: Callable, saved, samples: int, before: Float[Array, " y"] | None, y, number: Callable):
     """What is saved, and behind the `samples` each event that has happened since y was as it was `before`, or ever.
 
     `number(y)` is y without its variations.
@@ -44,7 +45,7 @@ def records(equations: EquationsOfMotion, rows: Float[Array, "r y"]) -> dict[str
     return {name: jax.vmap(of_one)(of) for (name, _), of in zip(equations.system.events, of_each, strict=False)}
 
 
-def has_stopped(equations: EquationsOfMotion, y) -> Bool[Array, ""]:
+def has_stopped(equations: Any, y) -> Bool[Array, ""]:
     """Whether an event has ended the motion."""
     return jnp.any(equations.parts(y).stopped > 0) if equations.events else jnp.array(False)
 

@@ -214,7 +214,10 @@ class IntervalLoop(NamedTuple):
         more = error, self.solver.error_order(term), steps.controller_state
         keep, t, end, _, control, controlled = controller.adapt_step_size(*states, args, *more)
         y, state = jax.tree.map(lambda new, old: jnp.where(keep, new, old), (y1, new), (y0, state))
-        return keep, y, state, dense, end - t, control, dfx.RESULTS.where(result == dfx.RESULTS.successful, controlled, result)
+        ended = result != dfx.RESULTS.successful
+        if not (self.equations.contacts or self.equations.events):
+            ended &= keep  # what was refused is tried again
+        return keep, y, state, dense, end - t, control, dfx.RESULTS.where(ended, result, controlled)
 
 
 def _alone(x: Array, numbers: Numbers) -> Array:
