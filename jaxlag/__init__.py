@@ -53,8 +53,8 @@ from ._mechanics.projection import (
     Baumgarte as Baumgarte,
     NoStabilisation as NoStabilisation,
     Projection as Projection,
-    consistent_state as consistent_state,
 )
+from ._mechanics.consistent_state import consistent_state as consistent_state
 from ._mechanics.lagrange import (
     Residual as Residual,
     constraint_jacobian as constraint_jacobian,

@@ -12,8 +12,8 @@ from jax.flatten_util import ravel_pytree
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from jaxtyping import Array, Float, PyTree
 
+from .._mechanics.consistent_state import consistent_state
 from .._mechanics.lagrange import constraint_rows, position_residual
-from .._mechanics.projection import consistent_state
 from .._model.paths import is_within
 from .._model.system import System
 from .._model.validation import at_state

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
 
-from .._mechanics.projection import consistent_state
+from .._mechanics.consistent_state import consistent_state
 from .experiment import Experiment, with_own
 from .levenberg_marquardt import DISCONTINUOUS, INTERRUPTED, STEP_LIMIT, Outcome, levenberg_marquardt
 from .problem import Continuity, Problem, linearise

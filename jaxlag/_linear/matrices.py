@@ -10,9 +10,9 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float, PyTree
 
+from .._mechanics.consistent_state import off_constraints
 from .._mechanics.contact import in_current_mode
 from .._mechanics.lagrange import applied_force, constraint_rows
-from .._mechanics.projection import off_constraints
 from .._mechanics.pseudo_inverse import CLEAR
 from .._mechanics.saddle_point import augmented
 from .._model.flat import StatesAt

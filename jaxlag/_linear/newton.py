@@ -9,6 +9,8 @@ import jax.numpy as jnp
 import lineax as lx
 from jaxtyping import Array, Bool, Float
 
+from .._program.implicit import implicit_root
+
 ITERATIONS = 100
 Residual = Callable[[Any, Float[Array, " u"]], Float[Array, " r"]]  # R(args, w)
 
@@ -51,7 +53,7 @@ def root_near(residual: Residual, args: Any, guess: Float[Array, " u"], ease: Fl
         return (i < ITERATIONS) & ~done & jnp.all(jnp.isfinite(w))
 
     w, _, _ = jax.lax.while_loop(is_on_its_way, turn, (jax.lax.stop_gradient(guess), jnp.array(False), jnp.array(0)))
-    return Root(implicit_root(residual, args, w), is_root(slope(w), residual(fixed, w), w))
+    return Root(differentiable_root(residual, args, w), is_root(slope(w), residual(fixed, w), w))
 
 
 def is_root(J: Array, R: Array, w: Array) -> Bool[Array, ""]:
@@ -60,18 +62,13 @@ def is_root(J: Array, R: Array, w: Array) -> Bool[Array, ""]:
     return jnp.all(jnp.isfinite(w)) & jnp.all(jnp.abs(R) <= allowed)
 
 
-@functools.partial(jax.custom_jvp, nondiff_argnums=(0,))
-def implicit_root(residual: Residual, args: Any, w: Float[Array, " u"]) -> Float[Array, " u"]:
-    """w, which depends on args as R(args, w) = 0 says: differentiable to any order."""
-    return w
+def differentiable_root(residual: Residual, args: Any, w: Float[Array, " u"]) -> Float[Array, " u"]:
+    """w, which depends on args as R(args, w) = 0 says; of several ways to change with them, by the shortest."""
+    return implicit_root(residual, functools.partial(_change, residual), args, w)
 
 
-@implicit_root.defjvp
-def _implicit_rule(residual, primals, tangents):
-    (args, found), (d_args, _) = primals, tangents
-    w = implicit_root(residual, args, found)
-    change = jax.jvp(lambda args: residual(args, w), (args,), (d_args,))[1]
-    return w, -least_change(jax.jacfwd(residual, 1)(args, w), change, 1 + jnp.abs(jax.lax.stop_gradient(w)))
+def _change(residual, args, w, R):
+    return -least_change(jax.jacfwd(residual, 1)(args, w), R, 1 + jnp.abs(jax.lax.stop_gradient(w)))
 
 
 def least_change(J: Float[Array, "r u"], R: Float[Array, " r"], scale: Any) -> Float[Array, " u"]:

@@ -16,7 +16,7 @@ from .._model.system import System
 from .._motion.simulate import simulate
 from .._program.jit import compiled
 from .eigenvalues import eigen
-from .newton import implicit_root, is_root, least_change
+from .newton import differentiable_root, is_root, least_change
 
 ITERATIONS = 30
 SECTION = "the section"  # among the events of the system
@@ -85,7 +85,7 @@ def orbit_near(system: System, setting: Setting, given: Given) -> Orbit:
         return returned(frame, w, frame.given.t)[0][of] - w
 
     near = _newton(lambda w: residual(jax.lax.stop_gradient(frame), w), frame.first[of], given.tolerances)
-    w = implicit_root(residual, frame, near)
+    w = differentiable_root(residual, frame, near)
 
     def at(t):
         """The return from a start at another time, and its slope."""

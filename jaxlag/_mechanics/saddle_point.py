@@ -1,5 +1,6 @@
 """The constrained solve: x and λ of  M x = f + Gᵀλ,  G x = c."""
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import jax
@@ -63,6 +64,17 @@ def _saddle_point(M, G, f, c, reach) -> SaddlePoint:
     factors = _factorised(*jax.lax.stop_gradient((M, G, f, c, reach)))
     x, multipliers = _solution(M, G, f, c, factors)
     return SaddlePoint(x, multipliers, Sound(factors.determined, factors.satisfied))
+
+
+def saddle_solver(M: lx.AbstractLinearOperator, G: Float[Array, "m n"], f, c, reach: Float[Array, " n"]) -> Callable:
+    """(f, c) ↦ (x, λ) as of `saddle_point`, for other vectors f and c; what G barely holds is held as it is for these."""
+    solve, _ = _solver(M, G, _factorised(*jax.lax.stop_gradient((M, G, f[:, None], c[:, None], reach))))
+
+    def solution(f, c):
+        x, multipliers = solve(f[:, None], c[:, None])
+        return x[:, 0], multipliers[:, 0]
+
+    return solution
 
 
 class Factors(NamedTuple):

@@ -5,8 +5,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from .._mechanics.consistent_state import nearest_state
 from .._mechanics.contact import gap_rates, gap_scales, outside
-from .._mechanics.projection import nearest_state
 from .._model.event import Negative
 from .._model.flat import Flat
 from .._model.state_values import ravelled

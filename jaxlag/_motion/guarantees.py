@@ -6,7 +6,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, PyTree
 
-from .._mechanics.projection import off_constraints
+from .._mechanics.consistent_state import off_constraints
+from .._program.implicit import undifferentiated
 from .first_order import EquationsOfMotion
 from .protocol import Arguments
 from .results import RESULTS
@@ -55,7 +56,7 @@ def _guarantees(
         within = excess <= LITTLE * scale + LITTLE**1.5 * jnp.max(jnp.where(jnp.isfinite(scale), scale, 0), axis=0, keepdims=True)
         guarantees.append((jnp.all(within, axis=1), RESULTS.missed))
     if equations.projection is not None:
-        off = jax.vmap(lambda t, y: _off(equations, t, y, params))(*jax.lax.stop_gradient((ts, ys)))
+        off = undifferentiated(jax.vmap(lambda t, y: _off(equations, t, y, params)))(ts, ys)
         guarantees += [(off <= _residual_bound(tolerances), RESULTS.contradictory), (evidence.sound.satisfied, RESULTS.contradictory)]
     elif equations.system.constraints:  # what drifts contradicts itself in time
         guarantees.append((evidence.sound.satisfied | (jnp.arange(len(ts)) > 0), RESULTS.contradictory))

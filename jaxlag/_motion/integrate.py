@@ -13,9 +13,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, PyTree
 
+from .._mechanics.consistent_state import nearest_state
 from .._mechanics.contact import outside
 from .._mechanics.friction_treatment import Regularised, StickSlip
-from .._mechanics.projection import Baumgarte, NoStabilisation, Projection, nearest_state
+from .._mechanics.projection import Baumgarte, NoStabilisation, Projection
 from .._model.flat import StatesAt
 from .._model.numbers import count, number
 from .._model.signal import broken_signals, moves_smoothly

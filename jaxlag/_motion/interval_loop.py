@@ -270,13 +270,13 @@ def integrated(equations, solver, max_steps, meter, y0, origin, args, ts, tolera
     along = tuple(zip(recorded.directions, (of_origin for _, of_origin in directions), strict=True))
     large = [ts, *(array for signal in recorded.signals.values() for array in (signal.ts, signal.values))]
     numbers = Numbers((recorded.params, origin), args, tolerances, along)
-    given, unpack, rows = packed((y0, following, numbers), large)
+    given, unpack, rows = packed((start, (y0, following, numbers)), large)  # a number first that is not NaN, as the kernel asks for
 
     def started(given):
         ts, *columns = rows(given)
         of = {k: (*columns[2 * i : 2 * i + 2], s.interpolation) for i, (k, s) in enumerate(recorded.signals.items())}
         loop = IntervalLoop(equations, solver, max_steps, meter, ts, lambda params: Inputs(of, equations.elsewhere, params), moving, dense)
-        return functools.partial(loop.run, *unpack(given))
+        return functools.partial(loop.run, *unpack(given)[1])
 
     length = ts.size + most(equations).sum()
     unknown = jnp.full((length - 1, *y0.shape), jnp.inf, y0.dtype)

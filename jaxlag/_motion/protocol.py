@@ -85,7 +85,7 @@ class AugmentedSystem(abc.ABC):
 
     equations: FirstOrderSystem
     modes = contacts = events = 0
-    elsewhere: ClassVar = frozenset()
+    elsewhere: ClassVar[frozenset[int]] = frozenset()
     varying_periods: ClassVar = ()
 
     def periods(self, params: PyTree) -> list[Array]:

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from .._mechanics.projection import IMPOSSIBLE
+from .._mechanics.consistent_state import IMPOSSIBLE
 from .._mechanics.saddle_point import NO_INERTIA
 from .._mechanics.singular_directions import NOT_AFFINE, UNDEFINED
 
