@@ -1,0 +1,250 @@
+"""States on the constraints, the nearest to a given one, and how far a state is off them."""
+
+import dataclasses
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import lineax as lx
+import numpy as np
+from jaxtyping import Array, Bool, Float, PyTree
+
+from .._model.flat import Flat
+from .._model.system import System
+from .._model.validation import at_state, coordinates
+from .._program.implicit import implicit_root, undifferentiated
+from .._program.jit import is_concrete
+from .._program.scalarise import scalarised
+from .lagrange import constraint_rows, inertia, position_residual, velocity_residual
+from .projection import metric_of_positions
+from .saddle_point import NO_INERTIA, SaddlePoint, is_determined, reach_of, saddle_point, saddle_solver
+from .singular_directions import NOT_AFFINE, UNDEFINED, explained, not_affine_in
+
+ITERATIONS = 16  # near the constraints four suffice
+
+
+class Consistent(NamedTuple):
+    """A state on the constraints; `reached` is false where the iteration found none, `determined` where inertia is missing, `affine`
+    where a nonholonomic constraint is not affine in q̇, `defined` where M or a constraint is not finite at the state given.
+    """
+
+    q: Float[Array, " n"]
+    v: Float[Array, " n"]
+    reached: Bool[Array, ""]
+    determined: Bool[Array, ""]
+    affine: Bool[Array, ""]
+    defined: Bool[Array, ""]
+
+
+def nearest_state(flat: Flat, t, q0, v0, free: Sequence[int] | None = None) -> Consistent:
+    """The state on the constraints nearest to (q0, v0), in which only the `free` coordinates move.
+
+    M (q − q0) = Gᵀλ,  g(t, q) = 0  by Newton's method, with M = M(q0); then  M (v − v0) = Gᵀμ,  ψ(t, q, v) = 0  with M = M(q).
+    Derivatives are those that these equations imply.
+    """
+    moving = np.arange(q0.size) if free is None else np.asarray(free, int)
+    full = inertia(flat, t, q0, v0)[0]
+    M = full.as_matrix()[np.ix_(moving, moving)]
+    given = jnp.concatenate([flat.holonomic(t, q0), velocity_residual(flat, t, q0, v0)])
+    positions = flat.holonomic(t, q0).size
+    if given.size == 0:  # nothing to satisfy: saves the compilation of the search
+        yes = jnp.array(True)
+        return Consistent(q0, v0, yes, is_determined(M, jnp.zeros((0, moving.size), M.dtype)), yes, jnp.all(jnp.isfinite(M)))
+    q = q0
+    if positions:
+        if given.size > 2 * positions:  # velocity constraints may be all that holds a coordinate
+            held = is_determined(M, position_residual(flat, t, q0)[1][:, moving])
+            M = jnp.where(held, M, metric_of_positions(flat, full, t, q0, v0).as_matrix()[np.ix_(moving, moving)])
+        q = _nearest_position(flat, moving, t, q0, M)
+    v, determined = _nearest_velocity(flat, moving, t, q, v0)
+
+    @undifferentiated
+    def judged(t, q0, v0, q, v, M, given):
+        reached = (off_constraints(flat, t, q, v) < _small(q)) & jnp.all(jnp.isfinite(q))
+        return reached, ~jnp.any(not_affine_in(flat, t, q0, v0)), jnp.all(jnp.isfinite(given)) & jnp.all(jnp.isfinite(M))
+
+    reached, affine, defined = judged(t, q0, v0, q, v, M, given)
+    return Consistent(q, v, reached, determined, affine, defined)
+
+
+def _nearest_position(flat: Flat, moving, t, q0, M) -> Float[Array, " n"]:
+    """That on the constraints, where only the coordinates `moving` move."""
+    free = moving.size
+    unpacked = lambda q0, w: (q0.at[moving].set(w[:free]), w[free:])
+    like = jnp.concatenate([q0[moving], flat.holonomic(t, q0)])
+
+    @scalarised
+    def residual(args, w):
+        (t, q0, M), (q, multipliers) = args, unpacked(args[1], w)
+        g, pull = jax.vjp(lambda q: flat.holonomic(t, q), q)
+        return jnp.concatenate([M @ (q - q0)[moving] - pull(multipliers)[0][moving], g])
+
+    @scalarised
+    def linear(args, w):
+        (t, q0, M), (q, multipliers) = args, unpacked(args[1], w)
+        g, G = position_residual(flat, t, q)
+        bend = jax.hessian(lambda q: multipliers @ flat.holonomic(t, q))(q)[np.ix_(moving, moving)]
+        curved = jnp.where(is_determined(M - bend, G[:, moving]), M - bend, M)
+        return Linear(curved, G[:, moving], M @ (q0 - q)[moving], -g, reach_of(q[moving], _off(g, G, q) > _small(q)))
+
+    def search(linear, args):
+        eps, size = jnp.finfo(like.dtype).eps, like.size - free
+
+        def newton(carry):
+            w, _, i = carry
+            found = linear(args, w).solution()
+            moved = jnp.max(jnp.abs(found.x), initial=0.0) > 4 * eps * jnp.max(jnp.abs(w[:free]), initial=0.0)
+            return jnp.concatenate([w[:free] + found.x, found.multipliers]), moved, i + 1
+
+        start = jnp.concatenate([args[1][moving], jnp.zeros(size, like.dtype)])
+        going_on = lambda carry: carry[1] & (carry[2] < ITERATIONS)
+        return jax.lax.while_loop(going_on, newton, (start, jnp.array(True), jnp.array(0)))[0], None
+
+    w, _ = _root(residual, linear, search, (t, q0, M), like)
+    return unpacked(q0, w)[0]
+
+
+def _nearest_velocity(flat: Flat, moving, t, q, v0) -> tuple[Float[Array, " n"], Bool[Array, ""]]:
+    """That on the constraints, where only those of the coordinates `moving` move; and whether M leaves no direction without inertia."""
+    free = moving.size
+    like = jnp.concatenate([v0[moving], velocity_residual(flat, t, q, v0)])
+
+    @scalarised
+    def residual(args, w):
+        t, q, v0 = args
+        v = v0.at[moving].set(w[:free])
+        psi, pull = jax.vjp(lambda v: velocity_residual(flat, t, q, v), v)
+        pushed = inertia(flat, t, q, v0)[0].mv(v - v0)
+        return jnp.concatenate([(pushed - pull(w[free:])[0])[moving], psi])
+
+    @scalarised
+    def linear(args, w):
+        t, q, v0 = args
+        psi, G, _ = constraint_rows(flat, t, q, v0)
+        M = inertia(flat, t, q, v0)[0].as_matrix()[np.ix_(moving, moving)]
+        return Linear(M, G[:, moving], jnp.zeros_like(v0[moving]), -psi, reach_of(v0[moving], _off(psi, G, v0) > _small(q)))
+
+    def search(linear, args):
+        found = linear(args, like).solution()
+        return jnp.concatenate([args[2][moving] + found.x, found.multipliers]), found.sound.determined
+
+    w, determined = _root(residual, linear, search, (t, q, v0), like)
+    return v0.at[moving].set(w[:free]), determined
+
+
+class Linear(NamedTuple):
+    """The linear equations M x = f + Gᵀλ, G x = c of a step, and its reach."""
+
+    M: Float[Array, "k k"]
+    G: Float[Array, "m k"]
+    f: Float[Array, " k"]
+    c: Float[Array, " m"]
+    reach: Float[Array, " k"]
+
+    def solution(self) -> SaddlePoint:
+        """x and λ."""
+        return saddle_point(lx.MatrixLinearOperator(self.M), self.G, self.f, self.c, self.reach)
+
+    def change(self, residual: Float[Array, " w"]) -> Float[Array, " w"]:
+        """What (x, λ) change where this is added to the left-hand sides; the rank is that of the step."""
+        solve = saddle_solver(lx.MatrixLinearOperator(self.M), self.G, self.f, self.c, self.reach)
+        return -jnp.concatenate(solve(*jnp.split(residual, [self.f.size])))
+
+
+def _root(residual: Callable, linear: Callable, search: Callable, args: tuple, like: Float[Array, " w"]) -> tuple[Array, Any]:
+    """w with residual(args, w) = 0, as `search(linear, args)` finds it, and what else that says; linear(args, w) is the slope there."""
+    residual, of_residual = jax.closure_convert(residual, args, like)
+    linear, of_linear = jax.closure_convert(linear, args, like)
+    fixed, within = jax.lax.stop_gradient((args, of_linear))
+    w, aux = search(lambda args, w: linear(args, w, *within), fixed)
+    of_all = lambda everything, w: residual(everything[0], w, *everything[1])
+    change = lambda everything, w, R: linear(everything[0], w, *everything[2]).change(R)
+    return implicit_root(of_all, change, (args, of_residual, of_linear), jax.lax.stop_gradient(w)), aux
+
+
+def _small(q):
+    """The residual of a constraint, in the units of its row, from which on a state is off it."""
+    return jnp.finfo(q.dtype).eps ** 0.5
+
+
+def off_constraints(flat: Flat, t, q, v) -> Float[Array, ""]:
+    """Largest residual of g and ψ, in the units of its row."""
+    G, beside = jax.jacfwd(flat.holonomic, argnums=1)(t, q), jax.jacfwd(flat.nonholonomic, argnums=2)(t, q, v)
+    return jnp.maximum(_off(flat.holonomic(t, q), G, q), _off(velocity_residual(flat, t, q, v), jnp.concatenate([G, beside]), v))
+
+
+def _off(residual, rows, x):
+    """Largest residual, in the units of its row: rounding makes some eps of it."""
+    size = jnp.sum(jnp.abs(rows), axis=1) * (1 + jnp.max(jnp.abs(x)))
+    return jnp.max(jnp.abs(residual) / jnp.where(size > 0, size, 1), initial=0.0)
+
+
+def consistent_state(
+    system: System, q: PyTree, qdot: PyTree, params: PyTree = None, *, t: Any = 0.0, states: PyTree = None, fixed: Sequence[Any] = ()
+) -> tuple[PyTree, PyTree]:
+    r"""The state on the constraints that is nearest to the given one, in the metric of M.
+
+    $$ \min \tfrac12 (q - q_0)^T M (q - q_0) \text{ with } g(t, q) = 0, \qquad
+       \min \tfrac12 (\dot q - \dot q_0)^T M (\dot q - \dot q_0) \text{ with } \dot g = 0,\ a = 0 $$
+
+    **Arguments:** the state `q`, `qdot` (one pytree structure), `params`, the time `t`, `states` as for `acceleration`; `fixed` lists
+    coordinates whose position and velocity stay as given: keys where q is a mapping, indices where it is an array or a sequence. Any
+    consistent units.
+
+    **Returns:** (q, qdot), structured like q; differentiable in every argument.
+
+    **Raises:** `ValueError` where no such state was found, where inertia is missing, or where `fixed` names no coordinate.
+    Under `jit` the state is NaN there.
+
+    **Source:** Hairer, Lubich & Wanner, Geometric Numerical Integration, section IV.4.
+
+    ```python
+    import jax.numpy as jnp
+    import jaxlag as jl
+    rod = jl.System(lambda qdot: 0.5 * qdot @ qdot, holonomic=lambda q, l: q @ q - l**2)
+    jl.consistent_state(rod, jnp.array([3.0, 4.0]), jnp.array([1.0, 0.0]), {"l": 10.0})  # [6, 8], [0.64, −0.48]
+    ```
+    """
+    core = _StateOn(_fixed_indices(coordinates(q, "q"), tuple(fixed)))
+    (new_q, new_qdot), (reached, determined, affine, defined) = at_state(core, system, q, qdot, params, t, states)
+    if is_concrete(reached):
+        for passed, reason in ((defined, UNDEFINED), (determined, NO_INERTIA), (affine, NOT_AFFINE), (reached, IMPOSSIBLE)):
+            if not passed:
+                raise ValueError(explained(reason, system, q, qdot, params, t, states))
+    return new_q, new_qdot
+
+
+IMPOSSIBLE = (
+    "`holonomic` and `nonholonomic` must be satisfied by some state near the start, but none was found. "
+    "Start nearer, fix fewer coordinates, or look for constraints that contradict each other."
+)
+
+
+@dataclasses.dataclass(frozen=True)
+class _StateOn:
+    """`nearest_state` with some coordinates fixed; compared by these, so that it is compiled once."""
+
+    held: tuple[int, ...]
+
+    def __call__(self, flat: Flat, t, q, v):
+        free = [i for i in range(q.size) if i not in self.held]
+        q, v, *flags = nearest_state(flat, t, q, v, free)
+        known = jnp.all(jnp.stack(flags))
+        return (flat.unravel(jnp.where(known, q, jnp.nan)), flat.unravel(jnp.where(known, v, jnp.nan))), flags
+
+
+def _fixed_indices(q: PyTree, fixed: tuple) -> tuple[int, ...]:
+    leaves, structure = jax.tree.flatten(q)
+    ends = np.cumsum([leaf.size for leaf in leaves])
+    indices = [np.arange(end - leaf.size, end).reshape(leaf.shape) for end, leaf in zip(ends, leaves, strict=True)]
+    tree = jax.tree.unflatten(structure, indices)
+    held: list[int] = []
+    for name in fixed:
+        try:
+            part = getattr(tree, name) if isinstance(name, str) and hasattr(tree, "_fields") else tree[name]
+        except (KeyError, IndexError, TypeError, AttributeError):
+            there = sorted(map(str, tree)) if isinstance(tree, dict) else f"of structure {structure}"
+            raise ValueError(f"`fixed` must name coordinates of q, but holds {name!r}. The coordinates are {there}.") from None
+        held += [int(i) for leaf in jax.tree.leaves(part) for i in np.ravel(leaf)]
+    return tuple(sorted(set(held)))
