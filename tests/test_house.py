@@ -108,6 +108,7 @@ WINGS = {  # each imports only from those above it, and each file of a wing only
         "padding",
         "failure",
         "interval_loop",
+        "integrated",
         "integrate",
         "solution_map",
         "simulate",

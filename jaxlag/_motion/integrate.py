@@ -23,7 +23,8 @@ from .._model.signal import broken_signals, moves_smoothly
 from .._program.single_kernel import in_one_kernel
 from .events import begun
 from .first_order import EquationsOfMotion, Formulation
-from .interval_loop import integrated, varied_along
+from .integrated import integrated
+from .interval_loop import varied_along
 from .mode_changes import started
 from .progress import Bar
 from .protocol import Arguments, FirstOrderSystem, Scales
