@@ -30,7 +30,9 @@ def integrated(equations, solver, max_steps, meter, y0, origin, args, ts, tolera
     along = tuple(zip(recorded.directions, (of_origin for _, of_origin in directions), strict=True))
     large = [ts, *(array for signal in recorded.signals.values() for array in (signal.ts, signal.values))]
     numbers = Numbers((recorded.params, origin), args, tolerances, along)
-    given, unpack, rows = packed((start, (y0, following, numbers)), large)  # a number first that is not NaN, as the kernel asks for
+    at_start = ts <= start  # the first, which may be repeated, as a delay has it
+    # A number comes first that is not NaN, as the kernel asks for.
+    given, unpack, rows = packed((start, (y0, following, at_start.sum(), numbers)), large)
 
     def started(given):
         ts, *columns = rows(given)
@@ -39,8 +41,8 @@ def integrated(equations, solver, max_steps, meter, y0, origin, args, ts, tolera
         return functools.partial(loop.run, *unpack(given)[1])
 
     length = ts.size + most(equations).sum()
-    unknown = jnp.full((length - 1, *y0.shape), jnp.inf, y0.dtype)
-    saved = jnp.concatenate([y0[None], unknown])
+    there = jnp.concatenate([at_start, jnp.zeros(length - ts.size, bool)])
+    saved = jnp.where(there.reshape(-1, *[1] * y0.ndim), y0[None], jnp.inf)
     if reverse:
         write = lambda saved, i, y, wanted: saved.at[i].set(y, pred=wanted)
         checkpointed = functools.partial(while_loop, max_steps=max_steps, buffers=lambda carry: carry[2], kind="checkpointed")

@@ -85,8 +85,8 @@ class IntervalLoop(NamedTuple):
         """Of a sample of the motion, or of the last."""
         return self.ts.at(jnp.minimum(sample, self.ts.shape[0] - 1))[0]
 
-    def run(self, y0, following, numbers: Numbers, saved: Any, write: Callable, loop: Callable) -> tuple[Moving, Steps, Any]:
-        """From the first sample to the last, or as far as it goes; with what was saved at the samples."""
+    def run(self, y0, following, sample, numbers: Numbers, saved: Any, write: Callable, loop: Callable) -> tuple[Moving, Steps, Any]:
+        """From the first sample to the last, or as far as it goes; with what was saved at the samples. `sample` is the first one later."""
         first, last = (self.ts.at(i)[0] for i in (0, self.ts.shape[0] - 1))
         rtol, atol = numbers.tolerances
         rounding = jnp.finfo(y0.dtype).eps * jnp.maximum(jnp.abs(first), jnp.abs(last))
@@ -114,13 +114,13 @@ class IntervalLoop(NamedTuple):
             going = (steps.result == dfx.RESULTS.successful) & (steps.accepted + steps.rejected < self.max_steps)
             return within & going & ~has_stopped(self.equations, now(moving.y))
 
-        moving, steps = stepping._start(controller, first, last, y0, following, numbers)
+        moving, steps = stepping._start(controller, first, last, y0, following, sample, numbers)
         saved = with_events(self.equations, write, saved, self.ts.shape[0], None, y0, now)
         moving, steps, saved, meter = loop(going_on, turn, (moving, steps, saved, self.meter.init()))
         self.meter.close(meter)
         return moving, steps, saved
 
-    def _start(self, controller, first, last, y0, following, numbers: Numbers) -> tuple[Moving, Steps]:
+    def _start(self, controller, first, last, y0, following, sample, numbers: Numbers) -> tuple[Moving, Steps]:
         """What is there before the first step."""
         term, y = self._term(), _alone(y0, numbers)
         params, origin = numbers.varied
@@ -132,7 +132,7 @@ class IntervalLoop(NamedTuple):
         unvaried = lambda x: functools.reduce(_with_zeros, y0.shape[y.ndim :], x)
         moving = Moving(unvaried(origin), y0, jax.tree.map(unvaried, changing))  # y0 is that at a fixed time, where there are directions
         zero = jnp.array(0)
-        return moving, Steps(t1 - first, rest, controller_state, is_new, following, zero + 1, dfx.RESULTS.successful, zero, zero)
+        return moving, Steps(t1 - first, rest, controller_state, is_new, following, sample, dfx.RESULTS.successful, zero, zero)
 
     def _varied(self, controller, rounding, steps: Steps, numbers: Numbers) -> Callable:
         """A step of what moves and its value at a sample, with their variations along the directions of what is varied, for each order."""

@@ -13,7 +13,7 @@ from scipy.linalg import expm
 
 import jaxlag as jl
 from jaxlag import Cubic, Linear, Signal, ZeroOrderHold
-from jaxlag._motion import integrate, solution_map
+from jaxlag._motion import solution_map
 
 RNG = np.random.default_rng(3)
 TS = np.cumsum(RNG.uniform(0.05, 0.4, 40)) - 0.3
@@ -334,11 +334,13 @@ def test_new_values_trace_nothing(monkeypatch):
     assert len(traces) == 1
 
 
-def test_without_held_signals_nothing_changes(monkeypatch):
-    monkeypatch.setattr(integrate, "integrated", None)
+def test_neither_samples_nor_a_smooth_signal_end_steps():
+    """u = 6 t through 101 points, sampled as often: x = t³."""
+    ts = np.linspace(0, 1, 101)
     cart = jl.System(lambda qdot: 0.5 * qdot**2, force={"cubic": lambda t, u: u(t)})
-    end = jl.simulate(cart, 0.0, 0.0, [0.0, 1.0], {"u": Signal([0, 1], [0, 6], Cubic())}).q[-1]
-    np.testing.assert_allclose(end, 1.0, rtol=1e-12)
+    motion = jl.simulate(cart, 0.0, 0.0, ts, {"u": Signal(ts, 6 * ts, Cubic())})
+    np.testing.assert_allclose(motion.q, ts**3, atol=1e-12)
+    assert motion.stats["num_steps"] < 20
 
 
 @pytest.mark.filterwarnings("ignore:jaxlag runs in single precision")

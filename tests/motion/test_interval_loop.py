@@ -59,3 +59,17 @@ def test_samples_beyond_the_end_of_a_motion_are_not_made_up():
     np.testing.assert_array_equal(there, TS[there][-1] >= TS)
     whole = jl.simulate(SMOOTH, *START, TS, PARAMS)
     np.testing.assert_allclose(found.q[there], whole.q[there], rtol=0, atol=1e-14)
+
+
+HELD = jl.System(lagrangian, force={"wind": lambda t, u: jnp.array([1.0, 0.0]) * u(t)}, holonomic={"rod": rod})
+STEPPED = PARAMS | {"u": jl.Signal(np.linspace(0, 4, 9), np.arange(9.0) - 4, jl.ZeroOrderHold())}
+
+
+@pytest.mark.parametrize("case", [(SMOOTH, PARAMS), (DRY, PARAMS), (HELD, STEPPED)], ids=["smooth", "dry", "input"])
+def test_first_and_last_times_may_be_repeated_inside_a_program(case):
+    """As the delay of a sensor has it, and padding: they show the same state."""
+    system, params = case
+    ts = jnp.array([0.0, 0.0, 0.0, 0.3, 1.1, 2.0, 2.0])
+    found = jax.jit(lambda ts: jl.simulate(system, *START, ts, params).q)(ts)
+    expected = jl.simulate(system, *START, ts[2:-1], params).q
+    np.testing.assert_allclose(found, expected[jnp.array([0, 0, 0, 1, 2, 3, 3])], rtol=0, atol=1e-9)
