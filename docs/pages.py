@@ -15,6 +15,13 @@ REFERENCE = {
     "Systems": "System Contact Newton Poisson Event Falling Rising Either Negative Every State Sampled "
     "virtual_work rate substitute Signal ZeroOrderHold Linear Cubic "
     "dissipation.sliding dissipation.viscous dissipation.drag dissipation.power_law dissipation.stribeck dissipation.speed",
+    "Bodies in space": "rigid.rotation_x rigid.rotation_y rigid.rotation_z rigid.rotation rigid.euler rigid.Euler rigid.quaternion "
+    "rigid.unit rigid.to_quaternion rigid.quaternion_rate rigid.rotation_vector rigid.angular_velocity rigid.kinetic_energy rigid.frame "
+    "rigid.Frame rigid.spherical rigid.revolute "
+    "rigid.prismatic rigid.cylindrical rigid.universal rigid.fixed rigid.same_axes rigid.on_plane rigid.length rigid.wheel_height "
+    "rigid.rolling rigid.rolling_ball rigid.inertia.box rigid.inertia.cylinder rigid.inertia.hollow_cylinder rigid.inertia.sphere "
+    "rigid.inertia.hollow_sphere rigid.inertia.ellipsoid rigid.inertia.steiner rigid.inertia.rotated rigid.inertia.principal_axes "
+    "rigid.inertia.Principal rigid.inertia.matrix rigid.inertia.physical rigid.inertia.log_cholesky rigid.inertia.Body",
     "At one state": "acceleration Acceleration mass_matrix momentum energy constraint_jacobian constraint_residual constraint_force powers "
     "Residual consistent_state examine Examination",
     "Motions": "simulate simulate_many Trajectory FrictionState ContactState EventState RESULTS Instant Interpolated load Dop853 Dopri5 "

@@ -2,7 +2,7 @@
 
 from importlib.metadata import PackageNotFoundError, version
 
-from . import dissipation as dissipation, learnt as learnt, plot as plot
+from . import dissipation as dissipation, learnt as learnt, plot as plot, rigid as rigid
 from ._mechanics.acceleration import Acceleration as Acceleration, acceleration as acceleration, constraint_force as constraint_force
 from ._draw.animate import animate as animate
 from ._paper.equations import equations as equations

@@ -5,11 +5,11 @@ import inspect
 import pytest
 
 import jaxlag
-from jaxlag import dissipation, learnt, plot
+from jaxlag import dissipation, learnt, plot, rigid
 
 pytestmark = pytest.mark.fast
 
-MODULES = {"": jaxlag, "dissipation.": dissipation, "learnt.": learnt, "plot.": plot}
+MODULES = {"": jaxlag, "dissipation.": dissipation, "learnt.": learnt, "plot.": plot, "rigid.": rigid, "rigid.inertia.": rigid.inertia}
 
 
 def public_functions():

@@ -24,7 +24,7 @@ import numpy as np
 import pytest
 
 import jaxlag
-from jaxlag import dissipation, learnt, plot
+from jaxlag import dissipation, learnt, plot, rigid
 
 
 def _public_names():
@@ -34,6 +34,8 @@ def _public_names():
         "dissipation.": vars(dissipation),
         "learnt.": vars(learnt),
         "plot.": {n: getattr(plot, n) for n in plot.__all__},
+        "rigid.": vars(rigid),
+        "rigid.inertia.": {n: getattr(rigid.inertia, n) for n in rigid.inertia.__all__},
     }
     for home, names in homes.items():
         for name, thing in names.items():
@@ -70,7 +72,7 @@ def _doc(name):
     doc = inspect.getdoc((PUBLIC | METHODS)[name]) or ""
     home = name.rpartition(".")[0]
     others = re.findall(r"\bas (?:for |in )?`(\w+)`", doc)
-    found = [inspect.getdoc(PUBLIC.get(f"{home}.{other}" if home in ("learnt", "plot") else other)) or "" for other in others]
+    found = [inspect.getdoc(PUBLIC.get(f"{home}.{other}" if home in ("learnt", "plot", "rigid") else other)) or "" for other in others]
     return "\n".join([doc, *found])
 
 

@@ -223,7 +223,7 @@ WINGS = {  # each imports only from those above it, and each file of a wing only
         "fit",
     ],
 }
-BESIDE = ["dissipation", "learnt"]  # need nothing of the package
+BESIDE = ["dissipation", "learnt", "rigid"]  # need nothing of the package
 ON_TOP = ["plot", "__init__", "__main__"]  # import from any wing
 
 
@@ -264,12 +264,13 @@ def test_a_file_imports_only_from_files_before_it(wing, name):
 def test_every_file_has_its_place():
     found = {(file.parent.name, file.stem) for file in PACKAGE.glob("_*/*.py") if file.stem != "__init__"}
     assert found == set(FILES)
-    assert {file.stem for file in PACKAGE.glob("*.py")} | {"learnt"} == set(BESIDE + ON_TOP)
+    assert {file.stem for file in PACKAGE.glob("*.py")} | {"learnt", "rigid"} == set(BESIDE + ON_TOP)
 
 
 def test_what_stands_beside_the_wings_needs_nothing_of_them():
     assert not list(_imported(PACKAGE / "dissipation.py"))
-    assert {home for file in (PACKAGE / "learnt").glob("*.py") for home, _ in _imported(file)} == {"learnt"}
+    for package in ("learnt", "rigid"):
+        assert {home for file in (PACKAGE / package).glob("*.py") for home, _ in _imported(file)} == {package}
 
 
 @pytest.mark.parametrize("wing, names", WINGS.items())

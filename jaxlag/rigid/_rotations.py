@@ -1,0 +1,273 @@
+"""Rotation matrices from coordinates: R turns the components of a vector in the axes of a body into those in space."""
+
+import dataclasses
+import math
+from collections.abc import Callable
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from ._vectors import check_rotation, floating, known, one, skew, vector
+
+SERIES = 12  # terms of a power series that is used up to an angle of 1: the last is below 1e-23
+
+
+def rotation(axis: Any, angle: Any) -> Float[Array, "3 3"]:
+    r"""Rotation about an axis.
+
+    $$ R = 1 + \sin\alpha\,[a]_\times + (1 - \cos\alpha)\,[a]_\times^2 $$
+
+    **Arguments:** `axis`: a, a vector of shape (3,), which is divided by its length; `angle`: α in rad, counted by the right-hand rule.
+
+    **Returns:** a rotation matrix, (3, 3).
+
+    **Raises:** `ValueError` where `axis` is no vector of three numbers, or is zero.
+
+    **Source:** Goldstein, Classical Mechanics, 3rd ed., eq. 4.62 (the active rotation).
+
+    ```python
+    import jax.numpy as jnp
+    from jaxlag import rigid
+    rigid.rotation([0, 0, 2.0], jnp.pi / 2) @ jnp.array([1.0, 0.0, 0.0])  # [0, 1, 0]
+    ```
+    """
+    a, seen = vector(axis, "axis"), known(axis)
+    if seen is not None and not np.any(seen):
+        raise ValueError("`axis` must point somewhere, but is zero. Give a direction, such as [0, 0, 1].")
+    K = skew(a / jnp.linalg.norm(a))
+    return one(a) + jnp.sin(angle) * K + (1 - jnp.cos(angle)) * (K @ K)
+
+
+def rotation_x(angle: Any) -> Float[Array, "3 3"]:
+    """Rotation about the x axis by an angle in rad: y turns towards z.
+
+    **Arguments:** `angle`: a number. **Returns:** a rotation matrix, (3, 3). **Raises:** nothing.
+
+    **Source:** Goldstein, 3rd ed., section 4.4.
+
+    ```python
+    from jaxlag import rigid
+    rigid.rotation_x(0.3)[1, 2]  # −sin 0.3 = −0.2955
+    ```
+    """
+    return _about(0, angle)
+
+
+def rotation_y(angle: Any) -> Float[Array, "3 3"]:
+    """Rotation about the y axis by an angle in rad: z turns towards x.
+
+    **Arguments:** `angle`: a number. **Returns:** a rotation matrix, (3, 3). **Raises:** nothing.
+
+    **Source:** Goldstein, 3rd ed., section 4.4.
+
+    ```python
+    from jaxlag import rigid
+    rigid.rotation_y(0.3)[0, 2]  # sin 0.3 = 0.2955
+    ```
+    """
+    return _about(1, angle)
+
+
+def rotation_z(angle: Any) -> Float[Array, "3 3"]:
+    """Rotation about the z axis by an angle in rad: x turns towards y.
+
+    **Arguments:** `angle`: a number. **Returns:** a rotation matrix, (3, 3). **Raises:** nothing.
+
+    **Source:** Goldstein, 3rd ed., section 4.4.
+
+    ```python
+    from jaxlag import rigid
+    rigid.rotation_z(0.3)[0, 1]  # −sin 0.3 = −0.2955
+    ```
+    """
+    return _about(2, angle)
+
+
+def _about(axis: int, angle: Any) -> Float[Array, "3 3"]:
+    """About one of the axes: two products fewer than by Rodrigues' formula."""
+    c, s = jnp.cos(floating(angle)), jnp.sin(floating(angle))
+    full, zero = jnp.ones_like(c), jnp.zeros_like(c)
+    rows = [[full, zero, zero], [zero, c, -s], [zero, s, c]]
+    return jnp.stack([jnp.stack([rows[(i - axis) % 3][(j - axis) % 3] for j in range(3)]) for i in range(3)])
+
+
+@dataclasses.dataclass(frozen=True)
+class Euler:
+    """Three rotations one after another, each about an axis that the ones before have turned; made by `euler`.
+
+    - `sequence`: the axes, such as "zxz".
+    """
+
+    sequence: str
+
+    def __call__(self, angles: Any) -> Float[Array, "3 3"]:
+        """The rotation matrix of three `angles` in rad."""
+        first, second, third = (_about("xyz".index(axis), angle) for axis, angle in zip(self.sequence, _three(angles), strict=True))
+        return first @ second @ third
+
+    def margin(self, angles: Any) -> Float[Array, ""]:
+        """How far the `angles` are from their singularity, where the first and the third turn about the same axis: 1 at best, 0 there.
+
+        |sin β| where first and third axis have the same name, |cos β| otherwise; rates of the angles grow by its inverse.
+        """
+        _, beta, _ = _three(angles)
+        return jnp.abs(jnp.sin(beta) if self.sequence[0] == self.sequence[2] else jnp.cos(beta))
+
+
+def euler(sequence: str) -> Euler:
+    r"""Rotations about three axes one after another, each of which the rotations before have turned.
+
+    $$ R = R_a(\alpha)\, R_b(\beta)\, R_c(\gamma) \text{ for the sequence } abc $$
+
+    "zxz": precession, nutation and spin of a top; "zyx": yaw, pitch and roll; "zxy": yaw, roll and pitch of a bicycle.
+
+    **Arguments:** `sequence`: three of the letters x, y, z, no two neighbours alike.
+
+    **Returns:** a function of three angles in rad (an array, a sequence, or a dict of three in this order), whose value is a rotation
+    matrix; its method `margin(angles)` says how far they are from their singularity, from 1 to 0. There the mass matrix is singular and
+    steps become small: an event can end the motion before, or quaternions avoid it.
+
+    **Raises:** `ValueError` where the sequence is none, or repeats an axis.
+
+    **Source:** Goldstein, Classical Mechanics, 3rd ed., section 4.4 and appendix A.
+
+    ```python
+    import jaxlag as jl
+    top = jl.rigid.euler("zxz")
+    top([0.1, 0.2, 0.3])[2, 2]  # cos 0.2 = 0.9801
+    jl.Event(when=lambda q: top.margin([q["phi"], q["theta"], q["psi"]]) - 1e-3, stop=True)  # before the singularity
+    ```
+    """
+    if not (isinstance(sequence, str) and len(sequence) == 3 and set(sequence) <= set("xyz")):
+        raise ValueError(f"`sequence` must be three of the letters x, y, z, but is {sequence!r}. Write e.g. 'zxz'.")
+    if sequence[0] == sequence[1] or sequence[1] == sequence[2]:
+        raise ValueError(f"`sequence` must not turn twice about the same axis in a row, but is {sequence!r}. Write e.g. 'zxz' or 'zyx'.")
+    return Euler(sequence)
+
+
+def quaternion(q: Any) -> Float[Array, "3 3"]:
+    r"""Rotation of a quaternion (w, x, y, z), w = cos(α/2) first.
+
+    $$ R = \frac{(w^2 - v\cdot v)\,1 + 2\,v v^T + 2 w\,[v]_\times}{w^2 + v\cdot v}, \qquad v = (x, y, z) $$
+
+    A rotation for every q ≠ 0: its length does not matter, and does not move. State the length as a constraint, `holonomic={"unit":
+    rigid.unit}`; a start of another length is put on it.
+
+    **Arguments:** `q`: four numbers. **Returns:** a rotation matrix, (3, 3).
+
+    **Raises:** `ValueError` where `q` has another shape.
+
+    **Source:** Shuster, A survey of attitude representations, J. Astronaut. Sci. 41 (1993) 439, with Hamilton's product.
+
+    ```python
+    import jax.numpy as jnp
+    from jaxlag import rigid
+    rigid.quaternion([jnp.cos(0.1), 0.0, 0.0, jnp.sin(0.1)])[0, 1]  # −sin 0.2 = −0.1987
+    ```
+    """
+    q = vector(q, "q", 4)
+    w, v = q[0], q[1:]
+    return ((w**2 - v @ v) * one(v) + 2 * jnp.outer(v, v) + 2 * w * skew(v)) / (q @ q)
+
+
+def to_quaternion(R: Any) -> Float[Array, "4"]:
+    """The quaternion (w, x, y, z) of length 1 with w ≥ 0 of a rotation: to start where angles say.
+
+    **Arguments:** `R`: a rotation matrix, (3, 3). **Returns:** (4,). At angles of π either of two signs.
+
+    **Raises:** `ValueError` where `R` is no rotation, as far as its numbers are known.
+
+    **Source:** Shepperd, Quaternion from rotation matrix, J. Guid. Control 1 (1978) 223.
+
+    ```python
+    from jaxlag import rigid
+    rigid.to_quaternion(rigid.rotation_z(0.2))  # [0.995, 0.0, 0.0, 0.0998]
+    ```
+    """
+    R = check_rotation(R, "`R`")
+    odd, even = R - R.T, R + R.T
+    diagonal = jnp.diagonal(R)
+    first = jnp.concatenate([1 + jnp.trace(R)[None], jnp.stack([odd[2, 1], odd[0, 2], odd[1, 0]])])
+    others = even + jnp.diag(1 - jnp.trace(R) * jnp.ones_like(diagonal))
+    products = jnp.concatenate([first[None], jnp.concatenate([first[1:, None], others], axis=1)])  # 4 q qᵀ
+    q = products[jnp.argmax(jnp.diagonal(products))]  # the row of the largest component
+    return q * jnp.where(q[0] < 0, -1, 1) / jnp.linalg.norm(q)
+
+
+def quaternion_rate(q: Any, omega: Any) -> Float[Array, "4"]:
+    r"""The rate of a quaternion of a body that turns: its q̇ at the start.
+
+    $$ \dot q = \tfrac12\, q \circ (0, \omega) $$
+
+    **Arguments:** `q`: (w, x, y, z); `omega`: the angular velocity in the axes of the body, (3,).
+
+    **Returns:** (4,), at a right angle to q. **Raises:** `ValueError` where `q` or `omega` has another shape.
+
+    **Source:** Shuster, A survey of attitude representations, J. Astronaut. Sci. 41 (1993) 439.
+
+    ```python
+    from jaxlag import rigid
+    rigid.quaternion_rate([1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 3.0])  # [0, 0, 0, 1.5]
+    ```
+    """
+    q, omega = vector(q, "q", 4), vector(omega, "omega")
+    w, v = q[0], q[1:]
+    return 0.5 * jnp.concatenate([-(v @ omega)[None], w * omega + jnp.cross(v, omega)])
+
+
+def unit(q: Any) -> Float[Array, ""]:
+    """q · q − 1, which is zero for a quaternion of length 1: its constraint, for `System(holonomic=...)`.
+
+    **Arguments:** `q`: a quaternion, (4,), or any vector. **Returns:** a number.
+
+    **Raises:** nothing.
+
+    ```python
+    from jaxlag import rigid
+    rigid.unit([1.0, 0.0, 0.0, 0.0])  # 0
+    ```
+    """
+    q = floating(q)
+    return q @ q - 1
+
+
+def rotation_vector(r: Any) -> Float[Array, "3 3"]:
+    r"""Rotation about a vector by its length in rad, the exponential map.
+
+    $$ R = 1 + \frac{\sin\alpha}{\alpha}[r]_\times + \frac{1 - \cos\alpha}{\alpha^2}[r]_\times^2, \qquad \alpha = |r| $$
+
+    Smooth at r = 0. It is singular at angles of 2π.
+
+    **Arguments:** `r`: three numbers. **Returns:** a rotation matrix, (3, 3).
+
+    **Raises:** `ValueError` where `r` has another shape.
+
+    **Source:** Murray, Li & Sastry, A Mathematical Introduction to Robotic Manipulation, eq. 2.14.
+
+    ```python
+    from jaxlag import rigid
+    rigid.rotation_vector([0.0, 0.0, 0.3])[0, 1]  # −sin 0.3 = −0.2955
+    ```
+    """
+    r = vector(r, "r")
+    K, square = skew(r), r @ r
+    return one(r) + _ratio(square, 1, jnp.sin, lambda a: a) * K + _ratio(square, 2, lambda a: 1 - jnp.cos(a), jnp.square) * (K @ K)
+
+
+def _ratio(square: Array, first: int, above: Callable, below: Callable) -> Array:
+    """sin α/α or (1 − cos α)/α² of α², by its series for small angles, so that all derivatives are right there, too."""
+    small = square < 1
+    terms = [(-1) ** k / math.factorial(2 * k + first) for k in range(SERIES)]
+    series = jnp.polyval(jnp.array(terms[::-1], square.dtype), jnp.where(small, square, 0))
+    angle = jnp.sqrt(jnp.where(small, 1, square))
+    return jnp.where(small, series, above(angle) / below(angle))
+
+
+def _three(angles: Any) -> tuple:
+    """Three angles out of an array, a sequence or a dict."""
+    given = tuple(angles.values()) if isinstance(angles, dict) else tuple(angles)
+    if len(given) != 3:
+        raise ValueError(f"`angles` must be three numbers, but are {len(given)}. Give one for each letter of the sequence.")
+    return given

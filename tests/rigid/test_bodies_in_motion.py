@@ -1,0 +1,129 @@
+"""Tops, free bodies, coins and linkages in space: motions in closed form, and one motion in two sets of coordinates."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.special import ellipj, ellipk
+
+import jaxlag as jl
+from jaxlag import rigid
+
+EULER = rigid.euler("zxz")
+HEIGHT, MOMENTS, PARAMS = 0.1, np.array([2e-3, 2e-3, 8e-4]), {"m": 0.5, "g": 9.81}  # a top on its tip; moments about its centre
+
+
+def top(rotation):
+    """L of a body whose point (0, 0, −HEIGHT) stays at the origin."""
+    position = lambda q: rotation(q) @ jnp.array([0.0, 0.0, HEIGHT])
+    T = lambda q, qdot, m: rigid.kinetic_energy(m, MOMENTS, position, rotation)(q, qdot)
+    return lambda q, qdot, m, g: T(q, qdot, m) - m * g * position(q)[2]
+
+
+BY_ANGLES = jl.System(top(EULER))
+BY_QUATERNION = jl.System(top(rigid.quaternion), holonomic={"unit": rigid.unit})
+ANGLES, RATES = np.array([0.2, 0.6, -0.3]), np.array([0.0, 0.0, 90.0])  # released with a spin: the tip of its axis draws cusps
+
+
+def as_quaternion(angles, rates):
+    """The same start, by a quaternion."""
+    q = rigid.to_quaternion(EULER(angles))
+    return q, rigid.quaternion_rate(q, rigid.angular_velocity(EULER)(angles, rates))
+
+
+def test_a_heavy_top_by_angles_and_by_a_quaternion():
+    """The same motion over 20 s, some 290 turns; and its nutation by elliptic functions (Goldstein, section 5.7).
+
+    u = cos θ moves between two zeros of u̇² = f(u), cubic, as u₁ + (u₂ − u₁) sn²(½√(β(u₃ − u₁)) (t − t₀)).
+    """
+    ts = np.linspace(0, 20, 401)
+    tight = {"rtol": 1e-11, "atol": 1e-12}
+    angles = jl.simulate(BY_ANGLES, ANGLES, RATES, ts, PARAMS, **tight)
+    turned = jl.simulate(BY_QUATERNION, *as_quaternion(ANGLES, RATES), ts, PARAMS, **tight)
+    axes = jax.vmap(EULER)(angles.q)
+    np.testing.assert_allclose(axes[:, :, 2], jax.vmap(rigid.quaternion)(turned.q)[:, :, 2], atol=1e-8)
+    np.testing.assert_allclose(axes, jax.vmap(rigid.quaternion)(turned.q), atol=1e-7)  # the spin, 1800 rad, included
+
+    A, C, weight = MOMENTS[0] + 0.5 * HEIGHT**2, MOMENTS[2], 0.5 * 9.81 * HEIGHT
+    u0, spin = np.cos(0.6), 90.0
+    a, b, beta = C * spin / A, C * spin * u0 / A, 2 * weight / A
+    alpha = beta * u0  # θ̇ = φ̇ = 0 at the start
+    f = np.polynomial.Polynomial([alpha - b**2, 2 * a * b - beta, -alpha - a**2, beta])  # (1 − u²)(α − βu) − (b − au)²
+    u1, u2, u3 = np.sort(f.roots().real)
+    k2, rate = (u2 - u1) / (u3 - u1), 0.5 * np.sqrt(beta * (u3 - u1))
+    np.testing.assert_allclose(u2, u0, rtol=1e-12)  # it falls from its highest point
+    sn, *_ = ellipj(rate * ts + ellipk(k2), k2)
+    np.testing.assert_allclose(axes[:, 2, 2], u1 + (u2 - u1) * sn**2, atol=1e-8)
+
+
+def test_a_spinning_wing_nut_turns_over_and_over():
+    """Dzhanibekov's flips: ω in the axes of the body by Jacobi's functions (Landau & Lifshitz, Mechanics, section 37), I₁ < I₂ < I₃."""
+    I = np.array([1.0, 2.0, 2.5])
+    free = jl.System(lambda q, qdot: rigid.kinetic_energy(1.0, I, lambda q: jnp.zeros(3), rigid.quaternion)(q, qdot), holonomic=rigid.unit)
+    w0 = np.array([0.05, 2.0, 0.0])
+    q0 = np.array([1.0, 0.0, 0.0, 0.0])
+    ts = np.linspace(0, 30, 301)
+    motion = jl.simulate(free, q0, rigid.quaternion_rate(q0, w0), ts, rtol=1e-11, atol=1e-12)
+    w = np.array(jax.vmap(rigid.angular_velocity(rigid.quaternion))(motion.q, motion.qdot))
+
+    E2, M2 = I @ w0**2, I**2 @ w0**2  # 2E and M²
+    assert E2 * I[1] > M2  # so that the roles of 1 and 3 are exchanged, and ω₁ keeps its sign
+    k2 = (I[2] - I[1]) * (M2 - E2 * I[0]) / ((I[1] - I[0]) * (E2 * I[2] - M2))
+    rate = np.sqrt((I[1] - I[0]) * (E2 * I[2] - M2) / np.prod(I))
+    first, third = (np.sqrt(x / y) for x, y in ((E2 * I[2] - M2, I[0] * (I[2] - I[0])), (M2 - E2 * I[0], I[2] * (I[2] - I[0]))))
+    second = np.sqrt((M2 - E2 * I[0]) / (I[1] * (I[1] - I[0])))
+    sn, cn, dn, _ = ellipj(rate * ts + ellipk(k2), k2)  # ω₂ is greatest at the start
+    expected = np.stack([first * dn, second * sn, third * cn], axis=1)
+    np.testing.assert_allclose(w, expected, atol=1e-8)
+    assert np.sum(np.diff(np.sign(w[:, 1])) != 0) >= 3  # it turns over
+    L = np.einsum("tij,tj->ti", jax.vmap(rigid.quaternion)(motion.q), I * w)
+    np.testing.assert_allclose(L, np.broadcast_to(I * w0, L.shape), atol=1e-9)
+
+
+def disc(q):
+    """A coin of zxz angles, its axle the z axis of the body."""
+    return rigid.frame(q["x"], EULER(q["angles"]))
+
+
+COIN = jl.System(
+    lambda q, qdot, m, g, r: (
+        rigid.kinetic_energy(m, rigid.inertia.cylinder(m, r, 0.0), lambda q: q["x"], lambda q: EULER(q["angles"]))(q, qdot)
+        - m * g * q["x"][2]
+    ),
+    holonomic={"stands": lambda q, r: rigid.wheel_height(disc(q), r)},
+    nonholonomic={"rolls": lambda q, qdot, r: rigid.rolling(disc, r)(q, qdot)},
+)
+
+
+@pytest.mark.parametrize("theta", [1.2, 0.5])
+def test_a_rolling_coin_runs_in_a_circle(theta):
+    """(C + m r²) n Ω sin θ − A Ω² sin θ cos θ + m g r cos θ = 0, n the spin about its axle (Neimark & Fufaev, section II.2): as it begins,
+    so it goes on, and its centre stays on a circle.
+    """
+    m, g, r, Omega = 0.3, 9.81, 0.1, 3.0
+    A, C, s, c = m * r**2 / 4, m * r**2 / 2, np.sin(theta), np.cos(theta)
+    n = (A * Omega**2 * s * c - m * g * r * c) / ((C + m * r**2) * Omega * s)
+    angles, rates = np.array([0.0, theta, 0.0]), np.array([Omega, 0.0, n - Omega * c])
+    x = np.array([0.0, 0.0, r * s])
+    # rolling gives the centre its velocity: the point below is at rest
+    still = jl.consistent_state(
+        COIN, {"x": x, "angles": angles}, {"x": np.zeros(3), "angles": rates}, {"m": m, "g": g, "r": r}, fixed=["angles"]
+    )
+    ts = np.linspace(0, 4, 41)
+    motion = jl.simulate(COIN, *still, ts, {"m": m, "g": g, "r": r}, rtol=1e-11, atol=1e-12)
+    np.testing.assert_allclose(motion.q["angles"][:, 1], theta, atol=1e-7)
+    np.testing.assert_allclose(motion.qdot["angles"], np.broadcast_to(rates, (41, 3)), atol=1e-6)
+    v = np.array(motion.qdot["x"])
+    radius = np.linalg.norm(v[0]) / Omega
+    centre = np.array(motion.q["x"][0]) + np.cross([0.0, 0.0, 1.0], v[0]) / Omega
+    np.testing.assert_allclose(np.linalg.norm(np.array(motion.q["x"]) - centre, axis=1), radius, atol=1e-7)
+    np.testing.assert_allclose(motion.multipliers["stands"], m * g, rtol=1e-6)
+
+
+def test_a_gradient_through_a_top():
+    """Of where it points after half a second by its mass, forward and reverse, against differences."""
+    axis = lambda m: jl.simulate(BY_QUATERNION, *as_quaternion(ANGLES, RATES), [0.0, 0.5], {"m": m, "g": 9.81}).q[-1]
+    expected = (axis(0.5001) - axis(0.4999)) / 2e-4
+    found = jax.jit(lambda m: (jax.jacfwd(axis)(m), jax.jacrev(axis)(m)))(0.5)
+    for derivative in found:
+        np.testing.assert_allclose(derivative, expected, atol=1e-5)
