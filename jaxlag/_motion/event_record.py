@@ -1,7 +1,6 @@
 """What is recorded of events: each is a row behind the samples of a motion."""
 
 from collections.abc import Callable
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -9,19 +8,21 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, PyTree
 
 from .first_order import EquationsOfMotion
+from .protocol import FirstOrderSystem
 
 
-def most(equations: Any) -> np.ndarray:
+def most(equations: FirstOrderSystem) -> np.ndarray:
     """How many of each event are recorded."""
-    return np.array([event.most for _, event in equations.system.events] if equations.events else [], int)
+    events = equations.system.events if isinstance(equations, EquationsOfMotion) else ()
+    return np.array([event.most for _, event in events], int)
 
 
-def with_events(equations: Any, write: Callable, saved, samples: int, before: Float[Array, " y"] | None, y, number: Callable):
+def with_events(equations: FirstOrderSystem, write: Callable, saved, samples: int, before: Float[Array, " y"] | None, y, number: Callable):
     """What is saved, and behind the `samples` each event that has happened since y was as it was `before`, or ever.
 
     `number(y)` is y without its variations.
     """
-    if not equations.events:
+    if not (isinstance(equations, EquationsOfMotion) and equations.events):
         return saved
     now = equations.parts(number(y)).happened
     earlier = jnp.zeros_like(now) if before is None else equations.parts(before).happened
@@ -45,9 +46,9 @@ def records(equations: EquationsOfMotion, rows: Float[Array, "r y"]) -> dict[str
     return {name: jax.vmap(of_one)(of) for (name, _), of in zip(equations.system.events, of_each, strict=False)}
 
 
-def has_stopped(equations: Any, y) -> Bool[Array, ""]:
+def has_stopped(equations: FirstOrderSystem, y) -> Bool[Array, ""]:
     """Whether an event has ended the motion."""
-    return jnp.any(equations.parts(y).stopped > 0) if equations.events else jnp.array(False)
+    return jnp.any(equations.parts(y).stopped > 0) if isinstance(equations, EquationsOfMotion) else jnp.array(False)
 
 
 def overflows(equations: EquationsOfMotion, y) -> Bool[Array, ""]:

@@ -24,7 +24,6 @@ from .._program.single_kernel import in_one_kernel
 from .events import begun
 from .first_order import EquationsOfMotion, Formulation
 from .integrated import integrated
-from .interval_loop import varied_along
 from .mode_changes import started
 from .progress import Bar
 from .protocol import Arguments, FirstOrderSystem, Scales
@@ -32,7 +31,7 @@ from .results import RESULTS, from_diffrax
 from .runge_kutta import Dop853, ExplicitRungeKutta, is_explicit
 from .step_size import GuardedController
 from .stick_slip_solver import StickSlipSolver
-from .variational import VariationalEquations, derived, with_variations
+from .variational import VariationalEquations, derived, varied_along, with_variations
 from .wrapped_solver import ProjectedSolver, SamplingAdjoint
 
 
@@ -143,13 +142,20 @@ def with_status(ys, result, conditions, inputs) -> tuple[Array, RESULTS]:
 def states_at(
     equations: FirstOrderSystem, options: SolverOptions, adjoint: dfx.AbstractAdjoint, t0, y0, ts, args: Arguments, tolerances
 ) -> tuple[Array, RESULTS, dict]:
-    """States at the samples, the reason it stopped, and, among the counts, the `last` time and state that it reached.
+    """States at the samples of a single motion, the reason it stopped, and, among the counts, the `last` time and state that it reached.
 
-    By diffrax's own loop what has no nodes and is differentiated in reverse mode, or by an adjoint that the user has chosen, or is a batch.
+    By diffrax's own loop what has no nodes and is differentiated in reverse mode, or by an adjoint that the user has chosen.
     """
-    reverse, single = not isinstance(adjoint, dfx.ForwardMode), options.adjoint is None and args.own is None
-    if has_nodes(equations, args.params) or (single and not reverse):
-        return on_nodes(equations, options, t0, y0, ts, args, tolerances, reverse=reverse)
+    reverse = not isinstance(adjoint, dfx.ForwardMode)
+    if has_nodes(equations, args.params) or not (reverse or options.adjoint):
+        return in_one_loop(equations, options, t0, y0, ts, args, tolerances, reverse=reverse)
+    return by_diffrax(equations, options, adjoint, t0, y0, ts, args, tolerances)
+
+
+def by_diffrax(
+    equations: FirstOrderSystem, options: SolverOptions, adjoint: dfx.AbstractAdjoint, t0, y0, ts, args: Arguments, tolerances
+) -> tuple[Array, RESULTS, dict]:
+    """The same by diffrax's own loop, also of a batch."""
     rtol, atol = tolerances
     rounding = jnp.finfo(y0.dtype).eps * jnp.maximum(jnp.abs(ts[0]), jnp.abs(ts[-1]))
     alone = in_one_kernel if isinstance(adjoint, dfx.ForwardMode) else lambda function: function
@@ -197,14 +203,14 @@ def has_nodes(equations: FirstOrderSystem, params: PyTree) -> bool:
     )
 
 
-def on_nodes(
+def in_one_loop(
     equations: FirstOrderSystem, options: SolverOptions, t0, y0, ts, args: Arguments, tolerances, *, directions=(), reverse=False
 ) -> tuple[Array, RESULTS, dict]:
-    """States at the samples, from node to node, as `states_at`, with their variations along directions of (params, t0) for each order."""
+    """States at the samples as `states_at`, with their variations along directions of (params, t0) for each order."""
     adjoint = dfx.RecursiveCheckpointAdjoint() if reverse else dfx.ForwardMode()
     meter, dense = Meter() if options.progress else dfx.NoProgressMeter(), not has_nodes(equations, args.params)
-    projected = in_one_kernel(equations.projected) if dense else equations.projected
-    solver = _wrapped(options, equations, projected if equations.projection else None, adjoint)
+    back = in_one_kernel(equations.projected) if dense else equations.projected
+    solver = _wrapped(options, equations, back if equations.projection else None, adjoint)
     numbers = y0, t0, args, ts, tolerances
     ys, (result, stats) = integrated(equations, solver, options.max_steps, meter, *numbers, directions, reverse=reverse, dense=dense)
     if dense and equations.projection:

@@ -9,7 +9,7 @@ Source: Hairer, Nørsett & Wanner, Solving Ordinary Differential Equations I, se
 """
 
 import functools
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import diffrax as dfx
@@ -27,7 +27,9 @@ from .protocol import Arguments
 from .results import RESULTS, under_diffrax
 from .runge_kutta import ExplicitRungeKutta
 from .step_size import GuardedController, ResumingController, with_tolerances
-from .variational import derived, with_variations
+from .variational import varied_along, with_variations
+
+FIRST_STEP = 0.01  # what diffrax takes in a loop of its own; each step that is refused may be a fifth as long, each that is kept ten times
 
 
 class Moving(NamedTuple):
@@ -90,9 +92,10 @@ class IntervalLoop(NamedTuple):
         first, last = (self.ts.at(i)[0] for i in (0, self.ts.shape[0] - 1))
         rtol, atol = numbers.tolerances
         rounding = jnp.finfo(y0.dtype).eps * jnp.maximum(jnp.abs(first), jnp.abs(last))
-        smallest = {"dtmin": 4 * rounding, "force_dtmin": False} if self.dense else {"smallest": 4 * rounding}
-        control = GuardedController if self.dense else ResumingController
-        controller = control(rtol, atol, norm=self.equations.error_norm, **smallest)
+        norm = self.equations.error_norm
+        controller = ResumingController(rtol, atol, smallest=4 * rounding, norm=norm)
+        if self.dense:  # no node cuts a step short
+            controller = GuardedController(rtol, atol, dtmin=4 * rounding, force_dtmin=False, norm=norm)
         stepping = self._replace(solver=with_tolerances(self.solver, controller))
         now = lambda x: _alone(x, numbers)
 
@@ -233,20 +236,3 @@ def _initial_state(solver, term, t0, t1, y0, args):
     if not isinstance(getattr(solver, "solver", solver), ExplicitRungeKutta):
         return make(), jnp.array(False)
     return jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), jax.eval_shape(make)), jnp.array(True)
-
-
-FIRST_STEP = 0.01  # diffrax's own; six steps at most that are refused make it a millionth, a few that are kept as long as need be
-
-
-def varied_along(function: Callable, orders: Sequence) -> Callable:
-    """A function (x, given) ↦ (value, aux) of x with variations as last axes, along directions of `given` for each order."""
-
-    def of_order(function, directions):
-        def varied(x, given):
-            alone, change = (jax.tree.map(lambda leaf, part=part: leaf[part], x) for part in ((..., 0), (..., slice(1, None))))
-            (value, change), aux = derived(lambda both: function(*both), (change, directions))((alone, given))
-            return jax.tree.map(with_variations, value, change), aux
-
-        return varied
-
-    return functools.reduce(of_order, orders, function)

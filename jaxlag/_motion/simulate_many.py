@@ -28,7 +28,7 @@ from .batch import BatchedEquations
 from .derivative_rule import differentiable_batch
 from .failure import raise_failure
 from .first_order import EquationsOfMotion, Formulation
-from .integrate import SolverOptions, Variations, initialised, is_variational, states_at, tolerances_of, with_status
+from .integrate import SolverOptions, Variations, by_diffrax, initialised, is_variational, tolerances_of, with_status
 from .protocol import Arguments
 from .results import RESULTS
 from .simulate import simulate
@@ -225,7 +225,7 @@ def _motions(equations, options, inputs, ts):
     (t0, tolerances, shared), own = inputs
     y0, start = _initialised(equations, inputs, ts)
     args = Arguments(with_second_derivatives(shared["params"]), own=own["params"])
-    ys, result, stats = states_at(BatchedEquations(equations), options, dfx.ForwardMode(), t0, y0, ts, args, tolerances)
+    ys, result, stats = by_diffrax(BatchedEquations(equations), options, dfx.ForwardMode(), t0, y0, ts, args, tolerances)
     return _with_status(ys, result, stats, start)
 
 
@@ -241,7 +241,7 @@ def _motions_and_variations(equations, options, inputs, directions, ts):
     variations = variations.along(directions, (d_shared["params"], d_own["params"]), dt0, lambda _: (t0, args))
     y0, start = variations.initial(inputs)
     args = args._replace(directions=variations.directions)
-    ys, result, stats = states_at(variations.equations, options, dfx.ForwardMode(), t0, y0, ts, args, tolerances)
+    ys, result, stats = by_diffrax(variations.equations, options, dfx.ForwardMode(), t0, y0, ts, args, tolerances)
     last_t, last_y = stats["last"]
     ys, change = ys[..., 0], ys[..., 1:]
     ys, aux = _with_status(ys, result, stats | {"last": (last_t, last_y[..., 0])}, start)

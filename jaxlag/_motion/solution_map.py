@@ -19,7 +19,7 @@ from .._model.validation import check
 from .event_record import records
 from .first_order import EquationsOfMotion
 from .guarantees import verified
-from .integrate import SolverOptions, Variations, initialised, is_variational, on_nodes, states_at, with_status
+from .integrate import SolverOptions, Variations, in_one_loop, initialised, is_variational, states_at, with_status
 from .moments import ContactState, EventState, FrictionState
 from .protocol import Arguments, Scales
 from .provenance import Provenance
@@ -104,12 +104,12 @@ class SolutionMap:
         args = Arguments(smooth, Scales.of(tolerances, ts, smooth))
         if is_variational(equations, self.options, varying, inputs.params):
             args = args._replace(directions=variations.directions)
-            ys, result, stats = on_nodes(variations.equations, self.options, at.t, y0, ts, args, tolerances)
+            ys, result, stats = in_one_loop(variations.equations, self.options, at.t, y0, ts, args, tolerances)
             last_t, last_y = stats["last"]
             stats = stats | {"last": (last_t, last_y[(..., *[0] * len(directions))])}
         else:
             along = tuple((of_order.params, of_order.t0) for of_order in directions)
-            ys, result, stats = on_nodes(equations, self.options, at.t, y0, ts, args, tolerances, directions=along)
+            ys, result, stats = in_one_loop(equations, self.options, at.t, y0, ts, args, tolerances, directions=along)
         return self._samples_and_variations(equations, inputs, directions, ts, ys, result, stats, start)
 
     def _samples_and_variations(self, equations, inputs, directions, ts, ys, result, stats, start):

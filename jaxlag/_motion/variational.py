@@ -6,7 +6,8 @@ An explicit scheme gives of these what differentiating it would, for the same st
 Source: Hairer, Nørsett & Wanner, Solving Ordinary Differential Equations I, eqs. I.14.13 and I.14.14.
 """
 
-from collections.abc import Callable
+import functools
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import equinox as eqx
@@ -56,6 +57,20 @@ def with_variations(y: Array, dy: Array) -> Array:
     return jnp.concatenate([y[..., None], dy], axis=-1)
 
 
+def varied_along(function: Callable, orders: Sequence) -> Callable:
+    """A function (x, given) ↦ (value, aux) of x with variations as last axes, along directions of `given` for each order."""
+
+    def of_order(function, directions):
+        def varied(x, given):
+            alone, change = (jax.tree.map(lambda leaf, part=part: leaf[part], x) for part in ((..., 0), (..., slice(1, None))))
+            (value, change), aux = derived(lambda both: function(*both), (change, directions))((alone, given))
+            return jax.tree.map(with_variations, value, change), aux
+
+        return varied
+
+    return functools.reduce(of_order, orders, function)
+
+
 class VariationalEquations(AugmentedSystem):
     """The `FirstOrderSystem` of a motion without stick and slip together with its variations, which are the last axis of y.
 
@@ -69,7 +84,5 @@ class VariationalEquations(AugmentedSystem):
     def along_axis(self, function: Callable, t: Any, y: Array, args: Arguments) -> Array:
         *before, directions = args.directions
         given = lambda numbers: Arguments(numbers[0], own=numbers[1], directions=tuple(before))
-        of_both = lambda both: (function(t, both[0], given(both[1])), None)
-        numbers = (args.params, args.own)
-        (value, change), _ = derived(of_both, (y[..., 1:], directions))((y[..., 0], numbers))
-        return with_variations(value, change)
+        along = varied_along(lambda y, numbers: (function(t, y, given(numbers)), None), [directions])
+        return along(y, (args.params, args.own))[0]
