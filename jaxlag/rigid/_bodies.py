@@ -3,11 +3,10 @@
 from collections.abc import Callable
 from typing import Any
 
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from ._vectors import check_rotation, floating, vector
+from ._vectors import check_rotation, moving, vector
 from .inertia import check_inertia
 
 
@@ -18,7 +17,7 @@ def angular_velocity(rotation: Callable, axes: str = "body") -> Callable:
        \dot R = \frac{\partial R}{\partial q}\,\dot q $$
 
     **Arguments:** `rotation`: R(q), which turns components in the axes of the body into those in space; q is any pytree. `axes`: "body"
-    or "world", those in which ω is given. What moves by a given law of time is a `rate`: R(t, q) by `jaxlag.rate`, and this of its value.
+    or "world", those in which ω is given. R must not depend on the time but through q: a driven angle is a coordinate with a constraint.
 
     **Returns:** a function of (q, qdot), whose value is ω, of shape (3,).
 
@@ -36,7 +35,7 @@ def angular_velocity(rotation: Callable, axes: str = "body") -> Callable:
         raise ValueError(f"`axes` must be 'body' or 'world', but is {axes!r}. The body's make its inertia constant.")
 
     def velocity(q: Any, qdot: Any) -> Float[Array, "3"]:
-        R, rate = _moving(rotation, q, qdot)
+        R, rate = moving(rotation, q, qdot)
         R = check_rotation(R, "`rotation` of a body")
         W = R.T @ rate if axes == "body" else rate @ R.T
         return 0.5 * jnp.stack([W[2, 1] - W[1, 2], W[0, 2] - W[2, 0], W[1, 0] - W[0, 1]])
@@ -78,14 +77,8 @@ def kinetic_energy(m: Any, Theta: Any, position: Callable, rotation: Callable) -
     omega = angular_velocity(rotation)
 
     def energy(q: Any, qdot: Any) -> Float[Array, ""]:
-        _, v = _moving(lambda q: vector(position(q), "position"), q, qdot)
+        _, v = moving(lambda q: vector(position(q), "position"), q, qdot)
         w = omega(q, qdot)
         return 0.5 * m * (v @ v) + 0.5 * w @ (Theta @ w if Theta.ndim == 2 else Theta * w)
 
     return energy
-
-
-def _moving(function: Callable, q: Any, qdot: Any) -> tuple[Array, Array]:
-    """A function of q and its rate."""
-    given = [jax.tree.map(floating, tree) for tree in (q, qdot)]
-    return jax.jvp(function, given[:1], given[1:])

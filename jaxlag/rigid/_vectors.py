@@ -1,5 +1,6 @@
 """Vectors and matrices of space, as they are given and checked."""
 
+from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -45,6 +46,12 @@ def floating(x: Any) -> Array:
     """Numbers as an array of real numbers, in the precision they have."""
     x = jnp.asarray(x)
     return x if jnp.issubdtype(x.dtype, jnp.floating) else x.astype(float)
+
+
+def moving(function: Callable, q: Any, qdot: Any) -> tuple[Any, Any]:
+    """A function of q and its rate."""
+    given = [jax.tree.map(floating, tree) for tree in (q, qdot)]
+    return jax.jvp(function, given[:1], given[1:])
 
 
 def vector(x: Any, name: str, size: int = 3) -> Array:

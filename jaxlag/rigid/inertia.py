@@ -90,7 +90,7 @@ def sphere(m: Any, r: Any) -> Float[Array, "3"]:
     rigid.inertia.sphere(5.0, 2.0)  # [8, 8, 8]
     ```
     """
-    return floating(0.4 * m * r**2) * jnp.ones(3)
+    return jnp.full(3, floating(0.4 * m * r**2))
 
 
 def hollow_sphere(m: Any, R: Any, r: Any) -> Float[Array, "3"]:
@@ -106,7 +106,7 @@ def hollow_sphere(m: Any, R: Any, r: Any) -> Float[Array, "3"]:
     ```
     """
     fifth = R**4 + R**3 * r + R**2 * r**2 + R * r**3 + r**4  # (R⁵ − r⁵)/(R − r)
-    return floating(0.4 * m * fifth / (R**2 + R * r + r**2)) * jnp.ones(3)
+    return jnp.full(3, floating(0.4 * m * fifth / (R**2 + R * r + r**2)))
 
 
 def ellipsoid(m: Any, a: Any, b: Any, c: Any) -> Float[Array, "3"]:
@@ -149,7 +149,7 @@ def rotated(Theta: Any, R: Any) -> Float[Array, "3 3"]:
 
     **Returns:** a matrix, (3, 3). Those of parts about one point in the same axes add up.
 
-    **Raises:** nothing.
+    **Raises:** `ValueError` where Θ is that of no body.
 
     ```python
     import jax.numpy as jnp

@@ -37,12 +37,11 @@ def test_a_heavy_top_by_angles_and_by_a_quaternion():
     u = cos θ moves between two zeros of u̇² = f(u), cubic, as u₁ + (u₂ − u₁) sn²(½√(β(u₃ − u₁)) (t − t₀)).
     """
     ts = np.linspace(0, 20, 401)
-    tight = {"rtol": 1e-11, "atol": 1e-12}
+    tight = {"rtol": 1e-12, "atol": 1e-13}
     angles = jl.simulate(BY_ANGLES, ANGLES, RATES, ts, PARAMS, **tight)
     turned = jl.simulate(BY_QUATERNION, *as_quaternion(ANGLES, RATES), ts, PARAMS, **tight)
     axes = jax.vmap(EULER)(angles.q)
-    np.testing.assert_allclose(axes[:, :, 2], jax.vmap(rigid.quaternion)(turned.q)[:, :, 2], atol=1e-8)
-    np.testing.assert_allclose(axes, jax.vmap(rigid.quaternion)(turned.q), atol=1e-7)  # the spin, 1800 rad, included
+    np.testing.assert_allclose(axes, jax.vmap(rigid.quaternion)(turned.q), atol=1e-8)  # the spin, 1800 rad, included
 
     A, C, weight = MOMENTS[0] + 0.5 * HEIGHT**2, MOMENTS[2], 0.5 * 9.81 * HEIGHT
     u0, spin = np.cos(0.6), 90.0

@@ -78,7 +78,14 @@ def test_quaternions_of_rotations_and_their_rates():
 
 def test_single_precision_stays():
     q = jnp.array([1.0, 0.1, 0.2, 0.3], jnp.float32)
-    for value in (rigid.quaternion(q), rigid.rotation_vector(q[1:]), rigid.euler("zxz")(q[1:]), rigid.rotation(q[1:], q[0]), rigid.unit(q)):
+    for value in (
+        rigid.quaternion(q),
+        rigid.rotation_vector(q[1:]),
+        rigid.euler("zxz")(q[1:]),
+        rigid.rotation(q[1:], q[0]),
+        rigid.unit(q),
+        rigid.inertia.sphere(q[0], q[1]),
+    ):
         assert value.dtype == jnp.float32
 
 
