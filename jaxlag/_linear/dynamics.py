@@ -10,9 +10,10 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, PyTree
 
+from .._mechanics.constrained_acceleration import constrained_acceleration
 from .._mechanics.contact import in_current_mode
 from .._mechanics.lagrange import imbalance, velocity_residual
-from .._mechanics.saddle_point import Sound, constrained_acceleration
+from .._mechanics.saddle_point import Sound
 from .._model.flat import Flat, StatesAt, bind
 from .._model.injection import call
 from .._model.signal import at_time

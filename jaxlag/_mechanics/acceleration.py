@@ -15,10 +15,11 @@ from .._model.system import System
 from .._model.validation import at_state
 from .._program.jit import is_concrete
 from .._program.scalarise import scalarised
+from .constrained_acceleration import constrained_acceleration
 from .contact import in_current_mode
 from .lagrange import constraint_rows
 from .pseudo_inverse import pseudo_inverse
-from .saddle_point import CONTRADICTION, NO_INERTIA, Sound, constrained_acceleration
+from .saddle_point import CONTRADICTION, NO_INERTIA, Sound
 from .singular_directions import explained
 
 

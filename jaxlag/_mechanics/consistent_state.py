@@ -1,24 +1,26 @@
 """States on the constraints, the nearest to a given one, and how far a state is off them."""
 
 import dataclasses
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-import lineax as lx
 import numpy as np
 from jaxtyping import Array, Bool, Float, PyTree
 
 from .._model.flat import Flat
 from .._model.system import System
 from .._model.validation import at_state, coordinates
-from .._program.implicit import implicit_root, undifferentiated
+from .._program.implicit import undifferentiated
 from .._program.jit import is_concrete
 from .._program.scalarise import scalarised
+from .constrained_root import Linear, root_of
+from .friction_elements import light_coordinates
 from .lagrange import constraint_rows, inertia, position_residual, velocity_residual
+from .massless import completed, inertial_part, with_masses
 from .projection import metric_of_positions
-from .saddle_point import NO_INERTIA, SaddlePoint, is_determined, reach_of, saddle_point, saddle_solver
+from .saddle_point import NO_INERTIA, is_determined, reach_of
 from .singular_directions import NOT_AFFINE, UNDEFINED, explained, not_affine_in
 
 ITERATIONS = 16  # near the constraints four suffice
@@ -44,20 +46,26 @@ def nearest_state(flat: Flat, t, q0, v0, free: Sequence[int] | None = None) -> C
     Derivatives are those that these equations imply.
     """
     moving = np.arange(q0.size) if free is None else np.asarray(free, int)
+    decided = flat
+    if flat.massless:
+        flat = with_masses(flat, light_coordinates(flat, t, q0, v0), t, q0, v0)
     full = inertia(flat, t, q0, v0)[0]
     M = full.as_matrix()[np.ix_(moving, moving)]
     given = jnp.concatenate([flat.holonomic(t, q0), velocity_residual(flat, t, q0, v0)])
     positions = flat.holonomic(t, q0).size
     if given.size == 0:  # nothing to satisfy: saves the compilation of the search
         yes = jnp.array(True)
-        return Consistent(q0, v0, yes, is_determined(M, jnp.zeros((0, moving.size), M.dtype)), yes, jnp.all(jnp.isfinite(M)))
+        return Consistent(
+            q0, completed(decided, t, q0, v0).v, yes, is_determined(M, jnp.zeros((0, moving.size), M.dtype)), yes, jnp.all(jnp.isfinite(M))
+        )
     q = q0
     if positions:
         if given.size > 2 * positions:  # velocity constraints may be all that holds a coordinate
             held = is_determined(M, position_residual(flat, t, q0)[1][:, moving])
             M = jnp.where(held, M, metric_of_positions(flat, full, t, q0, v0).as_matrix()[np.ix_(moving, moving)])
         q = _nearest_position(flat, moving, t, q0, M)
-    v, determined = _nearest_velocity(flat, moving, t, q, v0)
+    v, determined = _nearest_velocity(inertial_part(flat, t, q, v0), moving, t, q, v0)
+    v = completed(decided, t, q, v).v
 
     @undifferentiated
     def judged(t, q0, v0, q, v, M, given):
@@ -101,7 +109,7 @@ def _nearest_position(flat: Flat, moving, t, q0, M) -> Float[Array, " n"]:
         going_on = lambda carry: carry[1] & (carry[2] < ITERATIONS)
         return jax.lax.while_loop(going_on, newton, (start, jnp.array(True), jnp.array(0)))[0], None
 
-    w, _ = _root(residual, linear, search, (t, q0, M), like)
+    w, _ = root_of(residual, linear, search, (t, q0, M), like)
     return unpacked(q0, w)[0]
 
 
@@ -129,38 +137,8 @@ def _nearest_velocity(flat: Flat, moving, t, q, v0) -> tuple[Float[Array, " n"],
         found = linear(args, like).solution()
         return jnp.concatenate([args[2][moving] + found.x, found.multipliers]), found.sound.determined
 
-    w, determined = _root(residual, linear, search, (t, q, v0), like)
+    w, determined = root_of(residual, linear, search, (t, q, v0), like)
     return v0.at[moving].set(w[:free]), determined
-
-
-class Linear(NamedTuple):
-    """The linear equations M x = f + Gᵀλ, G x = c of a step, and its reach."""
-
-    M: Float[Array, "k k"]
-    G: Float[Array, "m k"]
-    f: Float[Array, " k"]
-    c: Float[Array, " m"]
-    reach: Float[Array, " k"]
-
-    def solution(self) -> SaddlePoint:
-        """x and λ."""
-        return saddle_point(lx.MatrixLinearOperator(self.M), self.G, self.f, self.c, self.reach)
-
-    def change(self, residual: Float[Array, " w"]) -> Float[Array, " w"]:
-        """What (x, λ) change where this is added to the left-hand sides; the rank is that of the step."""
-        solve = saddle_solver(lx.MatrixLinearOperator(self.M), self.G, self.f, self.c, self.reach)
-        return -jnp.concatenate(solve(*jnp.split(residual, [self.f.size])))
-
-
-def _root(residual: Callable, linear: Callable, search: Callable, args: tuple, like: Float[Array, " w"]) -> tuple[Array, Any]:
-    """w with residual(args, w) = 0, as `search(linear, args)` finds it, and what else that says; linear(args, w) is the slope there."""
-    residual, of_residual = jax.closure_convert(residual, args, like)
-    linear, of_linear = jax.closure_convert(linear, args, like)
-    fixed, within = jax.lax.stop_gradient((args, of_linear))
-    w, aux = search(lambda args, w: linear(args, w, *within), fixed)
-    of_all = lambda everything, w: residual(everything[0], w, *everything[1])
-    change = lambda everything, w, R: linear(everything[0], w, *everything[2]).change(R)
-    return implicit_root(of_all, change, (args, of_residual, of_linear), jax.lax.stop_gradient(w)), aux
 
 
 def _small(q):

@@ -15,9 +15,10 @@ from jaxtyping import Array, Bool, Float
 
 from .._model.flat import Flat
 from .._program.scalarise import scalarised
+from .constrained_acceleration import constrained_acceleration
 from .friction_elements import FrictionElements, find_elements
 from .lagrange import inertia, position_residual
-from .saddle_point import SaddlePoint, constrained_acceleration, reach_of, saddle_point
+from .saddle_point import SaddlePoint, reach_of, saddle_point
 from .stick_slip import Mode, first_mode, in_mode, sticking
 
 OUTWARDS = 6  # Newton steps that put a start on its obstacle

@@ -14,10 +14,11 @@ from .._model.state_values import given_states
 from .._model.system import System
 from .._model.validation import at_state, checked, coordinates, state
 from .._program.scalarise import scalarised
+from .constrained_acceleration import constrained_acceleration
 from .contact import in_contact, in_current_mode
 from .friction_elements import unread_friction
 from .lagrange import applied_force, constraint_rows, inertia, position_residual, velocity_residual
-from .saddle_point import augmented, constrained_acceleration
+from .saddle_point import augmented
 from .singular_directions import UNDEFINED, is_defined, massless_coordinates, not_affine_in, tangent_basis
 
 

@@ -25,6 +25,7 @@ from .._program.expressions import Node, TooLong, is_number, objects
 from .._program.polynomials import Modulus, moduli_in
 from .._program.substitution import evaluate_with_replacements, polynomial_values, source_equations
 from .._program.walker import constants_as_inputs
+from .massless import SEVERAL, first_order, plastic
 
 MOST_NODES = 100_000  # of a program that is searched: a second or two
 
@@ -36,6 +37,7 @@ class FrictionElements(NamedTuple):
     potentials: dict[str, Callable[..., Float[Array, ""]]]  # D of each term (t, q, v, λ, u), with u of length e
     element_of_row: np.ndarray
     rows_of_term: dict[str, np.ndarray]  # of each nonsmooth term
+    massless: np.ndarray  # of each row the coordinate without inertia that only this friction resists, or −1
     near_rest: Array | float = 0.0  # per element, the slip of several rows below which it keeps its direction
 
     @property
@@ -99,7 +101,28 @@ def find_elements(flat: Flat, t, q, v) -> FrictionElements | None:
 
     rows_of = lambda moduli: np.concatenate([starts[u] + np.arange(len(u.of)) for u in moduli])
     rows_of_term = {name: rows_of(moduli) for name, moduli in nonsmooth.items() if moduli}
-    return FrictionElements(slip, {name: potential(name) for name in terms}, np.repeat(np.arange(len(first)), sizes), rows_of_term)
+    potentials, of_row = {name: potential(name) for name in terms}, np.repeat(np.arange(len(first)), sizes)
+    elements = FrictionElements(slip, potentials, of_row, rows_of_term, np.full(of_row.size, -1))
+    return elements._replace(massless=_without_inertia(flat, elements, t, q, v)) if flat.massless else elements
+
+
+def _without_inertia(flat: Flat, elements: FrictionElements, t, q, v) -> np.ndarray:
+    """Of each row the coordinate without inertia that only this friction resists, or −1."""
+    slipping = lambda D: lambda t, q, v, multipliers: D(t, q, v, multipliers, elements.sums(elements.slip(t, q, v)))
+    sliding = flat._replace(dissipations={name: slipping(D) for name, D in elements.potentials.items()})
+    rows, coordinates = plastic(sliding, elements.slip, t, q, v)
+    if np.any(elements.is_vector[elements.element_of_row[rows]]):
+        raise ValueError(SEVERAL)
+    found = np.full(elements.element_of_row.size, -1)
+    found[rows] = coordinates
+    return found
+
+
+def light_coordinates(flat: Flat, t, q, v) -> np.ndarray:
+    """Coordinates without inertia whose motion dissipation decides: first-order ones, and those that stick and slip."""
+    elements = find_elements(flat, t, q, v) if flat.massless else None
+    sticking = np.zeros(0, int) if elements is None else elements.massless[elements.massless >= 0]
+    return np.union1d(first_order(flat, t, q, v).coordinates, sticking).astype(int)
 
 
 def unread_friction(flat: Flat, t, q, v, read: Container[str] | None = None) -> list[str]:

@@ -33,8 +33,9 @@ def applied_force(flat: Flat, t, q, v, multipliers) -> Float[Array, " n"]:
 
 
 def position_residual(flat: Flat, t, q) -> tuple[Float[Array, " h"], Float[Array, "h n"]]:
-    """g and its Jacobian ∂g/∂q."""
-    g, G = jacobian(lambda q: flat.holonomic(t, q), q)
+    """g and its Jacobian ∂g/∂q; and of what slips without inertia, the force that is left beside its friction."""
+    terms = [flat.holonomic] if flat.yielding is None else [flat.holonomic, flat.yielding]
+    g, G = jacobian(lambda q: jnp.concatenate([term(t, q) for term in terms]), q)
     return g, G.as_matrix()
 
 

@@ -9,9 +9,10 @@ from jaxtyping import Array, Float, PyTree
 from .._model.flat import Flat, rows_by_name
 from .._model.system import EXPLICIT_TIME, System
 from .._model.validation import at_state
+from .constrained_acceleration import constrained_acceleration
 from .contact import in_current_mode
 from .lagrange import constraint_rows
-from .saddle_point import constrained_acceleration
+from .massless import completed
 
 
 def powers(
@@ -46,6 +47,7 @@ def _powers(flat, t, q, v):
 
 def powers_of(flat: Flat, t, q, v) -> dict[str, Float[Array, ""]]:
     """The powers over flat vectors."""
+    v = completed(flat, t, q, v).v
     _, multipliers, _ = constrained_acceleration(flat, t, q, v)
     _, G, _ = constraint_rows(flat, t, q, v)
     does = lambda rows: multipliers[rows] @ (G[rows] @ v)

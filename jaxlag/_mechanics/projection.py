@@ -14,6 +14,7 @@ from .._model.numbers import count, number
 from .._program.scalarise import scalarised
 from .._program.sparse_jacobian import jacobian
 from .lagrange import constraint_rows, inertia, position_residual, velocity_residual
+from .massless import completed, inertial_part
 from .saddle_point import augmented, reach_of, saddle_point
 
 
@@ -50,7 +51,8 @@ class Projection:
 
     def project(self, flat: Flat, t: Any, q: Float[Array, " n"], v: Float[Array, " n"]) -> tuple[Float[Array, " n"], Float[Array, " n"]]:
         """The state on the constraints that is nearest to this one, which is near already."""
-        M = inertia(flat, t, q, v)[0]  # at the start serves throughout: corrections are small
+        part = inertial_part(flat, t, q, v)
+        M = inertia(part, t, q, v)[0]  # at the start serves throughout: corrections are small
 
         @scalarised
         def newton(t, q, M):
@@ -59,10 +61,10 @@ class Projection:
 
         @scalarised
         def on_velocities(t, q, v, M):
-            psi, G, _ = constraint_rows(flat, t, q, v)
-            return _corrected(v, saddle_point(M, G, jnp.zeros_like(v), -psi, reach_of(v)).x)
+            psi, G, _ = constraint_rows(part, t, q, v)
+            return completed(flat, t, q, _corrected(v, saddle_point(M, G, jnp.zeros_like(v), -psi, reach_of(v)).x)).v
 
-        if flat.holonomic_names:
+        if flat.holonomic_names or flat.yielding:
             metric = metric_of_positions(flat, M, t, q, v)
             q, _ = jax.lax.scan(lambda q, _: (newton(t, q, metric), None), q, length=self.iterations)
         return q, on_velocities(t, q, v, M)

@@ -8,9 +8,7 @@ import jax.numpy as jnp
 import lineax as lx
 from jaxtyping import Array, Bool, Float
 
-from .._model.flat import Flat
 from .._program.scalarise import scalarised
-from .lagrange import applied_force, constraint_rows, inertia
 from .pseudo_inverse import Inverse, Request, applied, by_rows, everywhere, inverse_of
 
 
@@ -188,49 +186,6 @@ def _solve(A, factor, B):
     return jax.lax.custom_linear_solve(lambda X: A @ X, B, by_factor, symmetric=True)
 
 
-def constrained_acceleration(flat: Flat, t, q, v, feedback=None) -> SaddlePoint:
-    """q̈ and λ of  M q̈ = f + Gᵀλ,  G q̈ = −γ − feedback(t, q, v)."""
-    M, inertial = inertia(flat, t, q, v)
-    _, G, gamma = constraint_rows(flat, t, q, v)
-    c = -gamma if feedback is None else -gamma - feedback(flat, t, q, v)
-    force = lambda multipliers: applied_force(flat, t, q, v, multipliers)
-    if not flat.needs_multipliers:
-        found = saddle_point(M, G, inertial + force(jnp.zeros_like(c)), c)
-        return found._replace(multipliers=_pushing(flat, found.multipliers))
-    # The solution is affine in the force, which is part of it by λ: one solve says how.
-    beside = lambda vector, matrix: jnp.concatenate([vector[:, None], matrix], axis=1)
-    columns = saddle_point(M, G, beside(inertial, jnp.eye(v.size, dtype=v.dtype)), beside(c, jnp.zeros((c.size, v.size), v.dtype)))
-    affine = lambda columns, force: columns[:, 0] + columns[:, 1:] @ force
-    reaction = lambda multipliers: affine(columns.multipliers, force(_pushing(flat, multipliers)))
-    multipliers = _pushing(flat, _self_consistent(reaction, jnp.zeros_like(c)))
-    return SaddlePoint(affine(columns.x, force(multipliers)), multipliers, columns.sound)
-
-
-def _pushing(flat: Flat, multipliers):
-    """λ, that of an open contact zero and no rounding."""
-    if flat.closed is None:
-        return multipliers
-    start, end = flat.rows_of_bilateral, flat.rows_of_bilateral + len(flat.contacts)
-    before, of_contacts, behind = jnp.split(multipliers, [start, end])
-    return jnp.concatenate([before, jnp.where(flat.closed, of_contacts, 0), behind])
-
-
-def _self_consistent(reaction, start):
-    """λ = reaction(λ) by Newton's method, where applied forces depend on the constraint forces they bring about.
-
-    It is exact at once where the forces are linear in λ, as friction is. NaN where 1 − ∂reaction/∂λ has no positive determinant:
-    then no λ, or more than one, solves it (Painlevé's paradox; Genot & Brogliato, Eur. J. Mech. A 18 (1999) 653).
-    """
-
-    def newton(multipliers, _):
-        slope = jnp.eye(start.size, dtype=start.dtype) - jax.jacfwd(reaction)(multipliers)
-        step = jnp.linalg.solve(slope, reaction(multipliers) - multipliers)
-        return jnp.where(jnp.linalg.det(slope) > 0, multipliers + step, jnp.nan), None
-
-    return jax.lax.scan(newton, start, length=MULTIPLIER_ITERATIONS)[0]
-
-
-MULTIPLIER_ITERATIONS = 3
 CONTRADICTION = (
     "`holonomic` and `nonholonomic` must not contradict each other, but no acceleration satisfies them all here, or two rows are too "
     "nearly the same to tell. Look for constraints that say nearly the same; put a state by hand on them by `consistent_state`."

@@ -7,6 +7,7 @@ In each mode the system is an ordinary one, so the rest of the package need not 
 Source: Pfeiffer & Glocker, Multibody Dynamics with Unilateral Contacts, chapters 5 and 6.
 """
 
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
@@ -16,25 +17,45 @@ from jaxtyping import Array, Bool, Float
 
 from .._model.flat import Flat
 from .._program.scalarise import scalarised
+from .constrained_acceleration import constrained_acceleration
 from .friction_elements import FrictionElements
 from .load_sharing import shared
-from .saddle_point import constrained_acceleration
+from .massless import completed, nearest_velocity, smooth_force
 
 
 def in_mode(flat: Flat, elements: FrictionElements, sigma: Float[Array, " r"]) -> Flat:
     """The system in one mode: D with ‖s‖ = σ·s where it slips, and s = 0 among the constraints where it sticks."""
-    stuck = sticking(elements, sigma)
+    stuck = sticking(elements, sigma)[elements.element_of_row]
     extent = lambda t, q, v: _extent(elements, sigma, elements.slip(t, q, v))
 
     def slipping(D):
         return lambda t, q, v, multipliers: D(t, q, v, multipliers, extent(t, q, v))
 
-    def nonholonomic(t, q, v):
-        held = jnp.where(stuck[elements.element_of_row], elements.slip(t, q, v), 0)
-        return jnp.concatenate([flat.nonholonomic(t, q, v), held])
+    def with_rows(t, q, v, otherwise):
+        return jnp.concatenate([flat.nonholonomic(t, q, v), jnp.where(stuck, elements.slip(t, q, v), otherwise)])
 
     held = {name: flat.rows + rows for name, rows in elements.own_rows.items()}
-    return flat._replace(dissipations={name: slipping(D) for name, D in elements.potentials.items()}, nonholonomic=nonholonomic, held=held)
+    mode = flat._replace(dissipations={name: slipping(D) for name, D in elements.potentials.items()}, held=held)
+    if not np.any(elements.massless >= 0):
+        return mode._replace(nonholonomic=lambda t, q, v: with_rows(t, q, v, 0))
+    yielding, rates = _yielding(mode, elements, stuck)
+    return mode._replace(nonholonomic=lambda t, q, v: with_rows(t, q, v, rates(t, q, v)), yielding=yielding)
+
+
+def _yielding(mode: Flat, elements: FrictionElements, stuck: Bool[Array, " r"]) -> tuple[Callable, Callable]:
+    """Of each row that slips without inertia, h(t, q), the force that is left beside friction; and dh/dt of all rows: zero while it slips.
+
+    So ż follows from dh/dt = 0: with h = c (x − z) ∓ F this is a Jenkin element. The force of such a constraint is zero.
+    """
+    rows = np.flatnonzero(elements.massless >= 0)
+
+    def left(t, q):
+        return jnp.where(stuck[rows], 0, smooth_force(mode, t, q, jnp.zeros_like(q))[elements.massless[rows]])
+
+    def rates(t, q, v):
+        return jnp.zeros(elements.massless.size, v.dtype).at[rows].set(jax.jvp(left, (t, q), (jnp.ones_like(t), v))[1])
+
+    return left, rates
 
 
 def sticking(elements: FrictionElements, sigma: Float[Array, " r"]) -> Bool[Array, " e"]:
@@ -46,7 +67,8 @@ def _extent(elements, sigma, slip):
     """u = ‖s‖ of each element: σ s for a single row, smooth through s = 0; for several rows σ·s near rest only."""
     along, norm = elements.sums(sigma * slip), elements.norms(slip)
     near_rest = norm <= jnp.maximum(elements.near_rest, jnp.finfo(slip.dtype).tiny ** 0.25)
-    return jnp.where(sticking(elements, sigma), 0, jnp.where(elements.is_vector & ~near_rest, norm, along))
+    extent = jnp.where(elements.is_vector & ~near_rest, norm, along) if np.any(elements.is_vector) else along
+    return jnp.where(sticking(elements, sigma), 0, extent)
 
 
 class Friction(NamedTuple):
@@ -69,8 +91,12 @@ def friction(flat: Flat, elements: FrictionElements, sigma, t, q, v, feedback=No
 
 def _friction(flat, elements, sigma, t, q, v, feedback):
     stuck, of = sticking(elements, sigma), elements.element_of_row
-    qddot, multipliers, _ = constrained_acceleration(in_mode(flat, elements, sigma), t, q, v, feedback)
+    mode = in_mode(flat, elements, sigma)
+    qddot, multipliers, _ = constrained_acceleration(mode, t, q, v, feedback)
+    v = completed(mode, t, q, v).v
     slip, slip_rate = jax.jvp(elements.slip, (t, q, v), (jnp.ones_like(t), v, qddot))
+    if mode.yielding is not None:  # what has no inertia slips at once
+        slip_rate = jnp.where(elements.massless >= 0, elements.slip(t, q, nearest_velocity(mode, t, q, v)), slip_rate)
     pull = jax.vjp(lambda slip: _extent(elements, sigma, slip), slip)[1]
     bound = bounds(elements, sigma, t, q, v, multipliers)
     held = multipliers[flat.rows :]

@@ -1,5 +1,6 @@
 """The system over flat vectors: what the mechanics works on."""
 
+import functools
 from collections.abc import Callable, Mapping
 from functools import partial
 from typing import Any, NamedTuple
@@ -10,6 +11,7 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float, PyTree
 
+from .._program.sparse_jacobian import sparsity_pattern
 from .contact import Poisson
 from .event import Every, merged
 from .injection import asks_for, call, described, needs
@@ -45,8 +47,10 @@ class Flat(NamedTuple):
     terms: tuple[str, ...]
     rows: int  # of G, those of the user's constraints
     rows_of_bilateral: int  # of those, the first, of `holonomic` alone
+    massless: tuple[int, ...]  # coordinates of which M has rows of zeros, as L is written
     closed: Bool[Array, " c"] | None = None  # those of the contacts, where it was chosen
     held: dict[str, np.ndarray] = {}  # noqa: RUF012 - rows of G beyond those, with which a dissipation term sticks
+    yielding: Callable[..., Float[Array, " p"]] | None = None  # h(t, q) = 0 of what slips without inertia
 
 
 class StatesAt(NamedTuple):
@@ -87,7 +91,31 @@ def bind(system: System, like: PyTree, params: PyTree, states: StatesAt | None =
         terms=system.terms,
         rows=bound.rows,
         rows_of_bilateral=bound.rows_of_bilateral,
+        massless=_massless(system, *_hashable((like, params, {} if states is None else states.values))),
     )
+
+
+def _hashable(tree: PyTree) -> tuple:
+    """Structure and leaves of a pytree, its arrays as shapes."""
+    leaves, structure = jax.tree.flatten(tree)
+    return structure, tuple(jax.ShapeDtypeStruct(x.shape, x.dtype) if hasattr(x, "dtype") else x for x in leaves)
+
+
+@functools.lru_cache(maxsize=1024)
+def _massless(system: System, structure: Any, leaves: tuple) -> tuple[int, ...]:
+    """Coordinates of which M has rows of zeros, whatever the numbers: read once from the program of L."""
+    found, is_number = [], [isinstance(leaf, jax.ShapeDtypeStruct) for leaf in leaves]
+
+    def read(numbers):
+        given = iter(numbers)
+        filled = [next(given) if of_number else leaf for leaf, of_number in zip(leaves, is_number, strict=True)]
+        bound = _Bound(system, *jax.tree.unflatten(structure, filled))
+        v, _ = ravel_pytree(bound.zeros)
+        momentum = lambda v: jax.grad(bound.lagrangian, argnums=2)(jnp.zeros((), v.dtype), v, v)
+        found.extend(np.flatnonzero(~np.any(sparsity_pattern(lambda dv: jax.jvp(momentum, (v,), (dv,))[1], v), axis=1)))
+
+    jax.eval_shape(read, [leaf for leaf, of_number in zip(leaves, is_number, strict=True) if of_number])
+    return tuple(int(i) for i in found)
 
 
 class _Bound:

@@ -10,13 +10,15 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, PyTree
 
+from .._mechanics.constrained_acceleration import constrained_acceleration
 from .._mechanics.contact import free, in_contact
-from .._mechanics.friction_elements import FrictionElements
+from .._mechanics.friction_elements import FrictionElements, light_coordinates
 from .._mechanics.friction_treatment import Regularised, StickSlip
 from .._mechanics.impact import check_impacts
+from .._mechanics.massless import completed
 from .._mechanics.power import energy_exchange, listed_powers
 from .._mechanics.projection import Baumgarte, NoStabilisation, Projection
-from .._mechanics.saddle_point import SaddlePoint, constrained_acceleration
+from .._mechanics.saddle_point import SaddlePoint
 from .._mechanics.stick_slip import (
     in_mode,
     redirected,
@@ -59,6 +61,7 @@ class EquationsOfMotion:
     sampled: Layout = NOTHING  # states that change at sample times
     contacts: int = 0
     events: int = 0
+    light: tuple[int, ...] = ()  # coordinates without inertia, whose velocities follow from the rest
 
     @classmethod
     def of(cls, system: System, q0: PyTree, formulation: Formulation, params: PyTree, at: StatesAt) -> "EquationsOfMotion":
@@ -69,6 +72,8 @@ class EquationsOfMotion:
             elsewhere = called_elsewhere(lambda params: _values(bind(system, q0, params, at), *at[1:]), params)
             warn_of_delays(params, elsewhere)
             alone = dataclasses.replace(alone, elsewhere=elsewhere)
+        light = light_coordinates(alone.flat_at(params, at), *at[1:])
+        alone = dataclasses.replace(alone, light=tuple(map(int, light)))
         elements = formulation.friction.elements(alone.flat_at(params, at), *at[1:])
         if system.unilateral:
             check_impacts(alone.flat_at(params, at), elements, formulation.friction)
@@ -150,7 +155,7 @@ class EquationsOfMotion:
     def projection(self) -> Projection | None:
         """What puts steps back on the constraints, and on s = 0 where friction sticks, if anything has to."""
         chosen = self.formulation.stabilisation.projection()
-        if self.elements or self.contacts:
+        if self.elements or self.contacts or self.light:
             return chosen or Projection()
         return chosen if self.system.constraints else None
 
@@ -212,6 +217,7 @@ def _rates(equations: EquationsOfMotion, t, y, args):
     parts = equations.parts(y)
     q, v, works, sigma, held = parts.q, parts.v, parts.works, parts.sigma, parts.held
     flat, mode, elements = equations.mode(t, parts, args)
+    v = completed(mode, t, q, v).v
     of = lambda flat: lambda: equations.acceleration(flat, t, q, v).x
     qddot = equations.where_closed(parts, of(mode), of(free(mode)))
     rates = ravelled(flat.state_rates(t, q, v), y.dtype)

@@ -25,7 +25,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import jaxlag as jl
-from jaxlag._mechanics.saddle_point import constrained_acceleration
+from jaxlag._mechanics.constrained_acceleration import constrained_acceleration
 from jaxlag._model.flat import bind
 from jaxlag._program.scalarise import scalarised
 from jaxlag.examples import vehicle

@@ -12,7 +12,7 @@ from jax import lax
 from operations import doubled_slope, tripled_slope
 
 import jaxlag as jl
-from jaxlag._mechanics.saddle_point import constrained_acceleration
+from jaxlag._mechanics.constrained_acceleration import constrained_acceleration
 from jaxlag._model.flat import bind
 from jaxlag._program import constants
 from jaxlag._program.constants import folded
