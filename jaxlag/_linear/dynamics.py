@@ -13,6 +13,7 @@ from jaxtyping import Array, Float, PyTree
 from .._mechanics.constrained_acceleration import constrained_acceleration
 from .._mechanics.contact import in_current_mode
 from .._mechanics.lagrange import imbalance, velocity_residual
+from .._mechanics.massless import completed, first_order
 from .._mechanics.saddle_point import Sound
 from .._model.flat import Flat, StatesAt, bind
 from .._model.injection import call
@@ -73,13 +74,16 @@ class Dynamics:
         return moved_params(self.inputs, self.params, self.t, motion)
 
     def constraints(self, y: Whole, motion: Motion) -> tuple[Float[Array, " h"], Float[Array, " l"]]:
-        """g and ψ, where dry friction sticks with its slip among them."""
+        """g and ψ, where dry friction sticks with its slip among them, and behind them how far ż of what has no inertia is off."""
         flat = self.at(y, motion)
-        return flat.holonomic(self.t, y.q), velocity_residual(in_current_mode(flat, self.t, y.q, y.v), self.t, y.q, y.v)
+        mode = in_current_mode(flat, self.t, y.q, y.v)
+        z, _ = first_order(mode, self.t, y.q, y.v)
+        off = (y.v - completed(mode, self.t, y.q, y.v).v)[z]
+        return flat.holonomic(self.t, y.q), jnp.concatenate([velocity_residual(mode, self.t, y.q, y.v), off])
 
-    def forces(self, y: Whole) -> Forces:
-        """q̈ and λ of the state, with inputs at rest."""
-        mode = in_current_mode(self.at(y, self.still()), self.t, y.q, y.v)
+    def forces(self, y: Whole, motion: Motion) -> Forces:
+        """q̈ and λ of the state, with its inputs moved."""
+        mode = in_current_mode(self.at(y, motion), self.t, y.q, y.v)
         return Forces(*scalarised(lambda t, q, v: constrained_acceleration(mode, t, q, v))(self.t, y.q, y.v))
 
     def balance(self, y: Whole, qddot: Array, multipliers: Array, motion: Motion) -> Balance:
@@ -87,8 +91,13 @@ class Dynamics:
         flat = self.at(y, motion)
         mode = in_current_mode(flat, self.t, y.q, y.v)
         off, constraint_rate = imbalance(mode, self.t, y.q, y.v, qddot, multipliers)
+        return Balance(off, constraint_rate, *self.driven(y, qddot, multipliers, motion))
+
+    def driven(self, y: Whole, qddot: Array, multipliers: Array, motion: Motion) -> tuple[Array, Array, Array]:
+        """ż of states, the outputs, and what sampled states would become."""
+        flat = self.at(y, motion)
         z, updates = (ravelled(of(self.t, y.q, y.v), y.q.dtype) for of in (flat.state_rates, flat.updates))
-        return Balance(off, constraint_rate, z, self._outputs(flat, y, qddot, multipliers, motion), updates)
+        return z, self._outputs(flat, y, qddot, multipliers, motion), updates
 
     def rows_along(self, y: Whole, direction: Float[Array, " n"], motion: Motion) -> Float[Array, " l"]:
         """G times a direction."""

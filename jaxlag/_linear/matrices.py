@@ -12,7 +12,8 @@ from jaxtyping import Array, Bool, Float, PyTree
 
 from .._mechanics.consistent_state import off_constraints
 from .._mechanics.contact import in_current_mode
-from .._mechanics.lagrange import applied_force, constraint_rows
+from .._mechanics.lagrange import applied_force, constraint_rows, inertia
+from .._mechanics.massless import first_order, with_masses
 from .._mechanics.pseudo_inverse import CLEAR
 from .._mechanics.saddle_point import augmented
 from .._model.flat import StatesAt
@@ -66,9 +67,16 @@ class Matrices(NamedTuple):
 
 @compiled
 def constraint_slopes(system, t, q, qdot, params, states):
-    """G, how many of its rows hold positions (as an array of that length), and how far the state is off the constraints."""
+    """G, how many of its rows hold positions (as an array of that length), and how far the state is off the constraints.
+
+    Below G, what says that velocities of coordinates without inertia depend on the others; rows that hold these hold them alone.
+    """
     flat, t, q, v = checked(system, t, q, qdot, params, states)
-    _, G, _ = constraint_rows(in_current_mode(flat, t, q, v), t, q, v)
+    mode = in_current_mode(flat, t, q, v)
+    _, G, _ = constraint_rows(mode, t, q, v)
+    z, rows = first_order(mode, t, q, v)
+    alone = np.outer(rows, ~np.isin(np.arange(q.size), z))
+    G = jnp.concatenate([jnp.where(alone, 0, G), jnp.eye(q.size, dtype=G.dtype)[z]])
     return G, jnp.zeros(flat.holonomic(t, q).size), off_constraints(flat, t, q, v)
 
 
@@ -80,8 +88,13 @@ def matrices(choice: Choice, system: System, t: Any, q: PyTree, qdot: PyTree, pa
     at = StatesAt(values, t, ravel_pytree(q)[0], ravel_pytree(qdot)[0])
     dynamics, y = dynamics_of(system, q, params, at, choice.inputs, choice.outputs)
     basis, driven = tangent_basis(dynamics, choice.partition, y)
-    forces = dynamics.forces(y)
-    slopes, M, found = _slopes(dynamics, choice.partition, y, forces, basis, driven)
+    forces = dynamics.forces(y, dynamics.still())
+    mode = in_current_mode(dynamics.at(y, dynamics.still()), at.t, y.q, y.v)
+    z, _ = first_order(mode, at.t, y.q, y.v)
+    if z.size:
+        slopes, M, found = _slopes_of_solution(dynamics, y, forces, basis, driven)
+    else:
+        slopes, M, found = _slopes(dynamics, choice.partition, y, forces, basis, driven)
     n = y.q.size
     velocity = ByInputs(basis[n : 2 * n], jnp.stack([*(of_u[n : 2 * n] for of_u in driven), jnp.zeros_like(driven[0][n : 2 * n])]))
     positions, velocities = (np.array(which, int) for which in choice.partition[:2])
@@ -140,6 +153,26 @@ def _slopes(
     return [of(x) for x in (qddot, multipliers, followed(slope.z), followed(slope.outputs), followed(slope.updates))], M, found
 
 
+def _slopes_of_solution(
+    dynamics: Dynamics, y: Whole, forces: Forces, basis: Array, driven: tuple[Array, Array]
+) -> tuple[list[ByInputs], Array, Balance]:
+    """The same where coordinates have no inertia: q̈ and λ are differentiated as they are computed."""
+    n, d, m = y.q.size, basis.shape[1], len(dynamics.inputs)
+
+    def along(c):
+        x, *u = jnp.split(c, np.cumsum([d, m, m]))
+        step = basis @ x + driven[0] @ u[0] + driven[1] @ u[1]
+        moved, motion = Whole(*(a + b for a, b in zip(y, jnp.split(step, (n, 2 * n)), strict=True))), (u[0], u[1], u[2])
+        qddot, multipliers, _ = dynamics.forces(moved, motion)
+        return qddot, multipliers, *dynamics.driven(moved, qddot, multipliers, motion)
+
+    slopes = jax.jacfwd(along)(jnp.zeros(d + 3 * m, y.q.dtype))
+    of = lambda J: ByInputs(J[:, :d], jnp.moveaxis(J[:, d:].reshape(len(J), 3, m), 1, 0))
+    mode = in_current_mode(dynamics.at(y, dynamics.still()), dynamics.t, y.q, y.v)
+    M = inertia(mode, dynamics.t, y.q, y.v)[0].as_matrix()
+    return [of(J) for J in slopes], M, dynamics.balance(y, forces.qddot, forces.multipliers, dynamics.still())
+
+
 def tangent_basis(dynamics: Dynamics, at: Partition, y: Whole) -> tuple[Array, tuple[Array, Array]]:
     """T, and how the state follows u and u̇ where these move constraints: from ∂(g, ψ) = 0 for the dependent ones."""
     (n,), (k,), m = y.q.shape, y.z.shape, len(dynamics.inputs)
@@ -186,4 +219,7 @@ def _rounding(dynamics: Dynamics, y: Whole, multipliers: Array, mass: Array) -> 
     of_lagrangian = jax.grad(mode.lagrangian, argnums=1)(dynamics.t, y.q, y.v)
     applied = applied_force(mode, dynamics.t, y.q, y.v, multipliers)
     forces = jnp.abs(of_lagrangian) + jnp.abs(applied) + jnp.abs(G.T) @ jnp.abs(multipliers)
+    light = first_order(mode, dynamics.t, y.q, y.v).coordinates
+    stand_in = with_masses(mode, light, dynamics.t, y.q, y.v) if light.size else None
+    mass = mass if stand_in is None else inertia(stand_in, dynamics.t, y.q, y.v)[0].as_matrix()
     return jnp.abs(jnp.linalg.inv(augmented(mass, G)[0])) @ forces

@@ -16,8 +16,9 @@ from .._model.validation import at_state, checked, coordinates, state
 from .._program.scalarise import scalarised
 from .constrained_acceleration import constrained_acceleration
 from .contact import in_contact, in_current_mode
-from .friction_elements import unread_friction
+from .friction_elements import light_coordinates, unread_friction
 from .lagrange import applied_force, constraint_rows, inertia, position_residual, velocity_residual
+from .massless import completed, with_masses
 from .saddle_point import augmented
 from .singular_directions import UNDEFINED, is_defined, massless_coordinates, not_affine_in, tangent_basis
 
@@ -32,7 +33,8 @@ class Examination:
     - `smallest_inertia`: the least eigenvalue of M on the motions that the constraints allow.
     - `dissipated`: the least of q̇·∂D/∂q̇ near the state, a power, by term.
     - `time_constants`: 1/|eigenvalue| of the linearised motion, the fastest and the slowest, with the states beside q held.
-    - `findings`: sentences with the cure. `contacts`: which contacts are closed, by name.
+    - `findings`: sentences with the cure. `contacts`: which contacts are closed, by name. `without_inertia`: coordinates whose velocity
+      dissipation alone decides; they count as degrees of freedom.
     """
 
     coordinates: tuple[str, ...]
@@ -48,6 +50,7 @@ class Examination:
     findings: tuple[str, ...]
     states: tuple[str, ...] = ()
     contacts: dict[str, bool] = dataclasses.field(default_factory=dict)
+    without_inertia: tuple[str, ...] = ()
 
     def __repr__(self) -> str:
         fastest, slowest = self.time_constants
@@ -55,6 +58,7 @@ class Examination:
             ("coordinates", ", ".join(self.coordinates)),
             *([("states", ", ".join(self.states))] if self.states else []),
             *((f"contact {name!r}", "closed" if closed else "open") for name, closed in self.contacts.items()),
+            *([("without inertia", ", ".join(self.without_inertia))] if self.without_inertia else []),
             ("degrees of freedom", str(self.degrees_of_freedom)),
             ("constraint rows", f"{self.rows}, of rank {self.rank}"),
             ("smallest inertia", f"{self.smallest_inertia:.3g}"),
@@ -125,7 +129,9 @@ def examine(system: System, q: PyTree, qdot: PyTree, params: PyTree = None, *, t
         *_pulling(system, found["multipliers"]),
         *_unread_friction(system, q, qdot, params, t, states),
     ]
-    return Examination(**numbers, findings=tuple(findings), states=tuple(name for name, _ in system.states), contacts=contacts)
+    light = tuple(names[i] for i in np.flatnonzero(found["light"]))
+    states = tuple(name for name, _ in system.states)
+    return Examination(**numbers, findings=tuple(findings), states=states, contacts=contacts, without_inertia=light)
 
 
 def _unread_friction(system, q, qdot, params, t, states):
@@ -151,7 +157,7 @@ def _without_inertia(names, M, G):
     if free:
         yield (
             f"a direction that no constraint holds has no inertia: {', '.join(map(repr, free))}; add the missing mass (a small one with "
-            "`solver=diffrax.Kvaerno5()`), a constraint that holds it, or leave the coordinate out"
+            "`solver=diffrax.Kvaerno5()`), a constraint that holds it, or a D of its velocity, or leave the coordinate out"
         )
 
 
@@ -214,11 +220,16 @@ def _measure(flat: Flat, t, q, v):
     closed = mode.closed if flat.contacts else jnp.zeros(0, bool)
     flat = in_contact(flat, closed)
     _, G, _ = constraint_rows(flat, t, q, v)
+    light = light_coordinates(flat, t, q, v)
     beside = jnp.linspace(-0.1, 0.1, q.size, dtype=q.dtype)
     around = jnp.stack([jnp.zeros_like(beside), beside, -beside[::-1]])
     multipliers, defects = jax.vmap(lambda near: _defects(mode, t, q + near, v + near))(around)
     multipliers = multipliers[0]
-    rates = lambda y: jnp.concatenate([y[q.size :], constrained_acceleration(mode, t, y[: q.size], y[q.size :]).x])
+
+    def rates(y):
+        q, v = jnp.split(y, 2)
+        return jnp.concatenate([completed(mode, t, q, v).v, constrained_acceleration(mode, t, q, v).x])
+
     scale = 1 + jnp.max(jnp.abs(v))
     near = v[None] + 0.1 * scale * jax.random.normal(jax.random.key(0), (64, v.size), v.dtype)
     fed = {name: jax.vmap(lambda v, D=D: v @ jax.grad(D, argnums=2)(t, q, v, multipliers))(near) for name, D in flat.dissipations.items()}
@@ -226,7 +237,8 @@ def _measure(flat: Flat, t, q, v):
     split = rows_by_name(flat)
     psi, _, _ = constraint_rows(flat, t, q, v)
     return {
-        "M": inertia(flat, t, q, v)[0].as_matrix(),
+        "M": inertia(with_masses(flat, light, t, q, v) if light.size else flat, t, q, v)[0].as_matrix(),
+        "light": jnp.isin(jnp.arange(q.size), light),
         "closed": closed,
         "G": G,
         "A": jax.jacfwd(rates)(jnp.concatenate([q, v])),
@@ -245,6 +257,7 @@ def _defects(mode, t, q, v):
 
     Of M q̈ − f − Gᵀλ and of G q̈ + γ: what is left, and with the largest term; zeros where inertia is missing.
     """
+    v = completed(mode, t, q, v).v
     qddot, multipliers, sound = scalarised(lambda t, q, v: constrained_acceleration(mode, t, q, v))(t, q, v)
     one, L, psi = jnp.ones_like(t), mode.lagrangian, lambda t, q, v: velocity_residual(mode, t, q, v)
     _, rate = jax.jvp(jax.grad(L, argnums=2), (t, q, v), (one, v, qddot))
@@ -273,9 +286,8 @@ def _redundant_rows(G, rows, eps):
 
 def _time_constants(found, N):
     """1/|λ| of the nonzero eigenvalues of the motion linearised on the constraints, the fastest and the slowest."""
-    n = N.shape[0]
-    A = found["A"]
-    reduced = np.block([[np.zeros((N.shape[1],) * 2), np.eye(N.shape[1])], [N.T @ A[n:, :n] @ N, N.T @ A[n:, n:] @ N]])
+    allowed = np.kron(np.eye(2), N)  # of positions and of velocities
+    reduced = allowed.T @ found["A"] @ allowed
     sizes = np.abs(np.linalg.eigvals(reduced))
     sizes = sizes[sizes > 1e-7 * np.max(sizes, initial=0.0)]  # a double eigenvalue 0 is some √eps of the largest, after rounding
     return (1 / np.max(sizes), 1 / np.min(sizes)) if sizes.size else (float("inf"), float("inf"))

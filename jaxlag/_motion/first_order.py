@@ -134,9 +134,10 @@ class EquationsOfMotion:
         return [period(self.system, name, params) for name in self.sampled_names]
 
     @property
-    def controlled(self) -> int:
-        """How many of the first entries of y set the steps by their error."""
-        return 2 * self.size + self.states.size
+    def controlled(self) -> tuple[bool, ...]:
+        """Which of the first entries of y set the steps by their error: velocities that follow from the rest do not."""
+        followed = {self.size + i for i in self.light}
+        return tuple(i not in followed for i in range(2 * self.size + self.states.size))
 
     def parts(self, y) -> Parts:
         """y, taken apart."""
@@ -149,7 +150,7 @@ class EquationsOfMotion:
     @property
     def seen(self) -> int:
         """How many numbers are recorded of an event, where there are any: the time, q, q̇ and the states."""
-        return 1 + self.controlled + self.sampled.size if self.events else 0
+        return 1 + len(self.controlled) + self.sampled.size if self.events else 0
 
     @property
     def projection(self) -> Projection | None:

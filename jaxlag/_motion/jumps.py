@@ -27,7 +27,7 @@ def after_jump(equations: EquationsOfMotion, t, y0, y, before: Arguments, args: 
         earlier = equations.flat(before.params, equations.states_of(t, there))
         lift = energy_exchange(flat, t, parts.q, parts.v)[0] - energy_exchange(earlier, t, there.q, there.v)[0]
         parts = parts._replace(works=parts.works.at[equations.works.index(EXPLICIT_TIME)].add(lift))
-    slipping = parts._replace(sigma=jnp.ones_like(parts.sigma))
+    slipping = parts._replace(sigma=parts.sigma if elements is None else jnp.where(elements.massless >= 0, parts.sigma, 1))
     if equations.contacts:
         assert args.scales is not None  # contacts are located
         moved = equations.parts(equations.projected(t, parts.y, args))
@@ -35,7 +35,7 @@ def after_jump(equations: EquationsOfMotion, t, y0, y, before: Arguments, args: 
         nothing = jnp.zeros(equations.elements, bool), jnp.zeros(equations.contacts, bool)
         change = behind_contact(equations, t, moved, args, *nothing, errors, anew=True)
         return change.y, change.consistent & change.dissipates & change.impulsive
-    held = equations.projection is not None and equations.system.constraints
+    held = equations.projection is not None and (equations.system.constraints or equations.light)
     moved = equations.parts(equations.projected(t, slipping.y, args)) if held else slipping
     if elements is None:
         return moved.y, jnp.array(True)

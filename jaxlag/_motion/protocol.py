@@ -62,8 +62,8 @@ class FirstOrderSystem(Protocol):
         """How many elements of dry friction and contacts change their modes; 0 where the right-hand side is smooth."""
 
     @property
-    def controlled(self) -> int:
-        """How many of the first entries of y set the steps by their error: positions, velocities, states of first order."""
+    def controlled(self) -> tuple[bool, ...]:
+        """Which of the first entries of y set the steps by their error: positions, velocities, states of first order."""
 
     @property
     def projection(self) -> Projection | None:
@@ -93,8 +93,8 @@ class AugmentedSystem(abc.ABC):
         return []
 
     @property
-    def controlled(self) -> int:
-        """As many of the first entries as of the equations alone."""
+    def controlled(self) -> tuple[bool, ...]:
+        """The same as of the equations alone."""
         return self.equations.controlled
 
     @property

@@ -29,12 +29,12 @@ class SamplingAdjoint(dfx.AbstractAdjoint):
 class ProjectedSolver(dfx.AbstractWrappedSolver, dfx.AbstractAdaptiveSolver):
     """Any solver that estimates its error, with the end of each step put back on the constraints.
 
-    `projected(t, y, args)` does that; the error of the first `controlled` entries of y alone sets the steps.
+    `projected(t, y, args)` does that; the error of those of the first entries of y that are `controlled` alone sets the steps.
     """
 
     solver: dfx.AbstractAdaptiveSolver
     projected: Callable | None = eqx.field(static=True)
-    controlled: int = eqx.field(static=True)
+    controlled: tuple[bool, ...] = eqx.field(static=True)
 
     @property
     def term_structure(self):
@@ -75,7 +75,9 @@ class ProjectedSolver(dfx.AbstractWrappedSolver, dfx.AbstractAdaptiveSolver):
     def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
         """One step of the solver, its end put back on the constraints."""
         y1, error, dense, solver_state, result = self.solver.step(terms, t0, t1, y0, args, solver_state, made_jump)
-        error = jnp.where((np.arange(len(error)) < self.controlled).reshape(-1, *[1] * (error.ndim - 1)), error, 0)
+        counts = np.zeros(len(error), bool)
+        counts[: len(self.controlled)] = self.controlled
+        error = jnp.where(counts.reshape(-1, *[1] * (error.ndim - 1)), error, 0)
         if self.projected is not None:
             y1 = self.projected(t1, y1, args)
             # A step that cannot be put back is rejected, and tried again with half the length or less.
