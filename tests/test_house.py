@@ -73,6 +73,7 @@ WINGS = {  # each imports only from those above it, and each file of a wing only
         "contact",
         "impact",
         "projection",
+        "return_mapping",
         "consistent_state",
         "acceleration",
         "power",

@@ -16,12 +16,13 @@ from .._program.implicit import undifferentiated
 from .._program.jit import is_concrete
 from .._program.scalarise import scalarised
 from .constrained_root import Linear, root_of
-from .friction_elements import light_coordinates
+from .friction_elements import find_elements, light_coordinates
 from .lagrange import constraint_rows, inertia, position_residual, velocity_residual
 from .massless import completed, inertial_part, with_masses
 from .projection import metric_of_positions
 from .saddle_point import NO_INERTIA, is_determined, reach_of
 from .singular_directions import NOT_AFFINE, UNDEFINED, explained, not_affine_in
+from .stick_slip import first_mode, in_mode
 
 ITERATIONS = 16  # near the constraints four suffice
 
@@ -46,7 +47,7 @@ def nearest_state(flat: Flat, t, q0, v0, free: Sequence[int] | None = None) -> C
     Derivatives are those that these equations imply.
     """
     moving = np.arange(q0.size) if free is None else np.asarray(free, int)
-    decided = flat
+    stated = flat
     if flat.massless:
         flat = with_masses(flat, light_coordinates(flat, t, q0, v0), t, q0, v0)
     full = inertia(flat, t, q0, v0)[0]
@@ -56,7 +57,12 @@ def nearest_state(flat: Flat, t, q0, v0, free: Sequence[int] | None = None) -> C
     if given.size == 0:  # nothing to satisfy: saves the compilation of the search
         yes = jnp.array(True)
         return Consistent(
-            q0, completed(decided, t, q0, v0).v, yes, is_determined(M, jnp.zeros((0, moving.size), M.dtype)), yes, jnp.all(jnp.isfinite(M))
+            q0,
+            _with_decided_rates(stated, t, q0, v0),
+            yes,
+            is_determined(M, jnp.zeros((0, moving.size), M.dtype)),
+            yes,
+            jnp.all(jnp.isfinite(M)),
         )
     q = q0
     if positions:
@@ -65,7 +71,7 @@ def nearest_state(flat: Flat, t, q0, v0, free: Sequence[int] | None = None) -> C
             M = jnp.where(held, M, metric_of_positions(flat, full, t, q0, v0).as_matrix()[np.ix_(moving, moving)])
         q = _nearest_position(flat, moving, t, q0, M)
     v, determined = _nearest_velocity(inertial_part(flat, t, q, v0), moving, t, q, v0)
-    v = completed(decided, t, q, v).v
+    v = _with_decided_rates(stated, t, q, v)
 
     @undifferentiated
     def judged(t, q0, v0, q, v, M, given):
@@ -74,6 +80,13 @@ def nearest_state(flat: Flat, t, q0, v0, free: Sequence[int] | None = None) -> C
 
     reached, affine, defined = judged(t, q0, v0, q, v, M, given)
     return Consistent(q, v, reached, determined, affine, defined)
+
+
+def _with_decided_rates(flat: Flat, t, q, v) -> Float[Array, " n"]:
+    """q̇ with the velocities that dissipation decides, in the mode of friction that holds there."""
+    elements = find_elements(flat, t, q, v) if flat.massless else None
+    mode = flat if elements is None else in_mode(flat, elements, first_mode(flat, elements, t, q, v)[0].sigma)
+    return completed(mode, t, q, v).v
 
 
 def _nearest_position(flat: Flat, moving, t, q0, M) -> Float[Array, " n"]:

@@ -23,6 +23,7 @@ from .._program.constants import is_numeric
 from .._program.dependence import Path, Structure
 from .._program.expressions import Node, TooLong, is_number, objects
 from .._program.polynomials import Modulus, moduli_in
+from .._program.sparse_jacobian import sparsity_pattern
 from .._program.substitution import evaluate_with_replacements, polynomial_values, source_equations
 from .._program.walker import constants_as_inputs
 from .massless import SEVERAL, first_order, plastic
@@ -38,6 +39,7 @@ class FrictionElements(NamedTuple):
     element_of_row: np.ndarray
     rows_of_term: dict[str, np.ndarray]  # of each nonsmooth term
     massless: np.ndarray  # of each row the coordinate without inertia that only this friction resists, or −1
+    follows: np.ndarray  # of each element, whether its slip follows from forces, as that of a coordinate without inertia does
     near_rest: Array | float = 0.0  # per element, the slip of several rows below which it keeps its direction
 
     @property
@@ -102,20 +104,22 @@ def find_elements(flat: Flat, t, q, v) -> FrictionElements | None:
     rows_of = lambda moduli: np.concatenate([starts[u] + np.arange(len(u.of)) for u in moduli])
     rows_of_term = {name: rows_of(moduli) for name, moduli in nonsmooth.items() if moduli}
     potentials, of_row = {name: potential(name) for name in terms}, np.repeat(np.arange(len(first)), sizes)
-    elements = FrictionElements(slip, potentials, of_row, rows_of_term, np.full(of_row.size, -1))
-    return elements._replace(massless=_without_inertia(flat, elements, t, q, v)) if flat.massless else elements
+    elements = FrictionElements(slip, potentials, of_row, rows_of_term, np.full(of_row.size, -1), np.zeros(len(first), bool))
+    return _without_inertia(flat, elements, t, q, v) if flat.massless else elements
 
 
-def _without_inertia(flat: Flat, elements: FrictionElements, t, q, v) -> np.ndarray:
-    """Of each row the coordinate without inertia that only this friction resists, or −1."""
+def _without_inertia(flat: Flat, elements: FrictionElements, t, q, v) -> FrictionElements:
+    """The elements, with what they know of coordinates without inertia."""
     slipping = lambda D: lambda t, q, v, multipliers: D(t, q, v, multipliers, elements.sums(elements.slip(t, q, v)))
     sliding = flat._replace(dissipations={name: slipping(D) for name, D in elements.potentials.items()})
     rows, coordinates = plastic(sliding, elements.slip, t, q, v)
     if np.any(elements.is_vector[elements.element_of_row[rows]]):
         raise ValueError(SEVERAL)
-    found = np.full(elements.element_of_row.size, -1)
-    found[rows] = coordinates
-    return found
+    massless, light = elements.massless.copy(), np.union1d(first_order(sliding, t, q, v).coordinates, coordinates).astype(int)
+    massless[rows] = coordinates
+    slips = sparsity_pattern(lambda dv: jax.jvp(lambda v: elements.slip(t, q, v), (v,), (dv,))[1], v)[:, light]
+    follows = np.isin(np.arange(elements.size), elements.element_of_row[np.any(slips, axis=1)])
+    return elements._replace(massless=massless, follows=follows)
 
 
 def light_coordinates(flat: Flat, t, q, v) -> np.ndarray:

@@ -95,8 +95,11 @@ def _friction(flat, elements, sigma, t, q, v, feedback):
     qddot, multipliers, _ = constrained_acceleration(mode, t, q, v, feedback)
     v = completed(mode, t, q, v).v
     slip, slip_rate = jax.jvp(elements.slip, (t, q, v), (jnp.ones_like(t), v, qddot))
-    if mode.yielding is not None:  # what has no inertia slips at once
-        slip_rate = jnp.where(elements.massless >= 0, elements.slip(t, q, nearest_velocity(mode, t, q, v)), slip_rate)
+    if np.any(elements.follows):  # what has no inertia slips at once
+        there = v if mode.yielding is None else nearest_velocity(mode, t, q, v)
+        at_once = elements.slip(t, q, there)
+        moves = elements.follows & (elements.norms(at_once) > slip_of(elements, t, q, there, 1e2 * jnp.finfo(v.dtype).eps * jnp.abs(there)))
+        slip_rate = jnp.where(moves[of], at_once, slip_rate)
     pull = jax.vjp(lambda slip: _extent(elements, sigma, slip), slip)[1]
     bound = bounds(elements, sigma, t, q, v, multipliers)
     held = multipliers[flat.rows :]
@@ -217,7 +220,7 @@ def select_mode(
             contacts,
             Mode(
                 jnp.where(anew, resting, jnp.where(within | (stage == LOOSE), sigma, mode.sigma)),
-                jnp.where(stage == HOLD, released & ~idle & (rate <= 1e-6 * search.free_rate), mode.held),
+                jnp.where(stage == HOLD, released & ~idle & ~elements.follows & (rate <= 1e-6 * search.free_rate), mode.held),
                 jnp.where(within, agrees & ~anew, mode.consistent),
                 jnp.where(within, found.bound, mode.bound),
             ),
@@ -251,7 +254,7 @@ def first_mode(flat: Flat, elements: FrictionElements, t, q, v, contacts: Any = 
     """The initial mode: what moves slips along its motion; what rests sticks or breaks away. And the contacts chosen with it."""
     slip = jax.lax.stop_gradient(elements.slip(t, q, v))
     size = elements.norms(slip)
-    at_rest = size <= slip_of(elements, t, q, v, 1e2 * jnp.finfo(v.dtype).eps * jnp.abs(v))
+    at_rest = elements.follows | (size <= slip_of(elements, t, q, v, 1e2 * jnp.finfo(v.dtype).eps * jnp.abs(v)))
     sigma = slip / jnp.where(at_rest, 1, size)[elements.element_of_row]
     return select_mode(flat, elements, t, q, v, sigma, at_rest, jnp.zeros_like(at_rest), contacts)
 

@@ -3,6 +3,7 @@
 import jax.numpy as jnp
 
 from .._mechanics.power import energy_exchange
+from .._mechanics.return_mapping import returned
 from .._mechanics.stick_slip import select_mode, slip_of
 from .._model.system import EXPLICIT_TIME
 from .._program.jit import jitted
@@ -40,6 +41,7 @@ def after_jump(equations: EquationsOfMotion, t, y0, y, before: Arguments, args: 
     if elements is None:
         return moved.y, jnp.array(True)
     assert args.scales is not None  # friction is located
+    moved = moved._replace(q=returned(flat, elements, t, moved.q, moved.v))
     q, v = moved.q, moved.v
     slip = elements.slip(t, q, v)
     size = elements.norms(slip)

@@ -22,6 +22,7 @@ from .._mechanics.contact import (
 )
 from .._mechanics.friction_elements import FrictionElements
 from .._mechanics.impact import impact, no_impact
+from .._mechanics.return_mapping import returned
 from .._mechanics.stick_slip import Mode, first_mode, friction, select_mode, slip_of, sticking
 from .._model.flat import Flat, StatesAt
 from .._program.jit import jitted
@@ -278,6 +279,7 @@ def started(equations: EquationsOfMotion, at: StatesAt, params) -> Start:
         return Start(change.y, change.consistent, yes, is_outside, change.dissipates, change.impulsive)
     if elements is None:
         return Start(parts.y, yes, yes, yes, yes, yes)
+    parts = parts._replace(q=returned(flat, elements, t, parts.q, parts.v))
     mode, _ = first_mode(flat, elements, t, parts.q, parts.v)
     parts = parts._replace(sigma=mode.sigma, held=mode.held.astype(parts.q.dtype))
     return Start(equations.projected(t, parts.y, args), mode.consistent, ~jnp.any(mode.bound < 0), yes, yes, yes)
