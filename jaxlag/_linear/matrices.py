@@ -75,8 +75,9 @@ def constraint_slopes(system, t, q, qdot, params, states):
     mode = in_current_mode(flat, t, q, v)
     _, G, _ = constraint_rows(mode, t, q, v)
     z, rows = first_order(mode, t, q, v)
-    alone = np.outer(rows, ~np.isin(np.arange(q.size), z))
-    G = jnp.concatenate([jnp.where(alone, 0, G), jnp.eye(q.size, dtype=G.dtype)[z]])
+    if z.size:
+        alone = np.outer(rows, ~np.isin(np.arange(q.size), z))
+        G = jnp.concatenate([jnp.where(alone, 0, G), jnp.eye(q.size, dtype=G.dtype)[z]])
     return G, jnp.zeros(flat.holonomic(t, q).size), off_constraints(flat, t, q, v)
 
 

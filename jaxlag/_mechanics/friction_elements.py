@@ -38,9 +38,11 @@ class FrictionElements(NamedTuple):
     potentials: dict[str, Callable[..., Float[Array, ""]]]  # D of each term (t, q, v, λ, u), with u of length e
     element_of_row: np.ndarray
     rows_of_term: dict[str, np.ndarray]  # of each nonsmooth term
-    massless: np.ndarray  # of each row the coordinate without inertia that only this friction resists, or −1
-    follows: np.ndarray  # of each element, whether its slip follows from forces, as that of a coordinate without inertia does
     near_rest: Array | float = 0.0  # per element, the slip of several rows below which it keeps its direction
+    massless: np.ndarray = np.array(-1)  # of each row the coordinate without inertia that only this friction resists, or −1
+    follows: np.ndarray = np.array(
+        False
+    )  # of each element, whether its slip follows from forces, as that of a coordinate without inertia does
 
     @property
     def size(self) -> int:
@@ -104,7 +106,7 @@ def find_elements(flat: Flat, t, q, v) -> FrictionElements | None:
     rows_of = lambda moduli: np.concatenate([starts[u] + np.arange(len(u.of)) for u in moduli])
     rows_of_term = {name: rows_of(moduli) for name, moduli in nonsmooth.items() if moduli}
     potentials, of_row = {name: potential(name) for name in terms}, np.repeat(np.arange(len(first)), sizes)
-    elements = FrictionElements(slip, potentials, of_row, rows_of_term, np.full(of_row.size, -1), np.zeros(len(first), bool))
+    elements = FrictionElements(slip, potentials, of_row, rows_of_term)
     return _without_inertia(flat, elements, t, q, v) if flat.massless else elements
 
 
@@ -115,7 +117,10 @@ def _without_inertia(flat: Flat, elements: FrictionElements, t, q, v) -> Frictio
     rows, coordinates = plastic(sliding, elements.slip, t, q, v)
     if np.any(elements.is_vector[elements.element_of_row[rows]]):
         raise ValueError(SEVERAL)
-    massless, light = elements.massless.copy(), np.union1d(first_order(sliding, t, q, v).coordinates, coordinates).astype(int)
+    massless, light = (
+        np.full(elements.element_of_row.size, -1),
+        np.union1d(first_order(sliding, t, q, v).coordinates, coordinates).astype(int),
+    )
     massless[rows] = coordinates
     slips = sparsity_pattern(lambda dv: jax.jvp(lambda v: elements.slip(t, q, v), (v,), (dv,))[1], v)[:, light]
     follows = np.isin(np.arange(elements.size), elements.element_of_row[np.any(slips, axis=1)])

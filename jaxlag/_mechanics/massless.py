@@ -8,10 +8,11 @@ Source: Onsager, Phys. Rev. 37 (1931) 405; Doi, J. Phys.: Condens. Matter 23 (20
 """
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import lineax as lx
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
@@ -103,7 +104,7 @@ def _underdetermined(pattern: Bool[np.ndarray, "m k"]) -> Bool[np.ndarray, " k"]
 
     Source: Dulmage & Mendelsohn, Canad. J. Math. 10 (1958) 517: what alternating paths from unmatched columns reach.
     """
-    owner: dict[int, int] = {}  # row: the column that it determines
+    owner: dict[Any, Any] = {}  # row: the column that it determines
 
     def augment(column, seen):
         for row in np.flatnonzero(pattern[:, column]):
@@ -202,8 +203,8 @@ def _by_newton(flat: Flat, z, rows, equations: Callable, t, q, v) -> tuple[Array
         return Linear(slope.as_matrix() + faint * jnp.eye(k), G, F, c)
 
     def search(linear, args):
-        given = jnp.where(jnp.isfinite(args[2][z]), args[2][z], 0)
         force = lambda w: linear(args, jnp.concatenate([w, like[k:]])).f
+        given = _first_guess(force, linear(args, jnp.zeros_like(like)), args[2][z])
 
         def newton(carry):
             w, _, _, i = carry
@@ -220,25 +221,42 @@ def _by_newton(flat: Flat, z, rows, equations: Callable, t, q, v) -> tuple[Array
         return w, (jnp.max(jnp.abs(left)) <= jnp.finfo(v.dtype).eps ** 0.5 * scale, linear(args, w).solution().sound.satisfied)
 
     w, (solved, satisfied) = root_of(residual, linear, search, (t, q, v), like)
-    return *jnp.split(w, [k]), Sound(solved, satisfied)
+    rates, multipliers = jnp.split(w, [k])
+    return rates, multipliers, Sound(solved, satisfied)
+
+
+def _first_guess(force: Callable, at_rest: Linear, given: Float[Array, " k"]) -> Float[Array, " k"]:
+    """The rates given, where they balance half of the forces; or else, along the forces, as fast as balances these, to a factor of two."""
+    identity = lambda f, c: saddle_point(lx.MatrixLinearOperator(jnp.eye(given.size, dtype=given.dtype)), at_rest.G, f, c).x
+    slowest = identity(jnp.zeros_like(given), at_rest.c)
+    allowed = lambda w: identity(force(w), jnp.zeros_like(at_rest.c))
+    given = jnp.where(jnp.isfinite(given), given, 0)
+    given, along = given + identity(jnp.zeros_like(given), at_rest.c - at_rest.G @ given), allowed(slowest)
+    along = along / jnp.maximum(jnp.max(jnp.abs(along)), jnp.finfo(given.dtype).tiny)
+    largest = int(jnp.finfo(given.dtype).maxexp)
+    ahead = lambda k: -force(slowest + jnp.exp2(k.astype(given.dtype)) * along) @ along
+    searched = lambda: slowest + _power_of_two(lambda k: ahead(k) <= 0, -largest, largest) * along
+    is_near = jnp.max(jnp.abs(allowed(given))) <= jnp.max(jnp.abs(allowed(slowest))) / 2
+    return jax.lax.cond(is_near, lambda: given, searched)
 
 
 def _length(slope: Callable) -> Float[Array, ""]:
     """How much of a step of Newton's method to take, a power of ½: the longest that does not go far beyond the minimum along it."""
     start = slope(0.0)
-    within = lambda share: slope(share) <= jnp.abs(start) / 2
+    within = lambda k: slope(jnp.exp2(k.astype(start.dtype))) <= jnp.abs(start) / 2
+    return jax.lax.cond(within(jnp.array(0)), lambda: jnp.ones_like(start), lambda: _power_of_two(within, -HALVINGS, 0))
 
-    def halved():
-        longer = lambda k: jnp.exp2(-k.astype(start.dtype))
 
-        def bisect(carry):
-            low, high = carry
-            middle = (low + high) // 2
-            return jax.tree.map(lambda a, b: jnp.where(within(longer(middle)), a, b), (low, middle), (middle, high))
+def _power_of_two(within: Callable, least: int, most: int) -> Float[Array, ""]:
+    """The largest power that is still within, by bisection of its exponent."""
 
-        return longer(jax.lax.while_loop(lambda carry: carry[1] - carry[0] > 1, bisect, (jnp.array(0), jnp.array(HALVINGS)))[1])
+    def bisect(carry):
+        low, high = carry
+        middle = (low + high) // 2
+        return jax.tree.map(lambda a, b: jnp.where(within(middle), a, b), (middle, high), (low, middle))
 
-    return jax.lax.cond(within(1.0), lambda: jnp.ones_like(start), halved)
+    exponent, _ = jax.lax.while_loop(lambda carry: carry[1] - carry[0] > 1, bisect, (jnp.array(least), jnp.array(most)))
+    return jnp.exp2(exponent.astype(float))
 
 
 def inertial_part(flat: Flat, t, q, v, reaction: Float[Array, " n"] | None = None) -> Flat:

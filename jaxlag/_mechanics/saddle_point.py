@@ -64,7 +64,7 @@ def _saddle_point(M, G, f, c, reach) -> SaddlePoint:
     return SaddlePoint(x, multipliers, Sound(factors.determined, factors.satisfied))
 
 
-def saddle_solver(M: lx.AbstractLinearOperator, G: Float[Array, "m n"], f, c, reach: Float[Array, " n"]) -> Callable:
+def saddle_solver(M: lx.AbstractLinearOperator, G: Float[Array, "m n"], f, c, reach: Float[Array, " n"] | None = None) -> Callable:
     """(f, c) ↦ (x, λ) as of `saddle_point`, for other vectors f and c; what G barely holds is held as it is for these."""
     solve, _ = _solver(M, G, _factorised(*jax.lax.stop_gradient((M, G, f[:, None], c[:, None], reach))))
 

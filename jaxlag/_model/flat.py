@@ -1,6 +1,6 @@
 """The system over flat vectors: what the mechanics works on."""
 
-import functools
+import weakref
 from collections.abc import Callable, Mapping
 from functools import partial
 from typing import Any, NamedTuple
@@ -91,28 +91,34 @@ def bind(system: System, like: PyTree, params: PyTree, states: StatesAt | None =
         terms=system.terms,
         rows=bound.rows,
         rows_of_bilateral=bound.rows_of_bilateral,
-        massless=_massless(system, *_hashable((like, params, {} if states is None else states.values))),
+        massless=_massless(system, like, params, {} if states is None else states.values),
     )
 
 
-def _hashable(tree: PyTree) -> tuple:
-    """Structure and leaves of a pytree, its arrays as shapes."""
-    leaves, structure = jax.tree.flatten(tree)
-    return structure, tuple(jax.ShapeDtypeStruct(x.shape, x.dtype) if hasattr(x, "dtype") else x for x in leaves)
+def _massless(system: System, *given: PyTree) -> tuple[int, ...]:
+    """Coordinates of which M has rows of zeros, whatever the numbers: read once for each structure of q, params and states."""
+    leaves, structure = jax.tree.flatten(given)
+    shapes = tuple(jax.ShapeDtypeStruct(x.shape, x.dtype) if hasattr(x, "dtype") else x for x in leaves)
+    known = _MASSLESS.setdefault(system, {})
+    if (structure, shapes) not in known:
+        known[structure, shapes] = _read_massless(system, structure, shapes)
+    return known[structure, shapes]
 
 
-@functools.lru_cache(maxsize=1024)
-def _massless(system: System, structure: Any, leaves: tuple) -> tuple[int, ...]:
-    """Coordinates of which M has rows of zeros, whatever the numbers: read once from the program of L."""
+_MASSLESS: weakref.WeakKeyDictionary[System, dict] = weakref.WeakKeyDictionary()
+
+
+def _read_massless(system: System, structure: Any, leaves: tuple) -> tuple[int, ...]:
+    """From the program of L."""
     found, is_number = [], [isinstance(leaf, jax.ShapeDtypeStruct) for leaf in leaves]
 
     def read(numbers):
         given = iter(numbers)
         filled = [next(given) if of_number else leaf for leaf, of_number in zip(leaves, is_number, strict=True)]
-        bound = _Bound(system, *jax.tree.unflatten(structure, filled))
-        v, _ = ravel_pytree(bound.zeros)
-        momentum = lambda v: jax.grad(bound.lagrangian, argnums=2)(jnp.zeros((), v.dtype), v, v)
-        found.extend(np.flatnonzero(~np.any(sparsity_pattern(lambda dv: jax.jvp(momentum, (v,), (dv,))[1], v), axis=1)))
+        like, params, states = jax.tree.unflatten(structure, filled)
+        bound, q = _Bound(system, like, params, states), ravel_pytree(like)[0]  # of no known numbers
+        momentum = lambda v: jax.grad(bound.lagrangian, argnums=2)(q[0], q, v)
+        found.extend(np.flatnonzero(~np.any(sparsity_pattern(lambda dv: jax.jvp(momentum, (q,), (dv,))[1], q), axis=1)))
 
     jax.eval_shape(read, [leaf for leaf, of_number in zip(leaves, is_number, strict=True) if of_number])
     return tuple(int(i) for i in found)

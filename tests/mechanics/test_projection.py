@@ -13,7 +13,7 @@ from scipy.integrate import solve_ivp
 from scipy.optimize import brentq
 
 import jaxlag as jl
-from jaxlag._mechanics import saddle_point
+from jaxlag._mechanics import constrained_acceleration
 from jaxlag.examples import pendulum, vehicle
 
 g = 9.81
@@ -368,12 +368,12 @@ def test_constraints_at_rest_do_no_work_and_moving_ones_do(name):
 @pytest.mark.parametrize("error", [0.0, 0.01])
 def test_balance_sees_a_wrong_gradient_of_the_dissipation(error, monkeypatch):
     """The equations of motion feel ∂D/∂q̇ too large by 1 %, the works do not: they miss 1 % of the heat."""
-    right = saddle_point.applied_force
+    right = constrained_acceleration.applied_force
 
     def spoiled(flat, t, q, v, multipliers):
         return right(flat, t, q, v, multipliers) * (1 + error)  # dissipation is all there is
 
-    monkeypatch.setattr(saddle_point, "applied_force", spoiled)
+    monkeypatch.setattr(constrained_acceleration, "applied_force", spoiled)
     system = jl.System(  # made here, so that nothing compiled before serves it
         lambda t, q, qdot, m, c: 0.5 * m * qdot**2 - 0.5 * c * (1 + 0.5 * jnp.sin(3 * t)) * q**2,
         dissipation={"oil": lambda qdot, b: 0.5 * b * qdot**2},
