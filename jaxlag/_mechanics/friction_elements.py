@@ -40,9 +40,7 @@ class FrictionElements(NamedTuple):
     rows_of_term: dict[str, np.ndarray]  # of each nonsmooth term
     near_rest: Array | float = 0.0  # per element, the slip of several rows below which it keeps its direction
     massless: np.ndarray = np.array(-1)  # of each row the coordinate without inertia that only this friction resists, or −1
-    follows: np.ndarray = np.array(
-        False
-    )  # of each element, whether its slip follows from forces, as that of a coordinate without inertia does
+    follows: np.ndarray = np.array(False)  # of each element, whether forces decide its slip, for want of inertia
 
     @property
     def size(self) -> int:

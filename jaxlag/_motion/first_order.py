@@ -15,7 +15,7 @@ from .._mechanics.contact import free, in_contact
 from .._mechanics.friction_elements import FrictionElements, light_coordinates
 from .._mechanics.friction_treatment import Regularised, StickSlip
 from .._mechanics.impact import check_impacts
-from .._mechanics.massless import completed
+from .._mechanics.massless import completed, first_order
 from .._mechanics.power import energy_exchange, listed_powers
 from .._mechanics.projection import Baumgarte, NoStabilisation, Projection
 from .._mechanics.saddle_point import SaddlePoint
@@ -103,6 +103,13 @@ class EquationsOfMotion:
             slow = slip_of(elements, t, q, v, jnp.full_like(v, args.scales.slow))
             elements = elements._replace(near_rest=jax.lax.stop_gradient(jnp.where(elements.is_vector, slow, 0)))
         return flat, in_mode(flat, elements, sigma), elements
+
+    def decided(self, t, parts: Parts, args: Arguments) -> Parts:
+        """With the velocities that follow from the rest: between the ends of steps, those of coordinates without inertia are not kept."""
+        if not self.light:
+            return parts
+        _, mode, _ = self.mode(t, parts, args)
+        return parts._replace(v=completed(mode, t, parts.q, parts.v).v)
 
     @property
     def modes(self) -> int:
@@ -215,12 +222,13 @@ def _values(flat: Flat, t, q, v):
 
 @jitted  # so that diffrax's many calls trace it once
 def _rates(equations: EquationsOfMotion, t, y, args):
-    parts = equations.parts(y)
+    parts = equations.decided(t, equations.parts(y), args)
     q, v, works, sigma, held = parts.q, parts.v, parts.works, parts.sigma, parts.held
     flat, mode, elements = equations.mode(t, parts, args)
-    v = completed(mode, t, q, v).v
     of = lambda flat: lambda: equations.acceleration(flat, t, q, v).x
     qddot = equations.where_closed(parts, of(mode), of(free(mode)))
+    if equations.light:  # what follows from the rest has no rate of its own
+        qddot = qddot.at[first_order(mode, t, q, v).coordinates].set(0)
     rates = ravelled(flat.state_rates(t, q, v), y.dtype)
     powers = listed_powers(mode, t, q, v) if equations.works else works
     stuck = parts.time_stuck if elements is None else jnp.maximum(sticking(elements, sigma).astype(y.dtype), held)

@@ -105,7 +105,7 @@ def approach(equations: EquationsOfMotion, path: Callable, t0, t1, args: Argumen
 
     def along(function):
         def at(t):
-            parts = equations.parts(path(t))
+            parts = equations.decided(t, equations.parts(path(t)), args)
             return function(equations.flat_at(args.params, equations.states_of(t, parts)), t, parts)
 
         return bounds_over_time(at, t), bounds_over_time(lambda t: jax.jvp(at, (t,), (jnp.ones_like(t),))[1], t)

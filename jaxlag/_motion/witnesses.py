@@ -18,6 +18,7 @@ def witness_margins(equations: EquationsOfMotion, t, parts: Parts, args: Argumen
     """Of each witness, its value with the sign that it has until it passes through zero, and what of it counts as rounding."""
     if not equations.events:
         return parts.sign, parts.sign
+    parts = equations.decided(t, parts, args)
     value, scale_of = _value_and_scale(equations, t, parts, args)
     return parts.sign * value, scale_of(roundings(parts.q), roundings(parts.v))
 
@@ -52,6 +53,7 @@ def sides(equations: EquationsOfMotion, t, parts: Parts, args: Arguments) -> tup
     whether it is farther away than by rounding.
     """
     assert args.scales is not None  # events are located
+    parts = equations.decided(t, parts, args)
     value, scale_of = _value_and_scale(equations, t, parts, args)
     flat, mode, _ = equations.mode(t, parts, args)
     multipliers, qddot = _multipliers(equations, t, parts, args), equations.acceleration(mode, t, parts.q, parts.v).x
