@@ -16,9 +16,10 @@ from .._program.implicit import undifferentiated
 from .._program.jit import is_concrete
 from .._program.scalarise import scalarised
 from .constrained_root import Linear, root_of
-from .friction_elements import find_elements, light_coordinates
+from .contact import in_contact
+from .friction_elements import find_elements, with_all_masses
 from .lagrange import constraint_rows, inertia, position_residual, velocity_residual
-from .massless import completed, inertial_part, with_masses
+from .massless import completed, inertial_part
 from .projection import metric_of_positions
 from .saddle_point import NO_INERTIA, is_determined, reach_of
 from .singular_directions import NOT_AFFINE, UNDEFINED, explained, not_affine_in
@@ -47,9 +48,7 @@ def nearest_state(flat: Flat, t, q0, v0, free: Sequence[int] | None = None) -> C
     Derivatives are those that these equations imply.
     """
     moving = np.arange(q0.size) if free is None else np.asarray(free, int)
-    stated = flat
-    if flat.massless:
-        flat = with_masses(flat, light_coordinates(flat, t, q0, v0), t, q0, v0)
+    stated, flat = flat, with_all_masses(flat, t, q0, v0)
     full = inertia(flat, t, q0, v0)[0]
     M = full.as_matrix()[np.ix_(moving, moving)]
     given = jnp.concatenate([flat.holonomic(t, q0), velocity_residual(flat, t, q0, v0)])
@@ -83,7 +82,8 @@ def nearest_state(flat: Flat, t, q0, v0, free: Sequence[int] | None = None) -> C
 
 
 def _with_decided_rates(flat: Flat, t, q, v) -> Float[Array, " n"]:
-    """q̇ with the velocities that dissipation decides, in the mode of friction that holds there."""
+    """q̇ with the velocities that dissipation decides, in the mode of friction that holds there; contacts have no part in them."""
+    flat = in_contact(flat, jnp.zeros(len(flat.contacts), bool))
     elements = find_elements(flat, t, q, v) if flat.massless else None
     mode = flat if elements is None else in_mode(flat, elements, first_mode(flat, elements, t, q, v)[0].sigma)
     return completed(mode, t, q, v).v

@@ -16,7 +16,7 @@ from jaxtyping import Array, Bool, Float
 from .._model.flat import Flat
 from .._program.scalarise import scalarised
 from .constrained_acceleration import constrained_acceleration
-from .friction_elements import FrictionElements, find_elements
+from .friction_elements import FrictionElements, find_elements, with_all_masses
 from .lagrange import inertia, position_residual
 from .saddle_point import SaddlePoint, reach_of, saddle_point
 from .stick_slip import Mode, first_mode, in_mode, sticking
@@ -69,7 +69,7 @@ def on_contact(flat: Flat, t, q, v, closed: Bool[Array, " c"]) -> Float[Array, "
 
     def put(t, q, v, closed):
         g, G = position_residual(in_contact(flat, closed), t, q)
-        return q + saddle_point(inertia(flat, t, q, v)[0], G, jnp.zeros_like(q), -g, reach_of(q)).x
+        return q + saddle_point(inertia(with_all_masses(flat, t, q, v), t, q, v)[0], G, jnp.zeros_like(q), -g, reach_of(q)).x
 
     return scalarised(put)(t, q, v, closed)
 

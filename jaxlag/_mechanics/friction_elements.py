@@ -26,7 +26,7 @@ from .._program.polynomials import Modulus, moduli_in
 from .._program.sparse_jacobian import sparsity_pattern
 from .._program.substitution import evaluate_with_replacements, polynomial_values, source_equations
 from .._program.walker import constants_as_inputs
-from .massless import SEVERAL, first_order, plastic
+from .massless import SEVERAL, first_order, plastic, with_masses
 
 MOST_NODES = 100_000  # of a program that is searched: a second or two
 
@@ -130,6 +130,11 @@ def light_coordinates(flat: Flat, t, q, v) -> np.ndarray:
     elements = find_elements(flat, t, q, v) if flat.massless else None
     sticking = np.zeros(0, int) if elements is None else elements.massless[elements.massless >= 0]
     return np.union1d(first_order(flat, t, q, v).coordinates, sticking).astype(int)
+
+
+def with_all_masses(flat: Flat, t, q, v) -> Flat:
+    """The system with masses, which nothing feels, where coordinates have none: for what moves a state by no more than rounding."""
+    return with_masses(flat, light_coordinates(flat, t, q, v), t, q, v) if flat.massless else flat
 
 
 def unread_friction(flat: Flat, t, q, v, read: Container[str] | None = None) -> list[str]:

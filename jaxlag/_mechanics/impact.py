@@ -19,9 +19,10 @@ from jaxtyping import Array, Bool, Float
 
 from .._model.flat import Flat, rows_by_name
 from .contact import Contacts, accelerated, contact_rows, gap_rates, in_contact, select_closed
-from .friction_elements import FrictionElements
+from .friction_elements import FrictionElements, with_all_masses
 from .friction_treatment import Regularised, StickSlip
 from .lagrange import constraint_rows, inertia
+from .massless import inertial_part
 from .stick_slip import bounds, friction, friction_by_term, select_mode
 
 RISE = 1e-9  # of the energy exchanged, by which an impact may raise it by rounding
@@ -143,6 +144,7 @@ def check_impacts(flat: Flat, elements: FrictionElements | None, treatment: Stic
 
 def _in_fast_time(flat, elements, t, q, v, returned, given):
     """The system of an impact: x stands for a change of q, its acceleration from rest for q̇⁺."""
+    flat = inertial_part(with_all_masses(flat, t, q, v), t, q, v)
     M = inertia(flat, t, q, v)[0]
     momentum = M.mv(v)
     if given is not None:
@@ -157,6 +159,7 @@ def _in_fast_time(flat, elements, t, q, v, returned, given):
         nonholonomic=lambda s, x, w: along(w)[2] + s * drift[2],
         dissipations={},
         forces={},
+        massless=(),
     )
     fast = fast._replace(holonomic=lambda s, x: jnp.concatenate([fast.bilateral(s, x), jnp.zeros_like(drift[1])]))
     if elements is None:

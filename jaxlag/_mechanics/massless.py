@@ -61,9 +61,10 @@ def first_order(flat: Flat, t, q, v) -> FirstOrder:
     moved = lambda w: v.at[massless].set(w)
     decay = lambda dw: jax.jvp(lambda w: smooth_force(flat, t, q, moved(w))[massless], (v[massless],), (dw,))[1]
     resisted = np.any(sparsity_pattern(decay, v[massless]), axis=1)
-    decided = _undetermined(flat, in_rows) & (resisted | np.any(in_rows[: flat.rows], axis=0))
+    stated, of_contacts = _stated_rows(flat, t, q)
+    decided = _underdetermined(in_rows[stated]) & (resisted | np.any(in_rows[stated], axis=0))
     rows = np.any(in_rows[:, decided], axis=1)
-    if np.any(rows[flat.rows_of_bilateral :][: len(flat.contacts)]):
+    if np.any(rows[of_contacts]):
         raise ValueError(NO_CONTACT)
     return FirstOrder(massless[decided], rows)
 
@@ -74,7 +75,7 @@ def plastic(sliding: Flat, slip: Callable, t, q, v) -> tuple[Int[np.ndarray, " k
     Refused where it is one of several slips or coordinates, a constraint acts on it, or the other forces on it depend on velocities.
     """
     massless, in_rows = np.array(sliding.massless), _rows_with(sliding, t, q, v)
-    undecided = _undetermined(sliding, in_rows) & ~np.isin(massless, first_order(sliding, t, q, v).coordinates)
+    undecided = _underdetermined(in_rows[_stated_rows(sliding, t, q)[0]]) & ~np.isin(massless, first_order(sliding, t, q, v).coordinates)
     slips = sparsity_pattern(lambda dv: jax.jvp(lambda v: slip(t, q, v), (v,), (dv,))[1], v)[:, massless[undecided]]
     rows, columns = np.nonzero(slips)
     coordinates = massless[undecided][columns]
@@ -92,11 +93,11 @@ def _rows_with(flat: Flat, t, q, v) -> Bool[np.ndarray, "m k"]:
     return sparsity_pattern(lambda w: velocity_residual(flat, t, q, v.at[massless].set(w)), v[massless])
 
 
-def _undetermined(flat: Flat, in_rows: Bool[np.ndarray, "m k"]) -> Bool[np.ndarray, " k"]:
-    """Which massless coordinates the stated constraints alone do not determine; contacts may be open."""
-    stated = in_rows[: flat.rows].copy()
-    stated[flat.rows_of_bilateral :][: len(flat.contacts)] = False
-    return _underdetermined(stated)
+def _stated_rows(flat: Flat, t, q) -> tuple[np.ndarray, slice]:
+    """Rows of ψ that the user has stated as equations, and those of contacts, which may be open; behind them, those of friction."""
+    holonomic, contacts = flat.holonomic(t, q).size, slice(flat.rows_of_bilateral, flat.holonomic(t, q).size)
+    beside = flat.rows - flat.rows_of_bilateral - len(flat.contacts)
+    return np.r_[: contacts.start, holonomic : holonomic + beside], contacts
 
 
 def _underdetermined(pattern: Bool[np.ndarray, "m k"]) -> Bool[np.ndarray, " k"]:
@@ -266,12 +267,13 @@ def inertial_part(flat: Flat, t, q, v, reaction: Float[Array, " n"] | None = Non
     z, rows = first_order(flat, t, q, v)
     if not z.size:
         return flat
-    size = flat.rows_of_bilateral + len(flat.contacts)
+    size = flat.holonomic(t, q).size
     without = lambda function, rows: lambda *given: jnp.where(rows, 0, function(*given))
     forces = flat.forces if reaction is None else flat.forces | {"": lambda *_: reaction}
     return with_masses(flat, z, t, q, v)._replace(
         forces=forces,
         holonomic=without(flat.holonomic, rows[:size]),
+        bilateral=without(flat.bilateral, rows[: flat.rows_of_bilateral]),
         nonholonomic=without(flat.nonholonomic, rows[size:]),
         massless=(),
     )

@@ -181,7 +181,8 @@ class IntervalLoop(NamedTuple):
             if moves:  # two nodes at one time are so for these numbers alone
                 y = jnp.where(by, self._moved(time, t, y, args), y)
                 t = jnp.where(by, time, t)
-        jump = [*inputs.jump, *[True] * len(ticks)]
+        bends_count = bool(self.equations.modes and self.equations.light)  # what slips without inertia follows the slope of an input
+        jump = [*(jumps or bends_count for jumps in inputs.jump), *[True] * len(ticks)]
         jumps = functools.reduce(jnp.logical_or, (by for by, jumps in zip(passed, jump, strict=True) if jumps), jnp.array(False))
         after = after._replace(params=inputs.pieces(following))
 

@@ -4,7 +4,7 @@ import jax.numpy as jnp
 
 from .._mechanics.power import energy_exchange
 from .._mechanics.return_mapping import returned
-from .._mechanics.stick_slip import select_mode, slip_of
+from .._mechanics.stick_slip import select_mode, slip_of, sticking
 from .._model.system import EXPLICIT_TIME
 from .._program.jit import jitted
 from .first_order import EquationsOfMotion
@@ -46,7 +46,8 @@ def after_jump(equations: EquationsOfMotion, t, y0, y, before: Arguments, args: 
     slip = elements.slip(t, q, v)
     size = elements.norms(slip)
     direction = slip / jnp.where(size > 0, size, 1)[elements.element_of_row]
-    at_rest = size <= slip_of(elements, t, q, v, args.scales.error(v))
-    mode, _ = select_mode(flat, elements, t, q, v, direction, at_rest, jnp.zeros_like(at_rest))
+    at_rest = elements.follows | (size <= slip_of(elements, t, q, v, args.scales.error(v)))
+    breaking = elements.follows & ~sticking(elements, parts.sigma)
+    mode, _ = select_mode(flat, elements, t, q, v, direction, at_rest, breaking)
     y = in_other_mode(elements, moved._replace(sigma=parts.sigma), mode).y
     return equations.projected(t, y, args), mode.consistent

@@ -223,9 +223,10 @@ def behind_contact(equations: EquationsOfMotion, t, parts: Parts, args: Argument
         slip = elements.slip(t, q, found.v)
         size = elements.norms(slip)[elements.element_of_row]
         anew = is_impact | anew | jnp.any(of_contact & ~closed)
-        at_rest = jnp.where(anew, slow, stuck | of_friction | slow)
+        at_rest = jnp.where(anew, slow | elements.follows, stuck | of_friction | slow)
+        breaking = jnp.where(anew, elements.follows & ~stuck, of_friction & stuck)  # at its bound: the forces tell where it goes on
         along = jnp.where(anew, slip / jnp.where(size > 0, size, 1), parts.sigma)
-        given = along, at_rest, of_friction & stuck & ~anew
+        given = along, at_rest, breaking
         mode, contacts = select_mode(flat, elements, t, q, found.v, *given, Contacts.of(flat, t, q, found.v, resting))
         chosen = Chosen(contacts.closed, mode, mode.consistent)
         parts = in_other_mode(elements, parts, mode)

@@ -5,6 +5,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy.integrate import solve_ivp
 from scipy.linalg import expm
 from scipy.optimize import brentq
 
@@ -323,3 +324,77 @@ def test_other_solvers_and_precisions(solver):
         single = lambda tree: jax.tree.map(np.float32, tree)
         motion = jl.simulate(MAXWELL, single(Q0), single(V0), TS.astype(np.float32), single(P))
         np.testing.assert_allclose(motion.q["x"], by_hand(P)[0], rtol=0, atol=2e-4)
+
+
+def test_a_slider_under_steps_and_ramps_of_its_load():
+    """|f(t) − c z| ≤ F: z goes at once as far as it has to, under a load that jumps; and along with one that bends."""
+    slider = jl.System(lambda q, c: -0.5 * c * q**2, dissipation=lambda qdot, F: F * jnp.abs(qdot), force=lambda t, f: f(t))
+    nodes, load = np.arange(6.0), np.array([0.5, 3.0, -2.0, 1.0, 1.5, -0.2])
+    ts = np.linspace(0, 5, 41)
+
+    def run(interpolation):
+        return jl.simulate(slider, 0.0, 0.0, ts, {"c": 2.0, "F": 1.0, "f": jl.Signal(nodes, load, interpolation)}).q
+
+    def exact(load):
+        z, found = 0.0, []
+        for f in load:
+            z = (f - np.clip(f - 2 * z, -1, 1)) / 2
+            found.append(z)
+        return np.array(found)
+
+    np.testing.assert_allclose(run(jl.ZeroOrderHold())[4::8], exact(load)[:5], rtol=0, atol=1e-12)
+    np.testing.assert_allclose(run(jl.Linear()), exact(np.interp(ts, nodes, load)), rtol=0, atol=1e-12)
+
+
+# Beside contact, events and states
+
+
+def phases(rate, y, ends, event, change):
+    """States at the times by SciPy, with `change` of y at each zero of `event` that it falls through."""
+    event.terminal, event.direction = True, -1
+    found, t, impacts = {}, ends[0], 0
+    while t < ends[-1]:
+        part = solve_ivp(rate, (t, ends[-1]), y, "DOP853", events=event, rtol=1e-12, atol=1e-13, dense_output=True)
+        found |= {s: part.sol(s) for s in ends[(ends >= t) & (ends <= part.t[-1])]}
+        t, y = part.t[-1], part.y[:, -1].copy()
+        if part.status == 1:
+            y, impacts = change(y), impacts + 1
+    return np.array([found[s] for s in ends]).T, impacts
+
+
+def test_a_mass_on_a_damped_leg_bounces():
+    leg = jl.System(
+        lambda q, qdot, m, c: 0.5 * m * qdot["x"] ** 2 - 9.81 * m * q["x"] - 0.5 * c * (q["x"] - 1 - q["z"]) ** 2,
+        dissipation=lambda qdot, b: 0.5 * b * qdot["z"] ** 2,
+        unilateral={"floor": jl.Contact(lambda q: q["x"] - 0.8, restitution=0.8)},
+    )
+    ts = np.linspace(0, 1.5, 31)
+    motion = jl.simulate(leg, {"x": 1.0, "z": 0.0}, {"x": 0.0, "z": 0.0}, ts, {"m": 1.0, "c": 30.0, "b": 2.0}, works=True, **SHARP)
+
+    def rate(t, y):
+        stretch = y[0] - 1 - y[2]
+        return [y[1], -9.81 - 30 * stretch, 15 * stretch]
+
+    exact, impacts = phases(rate, [1.0, 0, 0], ts, lambda t, y: y[0] - 0.8, lambda y: np.array([0.8, -0.8 * y[1], y[2]]))
+    assert motion.contacts["floor"].impacts[-1] == impacts > 3
+    np.testing.assert_allclose(motion.q["x"], exact[0], rtol=0, atol=1e-9)
+    np.testing.assert_allclose(motion.q["z"], exact[2], rtol=0, atol=1e-9)
+    assert np.max(np.abs(motion.balance())) < 1e-9
+
+
+def test_events_and_states_see_the_velocity_that_dissipation_decides():
+    system = jl.System(
+        dict(MAXWELL.lagrangian),
+        dissipation=dict(MAXWELL.dissipation),
+        force={"brake": lambda w: {"x": -w}},
+        states={"w": jl.State(lambda qdot, w: qdot["z"] - w)},
+        events={"turn": jl.Event(lambda qdot: qdot["z"], most=4)},
+    )
+    motion = jl.simulate(system, Q0, V0, TS, P, **SHARP)
+    stretch = lambda t, y: y[0] - y[2]
+    rate = lambda t, y: [y[1], (-3 * (y[0] - y[2]) - y[3]) / 2, 3 / 0.7 * (y[0] - y[2]), 3 / 0.7 * (y[0] - y[2]) - y[3]]
+    exact = solve_ivp(rate, (0, 5), [1, 0.3, 0.2, 0], "DOP853", t_eval=TS, events=stretch, rtol=1e-12, atol=1e-13)
+    np.testing.assert_allclose(motion.q["x"], exact.y[0], rtol=0, atol=1e-9)
+    np.testing.assert_allclose(motion.states["w"], exact.y[3], rtol=0, atol=1e-9)
+    found = motion.events["turn"].ts
+    np.testing.assert_allclose(found[np.isfinite(found)], exact.t_events[0], rtol=0, atol=1e-9)
