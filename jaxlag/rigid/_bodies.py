@@ -3,10 +3,11 @@
 from collections.abc import Callable
 from typing import Any
 
-import jax.numpy as jnp
+import jax
 from jaxtyping import Array, Float
 
-from ._vectors import check_rotation, moving, vector
+from ._rates import body_rate
+from ._vectors import floating, moving, vector
 from .inertia import check_inertia
 
 
@@ -35,10 +36,8 @@ def angular_velocity(rotation: Callable, axes: str = "body") -> Callable:
         raise ValueError(f"`axes` must be 'body' or 'world', but is {axes!r}. The body's make its inertia constant.")
 
     def velocity(q: Any, qdot: Any) -> Float[Array, "3"]:
-        R, rate = moving(rotation, q, qdot)
-        R = check_rotation(R, "`rotation` of a body")
-        W = R.T @ rate if axes == "body" else rate @ R.T
-        return 0.5 * jnp.stack([W[2, 1] - W[1, 2], W[0, 2] - W[2, 0], W[1, 0] - W[0, 1]])
+        omega = body_rate(rotation, q, qdot)
+        return omega if axes == "body" else rotation(jax.tree.map(floating, q)) @ omega
 
     return velocity
 

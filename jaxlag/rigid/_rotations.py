@@ -9,7 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from ._vectors import check_rotation, floating, known, one, skew, vector
+from ._rates import turning
+from ._vectors import floating, known, one, skew, vector
 
 SERIES = 12  # terms of a power series that is used up to an angle of 1: the last is below 1e-23
 
@@ -36,7 +37,18 @@ def rotation(axis: Any, angle: Any) -> Float[Array, "3 3"]:
     a, seen = vector(axis, "axis"), known(axis)
     if seen is not None and not np.any(seen):
         raise ValueError("`axis` must point somewhere, but is zero. Give a direction, such as [0, 0, 1].")
-    K = skew(a / jnp.linalg.norm(a))
+    return _about(a / jnp.linalg.norm(a), floating(angle))
+
+
+def _rate_about(numbers: Any, rates: Any) -> Float[Array, "3"]:
+    """α̇ a + sin α ȧ − (1 − cos α) a × ȧ."""
+    (a, angle), (a_dot, rate) = numbers, rates
+    return rate * a + jnp.sin(angle) * a_dot - (1 - jnp.cos(angle)) * jnp.cross(a, a_dot)
+
+
+@turning(_rate_about)
+def _about(a, angle):
+    K = skew(a)
     return one(a) + jnp.sin(angle) * K + (1 - jnp.cos(angle)) * (K @ K)
 
 
@@ -52,7 +64,7 @@ def rotation_x(angle: Any) -> Float[Array, "3 3"]:
     rigid.rotation_x(0.3)[1, 2]  # −sin 0.3 = −0.2955
     ```
     """
-    return _about(0, angle)
+    return _about_x(floating(angle))
 
 
 def rotation_y(angle: Any) -> Float[Array, "3 3"]:
@@ -67,7 +79,7 @@ def rotation_y(angle: Any) -> Float[Array, "3 3"]:
     rigid.rotation_y(0.3)[0, 2]  # sin 0.3 = 0.2955
     ```
     """
-    return _about(1, angle)
+    return _about_y(floating(angle))
 
 
 def rotation_z(angle: Any) -> Float[Array, "3 3"]:
@@ -82,15 +94,34 @@ def rotation_z(angle: Any) -> Float[Array, "3 3"]:
     rigid.rotation_z(0.3)[0, 1]  # −sin 0.3 = −0.2955
     ```
     """
-    return _about(2, angle)
+    return _about_z(floating(angle))
 
 
-def _about(axis: int, angle: Any) -> Float[Array, "3 3"]:
+@turning(lambda numbers, rates: _along(rates[0], 0))
+def _about_x(angle):
+    return _about_axis(0, angle)
+
+
+@turning(lambda numbers, rates: _along(rates[0], 1))
+def _about_y(angle):
+    return _about_axis(1, angle)
+
+
+@turning(lambda numbers, rates: _along(rates[0], 2))
+def _about_z(angle):
+    return _about_axis(2, angle)
+
+
+def _about_axis(axis: int, angle: Any) -> Float[Array, "3 3"]:
     """About one of the axes: two products fewer than by Rodrigues' formula."""
-    c, s = jnp.cos(floating(angle)), jnp.sin(floating(angle))
+    c, s = jnp.cos(angle), jnp.sin(angle)
     full, zero = jnp.ones_like(c), jnp.zeros_like(c)
     rows = [[full, zero, zero], [zero, c, -s], [zero, s, c]]
     return jnp.stack([jnp.stack([rows[(i - axis) % 3][(j - axis) % 3] for j in range(3)]) for i in range(3)])
+
+
+def _along(x: Float[Array, ""], axis: int) -> Float[Array, "3"]:
+    return jnp.stack([x if i == axis else jnp.zeros_like(x) for i in range(3)])
 
 
 @dataclasses.dataclass(frozen=True)
@@ -104,7 +135,8 @@ class Euler:
 
     def __call__(self, angles: Any) -> Float[Array, "3 3"]:
         """The rotation matrix of three `angles` in rad."""
-        first, second, third = (_about("xyz".index(axis), angle) for axis, angle in zip(self.sequence, _three(angles), strict=True))
+        about = {"x": rotation_x, "y": rotation_y, "z": rotation_z}
+        first, second, third = (about[axis](angle) for axis, angle in zip(self.sequence, _three(angles), strict=True))
         return first @ second @ third
 
     def margin(self, angles: Any) -> Float[Array, ""]:
@@ -145,92 +177,6 @@ def euler(sequence: str) -> Euler:
     if sequence[0] == sequence[1] or sequence[1] == sequence[2]:
         raise ValueError(f"`sequence` must not turn twice about the same axis in a row, but is {sequence!r}. Write e.g. 'zxz' or 'zyx'.")
     return Euler(sequence)
-
-
-def quaternion(q: Any) -> Float[Array, "3 3"]:
-    r"""Rotation of a quaternion (w, x, y, z), w = cos(α/2) first.
-
-    $$ R = \frac{(w^2 - v\cdot v)\,1 + 2\,v v^T + 2 w\,[v]_\times}{w^2 + v\cdot v}, \qquad v = (x, y, z) $$
-
-    A rotation for every q ≠ 0: its length does not matter, and does not move. State the length as a constraint, `holonomic={"unit":
-    rigid.unit}`; a start of another length is put on it.
-
-    **Arguments:** `q`: four numbers. **Returns:** a rotation matrix, (3, 3).
-
-    **Raises:** `ValueError` where `q` has another shape.
-
-    **Source:** Shuster, A survey of attitude representations, J. Astronaut. Sci. 41 (1993) 439, with Hamilton's product.
-
-    ```python
-    import jax.numpy as jnp
-    from jaxlag import rigid
-    rigid.quaternion([jnp.cos(0.1), 0.0, 0.0, jnp.sin(0.1)])[0, 1]  # −sin 0.2 = −0.1987
-    ```
-    """
-    q = vector(q, "q", 4)
-    w, v = q[0], q[1:]
-    return ((w**2 - v @ v) * one(v) + 2 * jnp.outer(v, v) + 2 * w * skew(v)) / (q @ q)
-
-
-def to_quaternion(R: Any) -> Float[Array, "4"]:
-    """The quaternion (w, x, y, z) of length 1 with w ≥ 0 of a rotation: to start where angles say.
-
-    **Arguments:** `R`: a rotation matrix, (3, 3). **Returns:** (4,). At angles of π either of two signs.
-
-    **Raises:** `ValueError` where `R` is no rotation, as far as its numbers are known.
-
-    **Source:** Shepperd, Quaternion from rotation matrix, J. Guid. Control 1 (1978) 223.
-
-    ```python
-    from jaxlag import rigid
-    rigid.to_quaternion(rigid.rotation_z(0.2))  # [0.995, 0.0, 0.0, 0.0998]
-    ```
-    """
-    R = check_rotation(R, "`R`")
-    odd, even = R - R.T, R + R.T
-    diagonal = jnp.diagonal(R)
-    first = jnp.concatenate([1 + jnp.trace(R)[None], jnp.stack([odd[2, 1], odd[0, 2], odd[1, 0]])])
-    others = even + jnp.diag(1 - jnp.trace(R) * jnp.ones_like(diagonal))
-    products = jnp.concatenate([first[None], jnp.concatenate([first[1:, None], others], axis=1)])  # 4 q qᵀ
-    q = products[jnp.argmax(jnp.diagonal(products))]  # the row of the largest component
-    return q * jnp.where(q[0] < 0, -1, 1) / jnp.linalg.norm(q)
-
-
-def quaternion_rate(q: Any, omega: Any) -> Float[Array, "4"]:
-    r"""The rate of a quaternion of a body that turns: its q̇ at the start.
-
-    $$ \dot q = \tfrac12\, q \circ (0, \omega) $$
-
-    **Arguments:** `q`: (w, x, y, z); `omega`: the angular velocity in the axes of the body, (3,).
-
-    **Returns:** (4,), at a right angle to q. **Raises:** `ValueError` where `q` or `omega` has another shape.
-
-    **Source:** Shuster, A survey of attitude representations, J. Astronaut. Sci. 41 (1993) 439.
-
-    ```python
-    from jaxlag import rigid
-    rigid.quaternion_rate([1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 3.0])  # [0, 0, 0, 1.5]
-    ```
-    """
-    q, omega = vector(q, "q", 4), vector(omega, "omega")
-    w, v = q[0], q[1:]
-    return 0.5 * jnp.concatenate([-(v @ omega)[None], w * omega + jnp.cross(v, omega)])
-
-
-def unit(q: Any) -> Float[Array, ""]:
-    """q · q − 1, which is zero for a quaternion of length 1: its constraint, for `System(holonomic=...)`.
-
-    **Arguments:** `q`: a quaternion, (4,), or any vector. **Returns:** a number.
-
-    **Raises:** nothing.
-
-    ```python
-    from jaxlag import rigid
-    rigid.unit([1.0, 0.0, 0.0, 0.0])  # 0
-    ```
-    """
-    q = floating(q)
-    return q @ q - 1
 
 
 def rotation_vector(r: Any) -> Float[Array, "3 3"]:
