@@ -32,6 +32,9 @@ WINGS = {  # each imports only from those above it, and each file of a wing only
         "jit",
         "implicit",
         "compilation_cache",
+        "sparse_matrix",
+        "block_tridiagonal",
+        "array_dependence",
         "sparse_jacobian",
         "dependence",
         "polynomials",
@@ -61,6 +64,7 @@ WINGS = {  # each imports only from those above it, and each file of a wing only
     "_mechanics": [
         "lagrange",
         "pseudo_inverse",
+        "sparse_saddle_point",
         "saddle_point",
         "constrained_root",
         "massless",
@@ -238,7 +242,7 @@ HOMES = [
     ("optimistix", "_fit"),
     ("pandas", "_motion/export"),
     ("polars", "_motion/export"),
-    ("scipy", ("_fit", "_linear")),
+    ("scipy", ("_program", "_fit", "_linear")),
     ("sympy", "_paper"),
 ]
 LONGEST_FILE = 300

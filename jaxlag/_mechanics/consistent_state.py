@@ -6,6 +6,7 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import lineax as lx
 import numpy as np
 from jaxtyping import Array, Bool, Float, PyTree
 
@@ -15,13 +16,15 @@ from .._model.validation import at_state, coordinates
 from .._program.implicit import undifferentiated
 from .._program.jit import is_concrete
 from .._program.scalarise import scalarised
+from .._program.sparse_jacobian import MANY, jacobian
+from .._program.sparse_matrix import SparseMatrix, dense, row_sums
 from .constrained_root import Linear, root_of
 from .contact import in_contact
 from .friction_elements import find_elements, with_all_masses
-from .lagrange import constraint_rows, inertia, position_residual, velocity_residual
+from .lagrange import inertia, position_rows, rows_of, velocity_residual, velocity_rows
 from .massless import completed, inertial_part
 from .projection import metric_of_positions
-from .saddle_point import NO_INERTIA, is_determined, reach_of
+from .saddle_point import NO_INERTIA, Rows, is_determined, reach_of
 from .singular_directions import NOT_AFFINE, UNDEFINED, explained, not_affine_in
 from .stick_slip import first_mode, in_mode
 
@@ -50,7 +53,7 @@ def nearest_state(flat: Flat, t, q0, v0, free: Sequence[int] | None = None) -> C
     moving = np.arange(q0.size) if free is None else np.asarray(free, int)
     stated, flat = flat, with_all_masses(flat, t, q0, v0)
     full = inertia(flat, t, q0, v0)[0]
-    M = full.as_matrix()[np.ix_(moving, moving)]
+    M = _part(full, moving)
     given = jnp.concatenate([flat.holonomic(t, q0), velocity_residual(flat, t, q0, v0)])
     positions = flat.holonomic(t, q0).size
     if given.size == 0:  # nothing to satisfy: saves the compilation of the search
@@ -59,15 +62,16 @@ def nearest_state(flat: Flat, t, q0, v0, free: Sequence[int] | None = None) -> C
             q0,
             _with_decided_rates(stated, t, q0, v0),
             yes,
-            is_determined(M, jnp.zeros((0, moving.size), M.dtype)),
+            is_determined(M, jnp.zeros((0, moving.size), q0.dtype)),
             yes,
-            jnp.all(jnp.isfinite(M)),
+            _is_finite(M),
         )
     q = q0
     if positions:
         if given.size > 2 * positions:  # velocity constraints may be all that holds a coordinate
-            held = is_determined(M, position_residual(flat, t, q0)[1][:, moving])
-            M = jnp.where(held, M, metric_of_positions(flat, full, t, q0, v0).as_matrix()[np.ix_(moving, moving)])
+            held = is_determined(M, _columns(position_rows(flat, t, q0)[1], moving))
+            metric = _part(metric_of_positions(flat, full, t, q0, v0), moving).as_matrix()
+            M = lx.MatrixLinearOperator(jnp.where(held, M.as_matrix(), metric))
         q = _nearest_position(flat, moving, t, q0, M)
     v, determined = _nearest_velocity(inertial_part(flat, t, q, v0), moving, t, q, v0)
     v = _with_decided_rates(stated, t, q, v)
@@ -75,10 +79,25 @@ def nearest_state(flat: Flat, t, q0, v0, free: Sequence[int] | None = None) -> C
     @undifferentiated
     def judged(t, q0, v0, q, v, M, given):
         reached = (off_constraints(flat, t, q, v) < _small(q)) & jnp.all(jnp.isfinite(q))
-        return reached, ~jnp.any(not_affine_in(flat, t, q0, v0)), jnp.all(jnp.isfinite(given)) & jnp.all(jnp.isfinite(M))
+        return reached, ~jnp.any(not_affine_in(flat, t, q0, v0)), jnp.all(jnp.isfinite(given)) & _is_finite(M)
 
     reached, affine, defined = judged(t, q0, v0, q, v, M, given)
     return Consistent(q, v, reached, determined, affine, defined)
+
+
+def _part(M: lx.AbstractLinearOperator, moving: np.ndarray) -> lx.AbstractLinearOperator:
+    """Of M that of the coordinates `moving`; diagonal where there are many of them."""
+    if isinstance(M, lx.DiagonalLinearOperator) and M.diagonal.size >= MANY:
+        return lx.DiagonalLinearOperator(M.diagonal[moving])
+    return lx.MatrixLinearOperator(M.as_matrix()[np.ix_(moving, moving)])
+
+
+def _columns(G: Rows, moving: np.ndarray) -> Rows:
+    return G.columns(moving) if isinstance(G, SparseMatrix) else G[:, moving]
+
+
+def _is_finite(M: lx.AbstractLinearOperator) -> Bool[Array, ""]:
+    return jnp.all(jnp.isfinite(M.diagonal if isinstance(M, lx.DiagonalLinearOperator) else M.as_matrix()))
 
 
 def _with_decided_rates(flat: Flat, t, q, v) -> Float[Array, " n"]:
@@ -99,15 +118,19 @@ def _nearest_position(flat: Flat, moving, t, q0, M) -> Float[Array, " n"]:
     def residual(args, w):
         (t, q0, M), (q, multipliers) = args, unpacked(args[1], w)
         g, pull = jax.vjp(lambda q: flat.holonomic(t, q), q)
-        return jnp.concatenate([M @ (q - q0)[moving] - pull(multipliers)[0][moving], g])
+        return jnp.concatenate([M.mv((q - q0)[moving]) - pull(multipliers)[0][moving], g])
 
     @scalarised
     def linear(args, w):
         (t, q0, M), (q, multipliers) = args, unpacked(args[1], w)
-        g, G = position_residual(flat, t, q)
-        bend = jax.hessian(lambda q: multipliers @ flat.holonomic(t, q))(q)[np.ix_(moving, moving)]
-        curved = jnp.where(is_determined(M - bend, G[:, moving]), M - bend, M)
-        return Linear(curved, G[:, moving], M @ (q0 - q)[moving], -g, reach_of(q[moving], _off(g, G, q) > _small(q)))
+        g, G = position_rows(flat, t, q)
+        reach = reach_of(q[moving], _off(g, row_sums(G), q) > _small(q))
+        metric, G = M, _columns(G, moving)
+        if not (isinstance(G, SparseMatrix) and isinstance(M, lx.DiagonalLinearOperator)):  # there curvature would be no diagonal
+            G, straight = dense(G), M.as_matrix()
+            curved = straight - jax.hessian(lambda q: multipliers @ flat.holonomic(t, q))(q)[np.ix_(moving, moving)]
+            metric = lx.MatrixLinearOperator(jnp.where(is_determined(lx.MatrixLinearOperator(curved), G), curved, straight))
+        return Linear(metric, G, M.mv((q0 - q)[moving]), -g, reach)
 
     def search(linear, args):
         eps, size = jnp.finfo(like.dtype).eps, like.size - free
@@ -142,9 +165,9 @@ def _nearest_velocity(flat: Flat, moving, t, q, v0) -> tuple[Float[Array, " n"],
     @scalarised
     def linear(args, w):
         t, q, v0 = args
-        psi, G, _ = constraint_rows(flat, t, q, v0)
-        M = inertia(flat, t, q, v0)[0].as_matrix()[np.ix_(moving, moving)]
-        return Linear(M, G[:, moving], jnp.zeros_like(v0[moving]), -psi, reach_of(v0[moving], _off(psi, G, v0) > _small(q)))
+        psi, G, _ = velocity_rows(flat, t, q, v0)
+        reach = reach_of(v0[moving], _off(psi, row_sums(G), v0) > _small(q))
+        return Linear(_part(inertia(flat, t, q, v0)[0], moving), _columns(G, moving), jnp.zeros_like(v0[moving]), -psi, reach)
 
     def search(linear, args):
         found = linear(args, like).solution()
@@ -161,13 +184,15 @@ def _small(q):
 
 def off_constraints(flat: Flat, t, q, v) -> Float[Array, ""]:
     """Largest residual of g and ψ, in the units of its row."""
-    G, beside = jax.jacfwd(flat.holonomic, argnums=1)(t, q), jax.jacfwd(flat.nonholonomic, argnums=2)(t, q, v)
-    return jnp.maximum(_off(flat.holonomic(t, q), G, q), _off(velocity_residual(flat, t, q, v), jnp.concatenate([G, beside]), v))
+    slope = (lambda function, x: jax.jacfwd(function)(x)) if q.size < MANY else lambda function, x: rows_of(jacobian(function, x)[1])
+    of_positions = row_sums(slope(lambda q: flat.holonomic(t, q), q))
+    of_velocities = jnp.concatenate([of_positions, row_sums(slope(lambda v: flat.nonholonomic(t, q, v), v))])
+    return jnp.maximum(_off(flat.holonomic(t, q), of_positions, q), _off(velocity_residual(flat, t, q, v), of_velocities, v))
 
 
 def _off(residual, rows, x):
-    """Largest residual, in the units of its row: rounding makes some eps of it."""
-    size = jnp.sum(jnp.abs(rows), axis=1) * (1 + jnp.max(jnp.abs(x)))
+    """Largest residual, in the units of its row, by the sums of them: rounding makes some eps of it."""
+    size = rows * (1 + jnp.max(jnp.abs(x)))
     return jnp.max(jnp.abs(residual) / jnp.where(size > 0, size, 1), initial=0.0)
 
 

@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 
 from .._model.flat import Flat
-from .lagrange import applied_force, constraint_rows, inertia, velocity_residual
+from .lagrange import applied_force, inertia, velocity_residual, velocity_rows
 from .massless import completed, first_order, inertial_part
 from .saddle_point import SaddlePoint, Sound, saddle_point
 
@@ -28,7 +28,7 @@ def constrained_acceleration(flat: Flat, t, q, v, feedback=None) -> SaddlePoint:
 def _by_inertia(flat: Flat, t, q, v, feedback) -> SaddlePoint:
     """q̈ and λ where everything has inertia, or is held by constraints."""
     M, inertial = inertia(flat, t, q, v)
-    _, G, gamma = constraint_rows(flat, t, q, v)
+    _, G, gamma = velocity_rows(flat, t, q, v)
     c = -gamma if feedback is None else -gamma - feedback(flat, t, q, v)
     force = lambda multipliers: applied_force(flat, t, q, v, multipliers)
     if not flat.needs_multipliers:

@@ -9,25 +9,28 @@ import lineax as lx
 from jaxtyping import Array, Float
 
 from .._program.implicit import implicit_root
-from .saddle_point import SaddlePoint, saddle_point, saddle_solver
+from .._program.sparse_matrix import SparseMatrix
+from .saddle_point import Rows, SaddlePoint, saddle_point, saddle_solver
+
+REFINEMENTS = 30  # of the derivative of a root, where curvature is left out of the step: each takes away what is off, in lengths of a rod
 
 
 class Linear(NamedTuple):
     """The linear equations M x = f + Gᵀλ, G x = c of a step, and its reach."""
 
-    M: Float[Array, "k k"]
-    G: Float[Array, "m k"]
+    M: lx.AbstractLinearOperator
+    G: Rows
     f: Float[Array, " k"]
     c: Float[Array, " m"]
     reach: Float[Array, " k"] | None = None
 
     def solution(self) -> SaddlePoint:
         """x and λ."""
-        return saddle_point(lx.MatrixLinearOperator(self.M), self.G, self.f, self.c, self.reach)
+        return saddle_point(self.M, self.G, self.f, self.c, self.reach)
 
     def change(self, residual: Float[Array, " w"]) -> Float[Array, " w"]:
         """What (x, λ) change where this is added to the left-hand sides; the rank is that of the step."""
-        solve = saddle_solver(lx.MatrixLinearOperator(self.M), self.G, self.f, self.c, self.reach)
+        solve = saddle_solver(self.M, self.G, self.f, self.c, self.reach)
         return -jnp.concatenate(solve(*jnp.split(residual, [self.f.size])))
 
 
@@ -38,5 +41,30 @@ def root_of(residual: Callable, linear: Callable, search: Callable, args: tuple,
     fixed, within = jax.lax.stop_gradient((args, of_linear))
     w, aux = search(lambda args, w: linear(args, w, *within), fixed)
     of_all = lambda everything, w: residual(everything[0], w, *everything[1])
-    change = lambda everything, w, R: linear(everything[0], w, *everything[2]).change(R)
+
+    def change(everything, w, R):
+        step = linear(everything[0], w, *everything[2])
+        if not isinstance(step.G, SparseMatrix):
+            return step.change(R)
+        return _refined(lambda dw: jax.jvp(lambda w: of_all(everything, w), (w,), (dw,))[1], step, R)
+
     return implicit_root(of_all, change, (args, of_residual, of_linear), jax.lax.stop_gradient(w)), aux
+
+
+def _refined(slope: Callable, step: Linear, residual: Float[Array, " w"]) -> Float[Array, " w"]:
+    """−slope⁻¹ residual by a step whose M is not the whole slope, again and again; NaN where that does not converge."""
+    signs = jnp.concatenate([jnp.ones_like(step.f), -jnp.ones_like(step.c)])  # with which the slope is symmetric
+
+    def solve(matvec, b):
+        enough = 100 * jnp.finfo(b.dtype).eps
+
+        def refine(carry):
+            dw, _, i = carry
+            added = step.change(signs * (matvec(dw) - b))
+            return dw + added, jnp.max(jnp.abs(added)) / jnp.max(jnp.abs(dw + added)), i + 1
+
+        going_on = lambda carry: (carry[1] > enough) & (carry[2] < REFINEMENTS)
+        dw, left, _ = jax.lax.while_loop(going_on, refine, (jnp.zeros_like(b), jnp.ones((), b.dtype), 0))
+        return jnp.where(left < jnp.finfo(b.dtype).eps ** 0.5, dw, jnp.where(jnp.any(b != 0), jnp.nan, 0))
+
+    return jax.lax.custom_linear_solve(lambda dw: signs * slope(dw), -signs * residual, solve, symmetric=True)

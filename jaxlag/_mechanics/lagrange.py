@@ -15,12 +15,14 @@ from .._model.flat import Flat
 from .._model.system import System
 from .._model.validation import at_state
 from .._program.sparse_jacobian import jacobian
+from .._program.sparse_matrix import SparseMatrix, dense
 
 
 def inertia(flat: Flat, t, q, v) -> tuple[lx.AbstractLinearOperator, Float[Array, " n"]]:
     """M and the force of the Lagrangian alone, ∂L/∂q − (∂²L/∂q̇∂q) q̇ − ∂²L/∂q̇∂t."""
     momentum = jax.grad(flat.lagrangian, argnums=2)
     _, M = jacobian(lambda v: momentum(t, q, v), v)
+    M = lx.MatrixLinearOperator(M.as_matrix()) if isinstance(M, SparseMatrix) else M
     _, carried = jax.jvp(lambda t, q: momentum(t, q, v), (t, q), (jnp.ones_like(t), v))
     return M, jax.grad(flat.lagrangian, argnums=1)(t, q, v) - carried
 
@@ -32,11 +34,22 @@ def applied_force(flat: Flat, t, q, v, multipliers) -> Float[Array, " n"]:
     return Q - jax.grad(D)(v)
 
 
-def position_residual(flat: Flat, t, q) -> tuple[Float[Array, " h"], Float[Array, "h n"]]:
-    """g and its Jacobian ∂g/∂q; and of what slips without inertia, the force that is left beside its friction."""
+def rows_of(G: lx.AbstractLinearOperator | SparseMatrix) -> Float[Array, "m n"] | SparseMatrix:
+    """A Jacobian as an array, but where it is sparse."""
+    return G if isinstance(G, SparseMatrix) else G.as_matrix()
+
+
+def position_rows(flat: Flat, t, q) -> tuple[Float[Array, " h"], Float[Array, "h n"] | SparseMatrix]:
+    """g and its Jacobian ∂g/∂q, sparse where it is large; and of what slips without inertia, the force that is left beside its friction."""
     terms = [flat.holonomic] if flat.yielding is None else [flat.holonomic, flat.yielding]
     g, G = jacobian(lambda q: jnp.concatenate([term(t, q) for term in terms]), q)
-    return g, G.as_matrix()
+    return g, rows_of(G)
+
+
+def position_residual(flat: Flat, t, q) -> tuple[Float[Array, " h"], Float[Array, "h n"]]:
+    """g and its Jacobian ∂g/∂q with all its zeros."""
+    g, G = position_rows(flat, t, q)
+    return g, dense(G)
 
 
 def velocity_residual(flat: Flat, t, q, v) -> Float[Array, " m"]:
@@ -45,11 +58,17 @@ def velocity_residual(flat: Flat, t, q, v) -> Float[Array, " m"]:
     return jnp.concatenate([dg_dt, flat.nonholonomic(t, q, v)])
 
 
-def constraint_rows(flat: Flat, t, q, v) -> tuple[Float[Array, " m"], Float[Array, "m n"], Float[Array, " m"]]:
-    """ψ, G and γ, such that dψ/dt = G q̈ + γ."""
+def velocity_rows(flat: Flat, t, q, v) -> tuple[Float[Array, " m"], Float[Array, "m n"] | SparseMatrix, Float[Array, " m"]]:
+    """ψ, G and γ, such that dψ/dt = G q̈ + γ; G sparse where it is large."""
     psi, G = jacobian(lambda v: velocity_residual(flat, t, q, v), v)
     _, gamma = jax.jvp(lambda t, q: velocity_residual(flat, t, q, v), (t, q), (jnp.ones_like(t), v))
-    return psi, G.as_matrix(), gamma
+    return psi, rows_of(G), gamma
+
+
+def constraint_rows(flat: Flat, t, q, v) -> tuple[Float[Array, " m"], Float[Array, "m n"], Float[Array, " m"]]:
+    """ψ, G and γ, such that dψ/dt = G q̈ + γ, with all zeros of G."""
+    psi, G, gamma = velocity_rows(flat, t, q, v)
+    return psi, dense(G), gamma
 
 
 def imbalance(flat: Flat, t, q, v, qddot, multipliers) -> tuple[Float[Array, " n"], Float[Array, " m"]]:

@@ -201,7 +201,7 @@ def _by_newton(flat: Flat, z, rows, equations: Callable, t, q, v) -> tuple[Array
     @scalarised
     def linear(args, w):
         slope, G, F, c = equations(*args, w[:k])
-        return Linear(slope.as_matrix() + faint * jnp.eye(k), G, F, c)
+        return Linear(lx.MatrixLinearOperator(slope.as_matrix() + faint * jnp.eye(k)), G, F, c)
 
     def search(linear, args):
         force = lambda w: linear(args, jnp.concatenate([w, like[k:]])).f

@@ -11,7 +11,7 @@ from .._model.system import EXPLICIT_TIME, System
 from .._model.validation import at_state
 from .constrained_acceleration import constrained_acceleration
 from .contact import in_current_mode
-from .lagrange import constraint_rows
+from .lagrange import velocity_rows
 from .massless import completed
 
 
@@ -49,8 +49,9 @@ def powers_of(flat: Flat, t, q, v) -> dict[str, Float[Array, ""]]:
     """The powers over flat vectors."""
     v = completed(flat, t, q, v).v
     _, multipliers, _ = constrained_acceleration(flat, t, q, v)
-    _, G, _ = constraint_rows(flat, t, q, v)
-    does = lambda rows: multipliers[rows] @ (G[rows] @ v)
+    _, G, _ = velocity_rows(flat, t, q, v)
+    rates = G @ v
+    does = lambda rows: multipliers[rows] @ rates[rows]
     stuck = {name: does(rows) for name, rows in flat.held.items()}  # friction that sticks to something that moves
     damped = {name: stuck.get(name, 0) - v @ jax.grad(D, argnums=2)(t, q, v, multipliers) for name, D in flat.dissipations.items()}
     forced = {name: v @ Q(t, q, v, multipliers) for name, Q in flat.forces.items()}

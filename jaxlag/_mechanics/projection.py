@@ -13,7 +13,7 @@ from .._model.flat import Flat
 from .._model.numbers import count, number
 from .._program.scalarise import scalarised
 from .._program.sparse_jacobian import jacobian
-from .lagrange import constraint_rows, inertia, position_residual, velocity_residual
+from .lagrange import inertia, position_rows, velocity_residual, velocity_rows
 from .massless import completed, inertial_part
 from .saddle_point import augmented, reach_of, saddle_point
 
@@ -56,12 +56,12 @@ class Projection:
 
         @scalarised
         def newton(t, q, M):
-            g, G = position_residual(flat, t, q)
+            g, G = position_rows(flat, t, q)
             return q + saddle_point(M, G, jnp.zeros_like(q), -g, reach_of(q)).x
 
         @scalarised
         def on_velocities(t, q, v, M):
-            psi, G, _ = constraint_rows(part, t, q, v)
+            psi, G, _ = velocity_rows(part, t, q, v)
             return completed(flat, t, q, _corrected(v, saddle_point(M, G, jnp.zeros_like(v), -psi, reach_of(v)).x)).v
 
         if flat.holonomic_names or flat.yielding:

@@ -9,7 +9,13 @@ import lineax as lx
 from jaxtyping import Array, Bool, Float
 
 from .._program.scalarise import scalarised
+from .._program.sparse_matrix import SparseMatrix, dense
 from .pseudo_inverse import Inverse, Request, applied, by_rows, everywhere, inverse_of
+from .sparse_saddle_point import factorised as sparsely_factorised
+from .sparse_saddle_point import is_satisfied
+from .sparse_saddle_point import solver as sparse_solver
+
+Rows = Float[Array, "m n"] | SparseMatrix
 
 
 class Sound(NamedTuple):
@@ -37,12 +43,12 @@ class SaddlePoint(NamedTuple):
     sound: Sound
 
 
-def saddle_point(M: lx.AbstractLinearOperator, G: Float[Array, "m n"], f, c, reach: Float[Array, " n"] | None = None) -> SaddlePoint:
+def saddle_point(M: lx.AbstractLinearOperator, G: Rows, f, c, reach: Float[Array, " n"] | None = None) -> SaddlePoint:
     """The unique x and the λ of least norm with M x = f + Gᵀλ and G x = c.
 
     f and c are vectors, or as many columns each. M need be positive definite on the null space of G only, and rows of G may
     depend on each other. Where M is seen to be diagonal, as of points in Cartesian coordinates, it is divided by, unless a mass is
-    (next to) nothing beside another.
+    (next to) nothing beside another. Beside it G may be sparse.
 
     A direction that G barely holds is held where that takes x about as far as all else does, or, where x puts a state right, no farther
     than its `reach`. What is asked beyond that, the error of a state asks for, as of a mechanism that passes a singular position.
@@ -51,7 +57,9 @@ def saddle_point(M: lx.AbstractLinearOperator, G: Float[Array, "m n"], f, c, rea
         found = saddle_point(M, G, f[:, None], c[:, None], reach)
         return found._replace(x=found.x[:, 0], multipliers=found.multipliers[:, 0])
     if not isinstance(M, lx.DiagonalLinearOperator):
-        return _saddle_point(M, G, f, c, reach)
+        return _saddle_point(M, dense(G), f, c, reach)
+    if isinstance(G, SparseMatrix):
+        return _sparse_saddle_point(M, G, f, c)
     heavy = M.diagonal > jnp.finfo(f.dtype).eps ** 0.25 * jnp.max(jnp.abs(M.diagonal))
     divided = _saddle_point(lx.DiagonalLinearOperator(jnp.where(heavy, M.diagonal, 1)), G, f, c, reach)
     full = lambda: _saddle_point(lx.MatrixLinearOperator(M.as_matrix()), G, f, c, reach)
@@ -64,9 +72,19 @@ def _saddle_point(M, G, f, c, reach) -> SaddlePoint:
     return SaddlePoint(x, multipliers, Sound(factors.determined, factors.satisfied))
 
 
-def saddle_solver(M: lx.AbstractLinearOperator, G: Float[Array, "m n"], f, c, reach: Float[Array, " n"] | None = None) -> Callable:
+def _sparse_saddle_point(M, G, f, c) -> SaddlePoint:
+    """Rows that follow from others are judged by what is left of G x = c."""
+    x, multipliers = _solution(M, G, f, c, sparsely_factorised(*jax.lax.stop_gradient((M, G))))
+    return SaddlePoint(x, multipliers, Sound(is_determined(M, G), is_satisfied(*jax.lax.stop_gradient((M, G, f, c, x)))))
+
+
+def saddle_solver(M: lx.AbstractLinearOperator, G: Rows, f, c, reach: Float[Array, " n"] | None = None) -> Callable:
     """(f, c) ↦ (x, λ) as of `saddle_point`, for other vectors f and c; what G barely holds is held as it is for these."""
-    solve, _ = _solver(M, G, _factorised(*jax.lax.stop_gradient((M, G, f[:, None], c[:, None], reach))))
+    if isinstance(G, SparseMatrix) and isinstance(M, lx.DiagonalLinearOperator):
+        solve, _ = _solver(M, G, sparsely_factorised(*jax.lax.stop_gradient((M, G))))
+    else:
+        G = dense(G)
+        solve, _ = _solver(M, G, _factorised(*jax.lax.stop_gradient((M, G, f[:, None], c[:, None], reach))))
 
     def solution(f, c):
         x, multipliers = solve(f[:, None], c[:, None])
@@ -125,7 +143,7 @@ def _by_inertia(M, G, W, cholesky):
 
 
 @jax.custom_jvp
-def _solution(M, G, f, c, factors: Factors):
+def _solution(M, G, f, c, factors):
     solve, _ = _solver(M, G, factors)
     return solve(f, c)
 
@@ -143,8 +161,10 @@ def _solution_jvp(primals, tangents):
     return (x, multipliers), (dx, d_multipliers + rotated(dG, multipliers))
 
 
-def _solver(M, G, factors: Factors):
+def _solver(M, G, factors):
     """(f, c) ↦ (x, λ); and (dG, λ) ↦ how λ turns with the null space of Gᵀ to stay of least norm."""
+    if isinstance(G, SparseMatrix):
+        return sparse_solver(M, G, factors)
     by_inertia, inverse = _by_inertia(M, G, factors.W, factors.cholesky), factors.inverse
     mobility = by_inertia(G.T)
     S = G @ mobility
@@ -161,9 +181,11 @@ def _solver(M, G, factors: Factors):
     return solve, rotated
 
 
-def is_determined(M: Float[Array, "n n"], G: Float[Array, "m n"]) -> Bool[Array, ""]:
-    """Whether M is positive definite on the null space of G."""
-    A = jax.lax.stop_gradient(augmented(M, G)[0])
+def is_determined(M: lx.AbstractLinearOperator, G: Rows) -> Bool[Array, ""]:
+    """Whether M is positive definite on the null space of G; a diagonal one beside sparse rows, everywhere."""
+    if isinstance(G, SparseMatrix) and isinstance(M, lx.DiagonalLinearOperator):
+        return jnp.all(M.diagonal > jnp.finfo(M.diagonal.dtype).eps * jnp.max(M.diagonal))
+    A = jax.lax.stop_gradient(augmented(M.as_matrix(), dense(G))[0])
     return _is_positive(jnp.linalg.cholesky(A), A)
 
 

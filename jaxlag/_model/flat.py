@@ -11,7 +11,7 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float, PyTree
 
-from .._program.sparse_jacobian import sparsity_pattern
+from .._program.sparse_jacobian import empty_rows
 from .contact import Poisson
 from .event import Every, merged
 from .injection import asks_for, call, described, needs
@@ -118,7 +118,7 @@ def _read_massless(system: System, structure: Any, leaves: tuple) -> tuple[int, 
         like, params, states = jax.tree.unflatten(structure, filled)
         bound, q = _Bound(system, like, params, states), ravel_pytree(like)[0]  # of no known numbers
         momentum = lambda v: jax.grad(bound.lagrangian, argnums=2)(q[0], q, v)
-        found.extend(np.flatnonzero(~np.any(sparsity_pattern(lambda dv: jax.jvp(momentum, (q,), (dv,))[1], q), axis=1)))
+        found.extend(empty_rows(lambda dv: jax.jvp(momentum, (q,), (dv,))[1], q))
 
     jax.eval_shape(read, [leaf for leaf, of_number in zip(leaves, is_number, strict=True) if of_number])
     return tuple(int(i) for i in found)

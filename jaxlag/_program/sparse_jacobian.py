@@ -12,29 +12,67 @@ import lineax as lx
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from .array_dependence import dependence
 from .expressions import Algebra, Node, TooLong, UnknownPrimitive
 from .interpreter import Interpreter, traced
+from .sparse_matrix import Places, SparseMatrix, colors
 from .structured_jacobian import structured_jacobian
 
 MAX_DENSE_COLUMNS = 3  # up to here a direction for each column costs less than looking for zeros
 MAX_SCALAR_COLUMNS = 5  # up to here most programs become scalar code, which is shortest with a direction for each column
 MAX_OPERATIONS = 20_000  # scalar operations that are searched, in a second or less
+MANY = 64  # columns, from which on programs are read as programs of arrays, and zeros may be left out
+SPARSE = 8  # times as many columns as directions, from which on they are
 
 
-def jacobian(function: Callable, x: Float[Array, " n"]) -> tuple[Float[Array, " m"], lx.AbstractLinearOperator]:
-    """f(x) and ∂f/∂x, which is a `DiagonalLinearOperator` where its program shows that it is diagonal."""
+def jacobian(function: Callable, x: Float[Array, " n"]) -> tuple[Float[Array, " m"], lx.AbstractLinearOperator | SparseMatrix]:
+    """f(x) and ∂f/∂x, which is a `DiagonalLinearOperator` where its program shows that it is diagonal, and a `SparseMatrix` where it is
+    large and takes few directions.
+    """
     y, push = jax.linearize(function, x)
+    if x.size >= MANY and (found := _by_arrays(function, push, x)) is not None:
+        return y, found
     pattern = np.ones((y.size, x.size), bool) if x.size <= MAX_DENSE_COLUMNS else sparsity_pattern(function, x)
     if pattern.shape[0] == pattern.shape[1] > MAX_DENSE_COLUMNS and np.array_equal(pattern, np.eye(x.size)):
         return y, lx.DiagonalLinearOperator(push(jnp.ones_like(x)))
-    color = _colors(pattern)
+    color = np.arange(x.size) if pattern.all() else colors(pattern)
     if x.size > MAX_SCALAR_COLUMNS and max(color) + 1 == x.size and (columns := structured_jacobian(function, x)) is not None:
         return y, lx.MatrixLinearOperator(columns)
-    directions = jnp.asarray(color[:, None] == np.arange(max(color, default=-1) + 1), x.dtype)
-    columns = jax.vmap(push, in_axes=1, out_axes=1)(directions)
-    if directions.shape[1] < x.size:
+    columns = along(push, color, x)
+    if columns.shape[1] < x.size:
         columns = jnp.where(pattern, columns[:, color], 0)
     return y, lx.MatrixLinearOperator(columns)
+
+
+def _by_arrays(function: Callable, push: Callable, x: Float[Array, " n"]) -> lx.DiagonalLinearOperator | SparseMatrix | None:
+    """∂f/∂x where the program of arrays shows that most of it is zeros."""
+    try:
+        pattern = dependence(function, x)
+    except TooLong:
+        return None
+    m, n = pattern.shape
+    if m == n == pattern.nnz and np.array_equal(pattern.indices, np.arange(n)) and np.array_equal(np.diff(pattern.indptr), np.ones(n)):
+        return lx.DiagonalLinearOperator(push(jnp.ones_like(x)))
+    if SPARSE * np.diff(pattern.indptr).max(initial=0) > n or SPARSE * max(color := colors(pattern)) >= n:
+        return None
+    places = Places.of(pattern)
+    return SparseMatrix(along(push, color, x)[places.rows, color[places.columns]], places)
+
+
+def along(push: Callable, color: np.ndarray, x: Float[Array, " n"]) -> Float[Array, "m c"]:
+    """The derivatives along directions, each the sum of the columns of one color."""
+    directions = jnp.asarray(color[:, None] == np.arange(max(color, default=-1) + 1), x.dtype)
+    return jax.vmap(push, in_axes=1, out_axes=1)(directions)
+
+
+def empty_rows(function: Callable, x: Float[Array, " n"]) -> np.ndarray:
+    """The numbers of the elements of f(x) that depend on none of x."""
+    try:
+        if x.size >= MANY:
+            return np.flatnonzero(np.diff(dependence(function, x).indptr) == 0)
+    except TooLong:
+        pass
+    return np.flatnonzero(~np.any(sparsity_pattern(function, x), axis=1))
 
 
 def sparsity_pattern(function: Callable, x: Array) -> Bool[np.ndarray, "m n"]:
@@ -61,14 +99,3 @@ class _Dependence(Algebra):
 
     def block(self, equation):
         return equation.primitive.bind
-
-
-def _colors(pattern) -> np.ndarray:
-    """Greedy coloring: for each column the least number that no earlier column with a row in common has."""
-    if pattern.all():
-        return np.arange(pattern.shape[1])
-    color, shares_row = np.zeros(pattern.shape[1], int), pattern.T.astype(int) @ pattern > 0
-    for j in range(1, color.size):
-        used = set(color[:j][shares_row[j, :j]])
-        color[j] = next(c for c in range(j + 1) if c not in used)
-    return color

@@ -1,0 +1,101 @@
+"""The constrained solve M x = f + Gᵀλ, G x = c where M is diagonal and G sparse: rods between points, however many.
+
+S = G M⁻¹ Gᵀ couples rows that share a coordinate. With the rows in an order of small bandwidth b, S is block tridiagonal: m b² operations,
+a number that grows with m alone for a chain (b = 1, 2), for a tree or a strip; and one block after the other in the program.
+"""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import lineax as lx
+import numpy as np
+from jax import lax
+from jaxtyping import Array, Bool, Float
+
+from .._program.block_tridiagonal import by_factor, elimination, factor
+from .._program.sparse_matrix import SparseMatrix, summed_by
+from .pseudo_inverse import FOLLOWS, everywhere
+
+SHIFT = 0.35  # exponent of eps: what is added to S where rows depend on each other
+GROWTH = 0.85  # exponent of 1/eps: what S⁻¹ makes of a number where rows do; a straight chain of m links makes m²/8 of it
+REFINED, REFINED_WITH_SHIFT = 2, 12  # times that a solution is put right by what is left
+
+
+class Factors(NamedTuple):
+    """What the solve takes as constant: a factor of S by blocks, in rows of unit length and in the order of elimination; whether rows
+    are independent; the lengths 1/D.
+    """
+
+    of: tuple[Array, Array]
+    regular: Bool[Array, ""]
+    D: Float[Array, "b s"]
+
+
+def factorised(M: lx.DiagonalLinearOperator, G: SparseMatrix) -> Factors:
+    """A factor of S, or, where rows depend on each other, of S + δ 1: then a solution is put right more often.
+
+    They are seen by what S⁻¹ makes of a vector at random: in the null space of S that is as large as rounding allows.
+    """
+    how, eps = elimination(G.places), jnp.finfo(G.values.dtype).eps
+    pairs = G.values[how.pairs[0]] * G.values[how.pairs[1]] / M.diagonal[G.places.columns[how.pairs[0]]]
+    S = jnp.append(summed_by(how.sums, pairs), 0)[how.entry]
+    squares, diagonal = jnp.diagonal(S[:, 0], axis1=1, axis2=2), jax.vmap(jnp.diag)
+    there = squares > (4 * eps) ** 2 * jnp.max(squares)  # a row of nothing but rounding has no part in it
+    D = jnp.where(there, lax.rsqrt(jnp.where(there, squares, 1)), 0)
+    before = jnp.concatenate([jnp.zeros_like(D[:1]), D[:-1]])
+    on = S[:, 0] * D[:, :, None] * D[:, None, :] + diagonal((~there).astype(S.dtype))
+    below = S[:, 1] * D[:, :, None] * before[:, None, :]
+    typical = jnp.exp(-2 * jnp.mean(jnp.log(jnp.where(there, D, 1))))
+    shift = eps**SHIFT * D**2 * typical  # as much for each row in the units given
+    probe = jnp.asarray(np.random.default_rng(0).choice([-1.0, 1.0], (*D.shape, 1)), D.dtype)
+
+    def attempt(carry):
+        _, _, shifted = carry
+        factors = factor(on + diagonal(jnp.where(shifted, shift, 0)), below)
+        is_singular = ~(jnp.max(jnp.abs(by_factor(factors, probe))) < eps**-GROWTH)
+        return factors, is_singular & ~shifted, is_singular | shifted
+
+    start = (on, below), jnp.array(True), jnp.array(False)
+    factors, _, shifted = lax.while_loop(lambda carry: carry[1], attempt, start)
+    return Factors(factors, everywhere(~shifted), D)
+
+
+def solver(M: lx.DiagonalLinearOperator, G: SparseMatrix, factors: Factors) -> tuple[Callable, Callable]:
+    """(f, c) ↦ (x, λ); and (dG, λ) ↦ how λ turns with the null space of Gᵀ to stay of least norm."""
+    how = elimination(G.places)
+    back = np.argsort(how.order)
+    by_inertia = lambda F: F / M.diagonal[:, None]
+    S = lambda X: G @ by_inertia(G.T @ X)
+
+    def once(R):
+        blocks = jnp.concatenate([R[how.order], jnp.zeros((how.padding, R.shape[1]), R.dtype)]).reshape(*factors.D.shape, -1)
+        scaled = factors.D[:, :, None] * by_factor(factors.of, factors.D[:, :, None] * blocks)
+        return scaled.reshape(-1, R.shape[1])[back]
+
+    def refined(matvec, R):
+        times = jnp.where(factors.regular, REFINED, REFINED_WITH_SHIFT)
+        return lax.fori_loop(0, times, lambda _, X: X + once(R - matvec(X)), jnp.zeros_like(R))
+
+    by_rows = lambda R: lax.custom_linear_solve(S, R, refined, symmetric=True)
+
+    def solve(f, c):
+        multipliers = by_rows(c - G @ by_inertia(f))
+        return by_inertia(f + G.T @ multipliers), multipliers
+
+    def rotated(dG, multipliers):
+        def turned(dG, multipliers):
+            change = dG @ by_inertia(G.T @ by_rows(multipliers))
+            return change - S(by_rows(change))
+
+        return lax.cond(factors.regular, lambda _, multipliers: jnp.zeros_like(multipliers), turned, dG, multipliers)
+
+    return solve, rotated
+
+
+def is_satisfied(M: lx.DiagonalLinearOperator, G: SparseMatrix, f, c, x) -> Bool[Array, ""]:
+    """Whether G x = c, as far as rounding lets it be: what rows that follow from others ask for follows too."""
+    size = SparseMatrix(jnp.abs(G.values), G.places)
+    scale = jnp.abs(c) + size @ (jnp.abs(x) + jnp.abs(f / M.diagonal[:, None]))
+    return jnp.all(jnp.abs(G @ x - c) <= jnp.finfo(x.dtype).eps ** FOLLOWS * jnp.max(scale, axis=0, initial=0.0, keepdims=True))

@@ -1,0 +1,127 @@
+"""Matrices of which only the entries that are not zero by structure are kept: their places are known while tracing."""
+
+import functools
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import scipy.sparse
+from jaxtyping import Array, Float
+
+UNEVEN = 4  # rows are padded to the longest where that makes no more than so many times as many entries
+
+
+class Places:
+    """The rows and columns of the entries of a matrix, row by row; compared by them."""
+
+    def __init__(self, rows: np.ndarray, columns: np.ndarray, shape: tuple[int, int]):
+        self.rows, self.columns, self.shape = rows, columns, shape
+        self.key = shape, rows.tobytes(), columns.tobytes()
+        self.hash = hash(self.key)
+
+    @classmethod
+    def of(cls, pattern: Any) -> "Places":
+        """Those of a sparse matrix of SciPy."""
+        pattern = scipy.sparse.csr_matrix(pattern)
+        pattern.sort_indices()
+        m, n = pattern.shape
+        return cls(np.repeat(np.arange(m), np.diff(pattern.indptr)), np.asarray(pattern.indices, int), (m, n))
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, Places) and self.key == other.key
+
+    def __hash__(self) -> int:
+        return self.hash
+
+    def pattern(self) -> scipy.sparse.csr_matrix:
+        """As a sparse matrix of SciPy, with the numbers of the entries, from 1 on."""
+        return scipy.sparse.csr_matrix((np.arange(1, self.rows.size + 1), (self.rows, self.columns)), self.shape)
+
+    @functools.cached_property
+    def by_row(self) -> np.ndarray | None:
+        """For each row the numbers of its entries, padded by the number of entries; None where rows are too uneven."""
+        m, size = self.shape[0], self.rows.size
+        count = np.bincount(self.rows, minlength=m)
+        width = int(count.max(initial=0))
+        if width * m > UNEVEN * size + m:
+            return None
+        padded = np.full((m, width), size)
+        padded[self.rows, np.arange(size) - np.repeat(np.cumsum(count) - count, count)] = np.arange(size)
+        return padded
+
+    @functools.cached_property
+    def transposed(self) -> tuple["Places", np.ndarray]:
+        """Those of the transpose, and the numbers that its entries have here."""
+        order = np.lexsort((self.rows, self.columns))
+        return Places(self.columns[order], self.rows[order], self.shape[::-1]), order
+
+
+class SparseMatrix(eqx.Module):
+    """A matrix by its entries."""
+
+    values: Float[Array, " e"]
+    places: Places = eqx.field(static=True)
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Rows and columns."""
+        return self.places.shape
+
+    @property
+    def T(self) -> "SparseMatrix":
+        """The transpose."""
+        places, order = self.places.transposed
+        return SparseMatrix(self.values[order], places)
+
+    def __matmul__(self, x: Float[Array, "n *k"]) -> Float[Array, "m *k"]:  # noqa: F821
+        """The product with a vector, or with a matrix column by column."""
+        if x.ndim == 2:
+            return jax.vmap(self.__matmul__, in_axes=1, out_axes=1)(x)
+        return summed_by(self.places, self.values * x[self.places.columns])
+
+    def __neg__(self) -> "SparseMatrix":
+        return SparseMatrix(-self.values, self.places)
+
+    def columns(self, which: np.ndarray) -> "SparseMatrix":
+        """Some of its columns, in this order."""
+        new = np.full(self.shape[1], -1)
+        new[which] = np.arange(which.size)
+        kept = np.flatnonzero(new[self.places.columns] >= 0)
+        kept = kept[np.lexsort((new[self.places.columns[kept]], self.places.rows[kept]))]
+        places = Places(self.places.rows[kept], new[self.places.columns[kept]], (self.shape[0], which.size))
+        return SparseMatrix(self.values[kept], places)
+
+    def as_matrix(self) -> Float[Array, "m n"]:
+        """With its zeros."""
+        return jnp.zeros(self.shape, self.values.dtype).at[self.places.rows, self.places.columns].set(self.values)
+
+
+def summed_by(places: Places, values: Float[Array, " e"]) -> Float[Array, " m"]:
+    """The sum of each row."""
+    if places.by_row is None:
+        return jax.ops.segment_sum(values, places.rows, places.shape[0], indices_are_sorted=True)
+    return jnp.sum(jnp.append(values, 0)[places.by_row], axis=1)
+
+
+def row_sums(matrix: Any) -> Float[Array, " m"]:
+    """Σⱼ |aᵢⱼ|."""
+    return summed_by(matrix.places, jnp.abs(matrix.values)) if isinstance(matrix, SparseMatrix) else jnp.sum(jnp.abs(matrix), axis=1)
+
+
+def dense(matrix: Any) -> Float[Array, "m n"]:
+    """A matrix with its zeros, whether it is kept with them or not."""
+    return matrix.as_matrix() if isinstance(matrix, SparseMatrix) else matrix
+
+
+def colors(pattern: Any) -> np.ndarray:
+    """Greedy coloring: for each column the least number that no earlier column with a row in common has."""
+    pattern = scipy.sparse.csr_matrix(pattern, dtype=np.int64)
+    beside = (pattern.T @ pattern).tocsr()
+    color, starts, others = np.zeros(pattern.shape[1], int), beside.indptr, beside.indices
+    for j in range(1, color.size):
+        before = others[starts[j] : starts[j + 1]]
+        used = set(color[before[before < j]].tolist())
+        color[j] = next(c for c in range(j + 1) if c not in used)
+    return color
