@@ -568,6 +568,13 @@ def test_programs_say_what_they_cannot_do():
     rod = jl.System(lambda q, qdot: 0.5 * qdot @ qdot - q[1], dissipation=rub, holonomic={"rod": lambda q: q @ q - 1})
     with pytest.raises(ValueError, match="must be linear in the multipliers for a program to solve for them, but they are not"):
         jl.equations(rod, ["x", "y"]).to_python()
+    node = lambda q: -0.5 * q["x"] ** 2 - 0.5 * (q["x"] - q["z"]) ** 2  # its rate is z's equation; z̈ is in none
+    solid = jl.System(node, dissipation=lambda qdot: 0.5 * qdot["z"] ** 2, holonomic={"grip": lambda q: q["x"] - 1})
+    for kept in (False, True):
+        on_paper = jl.equations(solid, {"x", "z"}, multipliers=kept)
+        for write in (on_paper.to_python, on_paper.to_c):
+            with pytest.raises(ValueError, match="accelerations follow from its equations of motion, but that of z does not"):
+                write()
 
 
 # Names and refusals.
