@@ -37,7 +37,7 @@ NAMES = {"E", "c", "b", "F", "x0"}
         (KELVIN_VOIGT, {"x"}, ["b ẋ + E x = F"]),
         (ZENER, {"x", "z"}, ["E x − c (z − x) = F", "b ż − c (x − z) = 0"]),
         (HELD, {"x", "z"}, ["x = x₀", "", "b ż + c (z − x₀) = 0", "", "λ = (E + c) x₀ − c z"]),
-        (SLIDER, {"x", "z"}, ["x = x₀", "", "b ż + F sign(ż) + c (z − x₀) = 0", "", "λ = c x₀ − c z"]),
+        (SLIDER, {"x", "z"}, ["x = x₀", "", "b ż + F sign(ż) + c (z − x₀) = 0", "", "λ = −c (z − x₀)"]),
     ],
     ids=["Maxwell", "Kelvin-Voigt", "Zener", "Zener, held", "a slider beside a dashpot"],
 )
