@@ -59,7 +59,7 @@ class EquationsOfMotion:
     rows: int = 0  # slip velocities with dry friction
     elements: int = 0  # elements of dry friction
     elsewhere: frozenset[int] = frozenset()  # signals that are asked for at other times than the present
-    driving: frozenset[int] = frozenset()  # signals in g or gaps, whose velocities jump where these bend
+    driving: frozenset[int] = frozenset()  # signals in holonomic constraints: velocities jump where these bend
     states: Layout = NOTHING  # of first order, by name
     sampled: Layout = NOTHING  # states that change at sample times
     contacts: int = 0
@@ -75,7 +75,7 @@ class EquationsOfMotion:
             elsewhere = called_elsewhere(lambda params: _values(bind(system, q0, params, at), *at[1:]), params)
             warn_of_delays(params, elsewhere)
             numbers, rest = eqx.partition(params, lambda leaf: isinstance(leaf, (jax.Array, np.ndarray)))
-            used = used_arguments(lambda part: alone.flat_at(eqx.combine(part, rest), at).holonomic(*at[1:3]), numbers)[0]
+            used = used_arguments(lambda part: alone.flat_at(eqx.combine(part, rest), at).bilateral(*at[1:3]), numbers)[0]
             driving = (k for k, signal in enumerate(broken_signals(used)) if any(jax.tree.leaves(signal)))
             alone = dataclasses.replace(alone, elsewhere=elsewhere, driving=frozenset(driving))
         light = light_coordinates(alone.flat_at(params, at), *at[1:])
