@@ -62,7 +62,7 @@ def first_order(flat: Flat, t, q, v) -> FirstOrder:
     decay = lambda dw: jax.jvp(lambda w: smooth_force(flat, t, q, moved(w))[massless], (v[massless],), (dw,))[1]
     resisted = np.any(sparsity_pattern(decay, v[massless]), axis=1)
     stated, of_contacts = _stated_rows(flat, t, q)
-    decided = _underdetermined(in_rows[stated]) & (resisted | np.any(in_rows[stated], axis=0))
+    decided = underdetermined(in_rows[stated]) & (resisted | np.any(in_rows[stated], axis=0))
     rows = np.any(in_rows[:, decided], axis=1)
     if np.any(rows[of_contacts]):
         raise ValueError(NO_CONTACT)
@@ -75,7 +75,7 @@ def plastic(sliding: Flat, slip: Callable, t, q, v) -> tuple[Int[np.ndarray, " k
     Refused where it is one of several slips or coordinates, a constraint acts on it, or the other forces on it depend on velocities.
     """
     massless, in_rows = np.array(sliding.massless), _rows_with(sliding, t, q, v)
-    undecided = _underdetermined(in_rows[_stated_rows(sliding, t, q)[0]]) & ~np.isin(massless, first_order(sliding, t, q, v).coordinates)
+    undecided = underdetermined(in_rows[_stated_rows(sliding, t, q)[0]]) & ~np.isin(massless, first_order(sliding, t, q, v).coordinates)
     slips = sparsity_pattern(lambda dv: jax.jvp(lambda v: slip(t, q, v), (v,), (dv,))[1], v)[:, massless[undecided]]
     rows, columns = np.nonzero(slips)
     coordinates = massless[undecided][columns]
@@ -100,7 +100,7 @@ def _stated_rows(flat: Flat, t, q) -> tuple[np.ndarray, slice]:
     return np.r_[: contacts.start, holonomic : holonomic + beside], contacts
 
 
-def _underdetermined(pattern: Bool[np.ndarray, "m k"]) -> Bool[np.ndarray, " k"]:
+def underdetermined(pattern: Bool[np.ndarray, "m k"]) -> Bool[np.ndarray, " k"]:
     """Unknowns that the equations of this pattern do not determine, whatever their numbers.
 
     Source: Dulmage & Mendelsohn, Canad. J. Math. 10 (1958) 517: what alternating paths from unmatched columns reach.

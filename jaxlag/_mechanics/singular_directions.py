@@ -14,6 +14,7 @@ from .._model.validation import at_state, coordinates
 from .._program.jit import is_concrete
 from .._program.walker import used_arguments
 from .lagrange import constraint_rows, inertia
+from .massless import first_order, with_masses
 from .saddle_point import NO_INERTIA
 
 UNDEFINED = (
@@ -67,7 +68,8 @@ def is_defined(found: dict) -> bool:
 
 
 def _without_inertia(found):
-    return massless_coordinates(found["M"], found["G"])
+    """Those that nothing decides; where that is none, D does not resist at this velocity, and all are named."""
+    return massless_coordinates(found["with_masses"], found["G"]) or massless_coordinates(found["M"], found["G"])
 
 
 def _nonaffine(found):
@@ -75,8 +77,10 @@ def _nonaffine(found):
 
 
 def _matrices(flat: Flat, t, q, v):
+    decided = first_order(flat, t, q, v).coordinates
     return {
         "M": inertia(flat, t, q, v)[0].as_matrix(),
+        "with_masses": inertia(with_masses(flat, decided, t, q, v) if decided.size else flat, t, q, v)[0].as_matrix(),
         "G": constraint_rows(flat, t, q, v)[1],
         "not_affine_in": not_affine_in(flat, t, q, v),
     }

@@ -5,6 +5,7 @@ import functools
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -31,6 +32,7 @@ from .._model.state_values import NOTHING, Layout, of_first_order, period, ravel
 from .._model.system import System
 from .._program.jit import jitted
 from .._program.scalarise import scalarised
+from .._program.walker import used_arguments
 from .interval_inputs import called_elsewhere, pieces_at, warn_of_delays
 from .protocol import Arguments
 from .state_vector import Parts
@@ -57,6 +59,7 @@ class EquationsOfMotion:
     rows: int = 0  # slip velocities with dry friction
     elements: int = 0  # elements of dry friction
     elsewhere: frozenset[int] = frozenset()  # signals that are asked for at other times than the present
+    driving: frozenset[int] = frozenset()  # signals in holonomic constraints: velocities jump where these bend
     states: Layout = NOTHING  # of first order, by name
     sampled: Layout = NOTHING  # states that change at sample times
     contacts: int = 0
@@ -71,7 +74,10 @@ class EquationsOfMotion:
         if broken_signals(params):
             elsewhere = called_elsewhere(lambda params: _values(bind(system, q0, params, at), *at[1:]), params)
             warn_of_delays(params, elsewhere)
-            alone = dataclasses.replace(alone, elsewhere=elsewhere)
+            numbers, rest = eqx.partition(params, lambda leaf: isinstance(leaf, (jax.Array, np.ndarray)))
+            used = used_arguments(lambda part: alone.flat_at(eqx.combine(part, rest), at).bilateral(*at[1:3]), numbers)[0]
+            driving = (k for k, signal in enumerate(broken_signals(used)) if any(jax.tree.leaves(signal)))
+            alone = dataclasses.replace(alone, elsewhere=elsewhere, driving=frozenset(driving))
         light = light_coordinates(alone.flat_at(params, at), *at[1:])
         alone = dataclasses.replace(alone, light=tuple(map(int, light)))
         elements = formulation.friction.elements(alone.flat_at(params, at), *at[1:])

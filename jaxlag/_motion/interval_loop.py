@@ -181,8 +181,9 @@ class IntervalLoop(NamedTuple):
             if moves:  # two nodes at one time are so for these numbers alone
                 y = jnp.where(by, self._moved(time, t, y, args), y)
                 t = jnp.where(by, time, t)
-        bends_count = bool(self.equations.modes and self.equations.light)  # what slips without inertia follows the slope of an input
-        jump = [*(jumps or bends_count for jumps in inputs.jump), *[True] * len(ticks)]
+        follows_slopes = bool(self.equations.modes and self.equations.light)  # what slips without inertia
+        bends = [follows_slopes or k in self.equations.driving for k in range(signals)]
+        jump = [*map(max, inputs.jump, bends), *[True] * len(ticks)]
         jumps = functools.reduce(jnp.logical_or, (by for by, jumps in zip(passed, jump, strict=True) if jumps), jnp.array(False))
         after = after._replace(params=inputs.pieces(following))
 

@@ -72,8 +72,8 @@ def simulate_many(
     - `over`: what differs: "q0", "qdot0", entries of them ("q0.phi") or of `params` ("b", "wheel.c").
     - `common_steps`: True has 64 members at a time take the same steps, short enough for each of them, with the members as the last
       axis of all arithmetic: many times as fast as one by one. False lets each member take its own. Default: True, but False where there
-      is dry friction, a contact, an event or a measured input that jumps, whose steps end at times that differ. Where one of 64 cannot
-      go on, all stop: `common_steps=False` then says which.
+      is dry friction, a contact, an event or a measured input that jumps, or bends and drives a constraint: these end steps at times
+      that differ. Where one of 64 cannot go on, all stop: `common_steps=False` then says which.
     - `steps`: deprecated; "common" is now `common_steps=True`, "own" `common_steps=False`.
 
     **Returns:** a `Trajectory`; each of its fields has the B members as its first axis, the samples as its second.
@@ -163,7 +163,7 @@ def _at(system, t, q0, qdot0, params):
 
 def _share_steps(common_steps, equations, params, own):
     signals = [leaf for leaf in jax.tree.leaves(own, is_leaf=is_signal) if is_signal(leaf) and jax.tree.leaves(leaf)]
-    obstacle = equations.modes or equations.sampled.size or signals or jump_times(params, float) is not None
+    obstacle = equations.modes or equations.sampled.size or signals or equations.driving or jump_times(params, float) is not None
     if common_steps and obstacle:
         raise ValueError(
             "`common_steps` must be False where dry friction, a contact, an event, a jumping input or an update ends steps at its own "

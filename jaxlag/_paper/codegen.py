@@ -4,12 +4,14 @@ import keyword
 import re
 from typing import NamedTuple
 
+import numpy as np
 import sympy
 from sympy import Expr, Matrix, Symbol
 from sympy.printing.c import C99CodePrinter, reserved_words
 from sympy.printing.codeprinter import CodePrinter, PrintMethodNotImplementedError
 from sympy.printing.numpy import NumPyPrinter
 
+from .._mechanics.massless import underdetermined
 from .derivative import derivative
 
 
@@ -41,6 +43,14 @@ class Program(NamedTuple):
             raise ValueError(
                 "`force` and `dissipation` must be linear in the multipliers for a program to solve for them, but they are not. "
                 "Say which multipliers are `positive`, or eliminate coordinates (`multipliers=False`)."
+            )
+        n = len(self.qddot)
+        undecided = np.flatnonzero(underdetermined(np.array(A.applyfunc(lambda entry: int(entry != 0)), bool))[:n])
+        if undecided.size:
+            raise ValueError(
+                "a program must be of a system whose accelerations follow from its equations of motion, but that of "
+                f"{', '.join(self.q[i].name for i in undecided)} does not: without inertia, its velocity follows from D. "
+                "Give it a mass, or write a program of the first-order equation that is printed."
             )
         at_zero = dict.fromkeys(self.unknowns, sympy.Integer(0))
         return A, Matrix([-residual.xreplace(at_zero) for residual in self.residuals])

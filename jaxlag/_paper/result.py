@@ -113,7 +113,8 @@ class Equations:
 
         `q` and `qdot` (n) hold the coordinates in the order of `Equations.q`; `params` is structured as it was for `equations`.
 
-        **Raises:** `ValueError` where there are states beside q, NumPy lacks a function, or λ enters nonlinearly and has no formula.
+        **Raises:** `ValueError` where there are states beside q or coordinates that D alone moves, NumPy lacks a function, or λ enters
+        nonlinearly and has no formula.
         """
         from .codegen import to_python
 
@@ -122,7 +123,8 @@ class Equations:
     def to_c(self) -> str:
         """The source of `void acceleration(t, q, qdot, params, qddot, multipliers)` in C99; a comment lists the entries in order.
 
-        **Raises:** `ValueError` where there are states beside q, C lacks a function, or λ enters nonlinearly and has no formula.
+        **Raises:** `ValueError` where there are states beside q or coordinates that D alone moves, C lacks a function, or λ enters
+        nonlinearly and has no formula.
         """
         from .codegen import to_c
 

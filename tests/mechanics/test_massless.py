@@ -124,7 +124,7 @@ def refused(system, *state):
 
 spring = lambda q, qdot: 0.5 * qdot["x"] ** 2 - 0.5 * (q["x"] - q["z"]) ** 2 - 0.5 * (q["z"] - q["y"]) ** 2
 REFUSED = {
-    "nothing": (jl.System(spring, dissipation=lambda qdot: qdot["z"] ** 2), "every direction inertia.*here: 'y'"),
+    "nothing": (jl.System(spring, dissipation=lambda qdot: qdot["z"] ** 2), r"every direction inertia.*here: 'y'\."),
     "no slope": (
         jl.System(spring, dissipation=lambda qdot: qdot["z"] ** 2 + jnp.maximum(jnp.abs(qdot["y"]) - 1e3, 0) ** 2),
         "every direction inertia",

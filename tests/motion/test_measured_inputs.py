@@ -218,6 +218,43 @@ def test_a_held_speed_of_a_belt_takes_the_mass_along():
     np.testing.assert_allclose(total, 0.5 * M * (9 - 1), rtol=1e-12)
 
 
+def test_a_grip_on_a_ramp_that_stops():
+    """x follows u(t), a ramp that ends: its velocity jumps, by an impulse of the grip; y hangs on a spring beside."""
+    system = jl.System(
+        lambda q, qdot, c: 0.5 * qdot["x"] ** 2 + 0.5 * qdot["y"] ** 2 - 0.5 * c * (q["x"] - q["y"]) ** 2,
+        holonomic={"grip": lambda q, t, u: q["x"] - u(t)},
+    )
+    ts = np.linspace(0, 5, 51)
+    at_rest = {"x": 0.0, "y": 0.0}
+
+    def run(c, delay):
+        u = jl.Signal(np.array([-0.5, 0.0, 0.2, 10.0]), np.array([0.0, 0.0, 1.0, 1.0]), jl.Linear(), delay=delay)
+        return jl.simulate(system, at_rest, at_rest, ts, {"c": c, "u": u}, rtol=1e-10, atol=1e-12)
+
+    def exact(c, delay):
+        w = np.sqrt(c)
+        ramp = lambda t: 5 * np.where(t > 0, t - np.sin(w * t) / w, 0)
+        y = ramp(ts - delay) - ramp(ts - delay - 0.2)
+        x = np.interp(ts, [delay, delay + 0.2], [0, 1])
+        return y, c * (x - y)
+
+    motion = run(2.0, 0.15)
+    y, force = exact(2.0, 0.15)
+    np.testing.assert_allclose(motion.q["y"], y, rtol=0, atol=1e-9)
+    np.testing.assert_allclose(motion.multipliers["grip"], force, rtol=0, atol=1e-8)
+    np.testing.assert_allclose(motion.qdot["x"][4:], 0, atol=1e-12)
+    slopes = jax.jacfwd(lambda c, delay: run(c, delay).q["y"], (0, 1))(2.0, 0.15)
+    h = 1e-5
+    np.testing.assert_allclose(slopes[0], (exact(2.0 + h, 0.15)[0] - exact(2.0 - h, 0.15)[0]) / (2 * h), atol=1e-7)
+    np.testing.assert_allclose(slopes[1], (exact(2.0, 0.15 + h)[0] - exact(2.0, 0.15 - h)[0]) / (2 * h), atol=1e-7)
+    back = jax.grad(lambda c: run(c, 0.15).q["y"][-1])(2.0)
+    np.testing.assert_allclose(back, slopes[0][-1], rtol=1e-8)
+    different = {"c": np.array([2.0, 3.0]), "u": jl.Signal([0.0, 0.2, 10.0], [0.0, 1.0, 1.0], jl.Linear())}
+    many = jl.simulate_many(system, at_rest, at_rest, ts, different, over=("c",), rtol=1e-10, atol=1e-12)
+    for of, c in zip(many.q["y"], (2.0, 3.0), strict=True):
+        np.testing.assert_allclose(of, exact(c, 0.0)[0], rtol=0, atol=1e-9)
+
+
 def test_single_precision():
     with jax.enable_x64(False):
         found = jl.simulate(CART, np.float32(0), np.float32(0), SAMPLES["coarse"], PARAMS | {"u": jl.Signal(TIMES, VALUES)}).q

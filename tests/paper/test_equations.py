@@ -334,6 +334,7 @@ NOTEBOOK_SYSTEMS = {  # by notebook and name: its coordinates
 }
 RECORDED = {"11_driven_pendulum.pendulum"}  # driven by a recorded `Signal`, which has no formula
 WITH_CONTACTS = {f"15_bouncing_rocking_pecking.{name}" for name in ("ball", "block", "woodpecker")}  # `test_contact_equations`
+WITHOUT_INERTIA = {f"16_viscoelastic.{name}" for name in ("mount", "iwan")}  # `test_equations_without_inertia`
 FROM_EXAMPLES = {"13_bicycle"}  # defines no system of its own
 SOLVED_BY_NUMBERS = {"05_closed_loops.four_bar", "05_closed_loops.platform"}  # for their formulas one would wait for minutes
 
@@ -368,7 +369,7 @@ def test_every_system_of_a_notebook_is_in_the_table():
         for source in code_of(notebook)
         for name in re.findall(r"(\w+) = jl\.System\(", source)
     }
-    table = set(NOTEBOOK_SYSTEMS) | RECORDED | WITH_CONTACTS
+    table = set(NOTEBOOK_SYSTEMS) | RECORDED | WITH_CONTACTS | WITHOUT_INERTIA
     assert there <= table and {name.split(".")[0] for name in table} | FROM_EXAMPLES == set(notebooks)
 
 
@@ -568,6 +569,13 @@ def test_programs_say_what_they_cannot_do():
     rod = jl.System(lambda q, qdot: 0.5 * qdot @ qdot - q[1], dissipation=rub, holonomic={"rod": lambda q: q @ q - 1})
     with pytest.raises(ValueError, match="must be linear in the multipliers for a program to solve for them, but they are not"):
         jl.equations(rod, ["x", "y"]).to_python()
+    node = lambda q: -0.5 * q["x"] ** 2 - 0.5 * (q["x"] - q["z"]) ** 2  # its rate is z's equation; z̈ is in none
+    solid = jl.System(node, dissipation=lambda qdot: 0.5 * qdot["z"] ** 2, holonomic={"grip": lambda q: q["x"] - 1})
+    for kept in (False, True):
+        on_paper = jl.equations(solid, {"x", "z"}, multipliers=kept)
+        for write in (on_paper.to_python, on_paper.to_c):
+            with pytest.raises(ValueError, match="accelerations follow from its equations of motion, but that of z does not"):
+                write()
 
 
 # Names and refusals.
