@@ -137,7 +137,7 @@ def _described(equations: Equations, given: Given, w: Array, found: Array) -> Re
     t, (known, at_rest) = given.t, jax.lax.stop_gradient((given, w))
     J, R = jax.jacfwd(equations, 1)(known, at_rest), equations(known, at_rest)
     allowed = jnp.abs(J) @ (1 + jnp.abs(at_rest)) + jnp.finfo(w.dtype).tiny
-    step = 0.1 * (1 + jnp.max(jnp.abs(q))) / jnp.maximum(jnp.max(jnp.abs(v)), jnp.finfo(w.dtype).tiny)
+    step = 0.1 * (1 + jnp.max(jnp.abs(q))) / jnp.maximum(jnp.max(jnp.abs(v)), jnp.finfo(w.dtype).tiny ** 0.5)
     later = at_rest.at[: equations.moving.size].add(jax.lax.stop_gradient(step * v)[equations.moving])
     uniform = is_root(J, equations(known._replace(q=known.q + step * known.v), later), at_rest)
     in_terms_of_q = lambda q: equations(known._replace(q=q), at_rest.at[: equations.moving.size].set(q[equations.moving]))

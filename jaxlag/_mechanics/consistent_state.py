@@ -29,6 +29,7 @@ from .singular_directions import NOT_AFFINE, UNDEFINED, explained, not_affine_in
 from .stick_slip import first_mode, in_mode
 
 ITERATIONS = 16  # near the constraints four suffice
+WITHOUT_CURVATURE = 200  # of a step that leaves it out: each takes away a part, the more the nearer the start is
 
 
 class Consistent(NamedTuple):
@@ -142,7 +143,8 @@ def _nearest_position(flat: Flat, moving, t, q0, M) -> Float[Array, " n"]:
             return jnp.concatenate([w[:free] + found.x, found.multipliers]), moved, i + 1
 
         start = jnp.concatenate([args[1][moving], jnp.zeros(size, like.dtype)])
-        going_on = lambda carry: carry[1] & (carry[2] < ITERATIONS)
+        most = WITHOUT_CURVATURE if isinstance(jax.eval_shape(linear, args, start).G, SparseMatrix) else ITERATIONS
+        going_on = lambda carry: carry[1] & (carry[2] < most)
         return jax.lax.while_loop(going_on, newton, (start, jnp.array(True), jnp.array(0)))[0], None
 
     w, _ = root_of(residual, linear, search, (t, q0, M), like)

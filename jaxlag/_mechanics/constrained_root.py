@@ -12,7 +12,7 @@ from .._program.implicit import implicit_root
 from .._program.sparse_matrix import SparseMatrix
 from .saddle_point import Rows, SaddlePoint, saddle_point, saddle_solver
 
-REFINEMENTS = 30  # of the derivative of a root, where curvature is left out of the step: each takes away what is off, in lengths of a rod
+REFINEMENTS = 200  # of the derivative of a root, where curvature is left out of the step: each takes away a part
 
 
 class Linear(NamedTuple):

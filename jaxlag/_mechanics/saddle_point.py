@@ -74,8 +74,10 @@ def _saddle_point(M, G, f, c, reach) -> SaddlePoint:
 
 def _sparse_saddle_point(M, G, f, c) -> SaddlePoint:
     """Rows that follow from others are judged by what is left of G x = c."""
-    x, multipliers = _solution(M, G, f, c, sparsely_factorised(*jax.lax.stop_gradient((M, G))))
-    return SaddlePoint(x, multipliers, Sound(is_determined(M, G), is_satisfied(*jax.lax.stop_gradient((M, G, f, c, x)))))
+    factors = sparsely_factorised(*jax.lax.stop_gradient((M, G)))
+    x, multipliers = _solution(M, G, f, c, factors)
+    satisfied = jax.lax.cond(factors.regular, lambda *_: jnp.array(True), is_satisfied, *jax.lax.stop_gradient((M, G, f, c, x)))
+    return SaddlePoint(x, multipliers, Sound(is_determined(M, G), satisfied))
 
 
 def saddle_solver(M: lx.AbstractLinearOperator, G: Rows, f, c, reach: Float[Array, " n"] | None = None) -> Callable:

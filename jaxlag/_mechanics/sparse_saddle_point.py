@@ -20,7 +20,7 @@ from .pseudo_inverse import FOLLOWS, everywhere
 
 SHIFT = 0.35  # exponent of eps: what is added to S where rows depend on each other
 GROWTH = 0.85  # exponent of 1/eps: what S⁻¹ makes of a number where rows do; a straight chain of m links makes m²/8 of it
-REFINED, REFINED_WITH_SHIFT = 2, 12  # times that a solution is put right by what is left
+REFINEMENTS = 12  # times that a solution is put right then, by what is left
 
 
 class Factors(NamedTuple):
@@ -75,8 +75,8 @@ def solver(M: lx.DiagonalLinearOperator, G: SparseMatrix, factors: Factors) -> t
         return scaled.reshape(-1, R.shape[1])[back]
 
     def refined(matvec, R):
-        times = jnp.where(factors.regular, REFINED, REFINED_WITH_SHIFT)
-        return lax.fori_loop(0, times, lambda _, X: X + once(R - matvec(X)), jnp.zeros_like(R))
+        times = jnp.where(factors.regular, 0, REFINEMENTS)
+        return lax.fori_loop(0, times, lambda _, X: X + once(R - matvec(X)), once(R))
 
     by_rows = lambda R: lax.custom_linear_solve(S, R, refined, symmetric=True)
 

@@ -77,9 +77,11 @@ class SparseMatrix(eqx.Module):
 
     def __matmul__(self, x: Float[Array, "n *k"]) -> Float[Array, "m *k"]:  # noqa: F821
         """The product with a vector, or with a matrix column by column."""
-        if x.ndim == 2:
-            return jax.vmap(self.__matmul__, in_axes=1, out_axes=1)(x)
-        return summed_by(self.places, self.values * x[self.places.columns])
+        values = self.values.reshape(-1, *[1] * (x.ndim - 1))
+        if self.places.by_row is None:
+            return summed_by(self.places, values * x[self.places.columns])
+        padded = jnp.append(values, jnp.zeros_like(values[:1]), axis=0)[self.places.by_row]
+        return jnp.sum(padded * x[np.append(self.places.columns, 0)[self.places.by_row]], axis=1)
 
     def __neg__(self) -> "SparseMatrix":
         return SparseMatrix(-self.values, self.places)
@@ -98,11 +100,11 @@ class SparseMatrix(eqx.Module):
         return jnp.zeros(self.shape, self.values.dtype).at[self.places.rows, self.places.columns].set(self.values)
 
 
-def summed_by(places: Places, values: Float[Array, " e"]) -> Float[Array, " m"]:
+def summed_by(places: Places, values: Float[Array, "e *k"]) -> Float[Array, "m *k"]:  # noqa: F821
     """The sum of each row."""
     if places.by_row is None:
         return jax.ops.segment_sum(values, places.rows, places.shape[0], indices_are_sorted=True)
-    return jnp.sum(jnp.append(values, 0)[places.by_row], axis=1)
+    return jnp.sum(jnp.append(values, jnp.zeros_like(values[:1]), axis=0)[places.by_row], axis=1)
 
 
 def row_sums(matrix: Any) -> Float[Array, " m"]:

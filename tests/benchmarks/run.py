@@ -9,7 +9,7 @@ import subprocess
 import sys
 from pathlib import Path
 
-TOPICS = ("vehicle", "devices", "pendulum", "constraints", "bodies", "first_use", "emitters")
+TOPICS = ("vehicle", "devices", "pendulum", "constraints", "bodies", "growth", "first_use", "emitters")
 
 
 def main():

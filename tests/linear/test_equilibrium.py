@@ -31,6 +31,12 @@ def test_a_pendulum_up_and_down(guess, expected, stability):
     np.testing.assert_allclose(at.stiffness, [np.cos(expected) * g / BOB["l"]], rtol=1e-12)
 
 
+def test_far_from_zero():
+    """A spring whose length at rest is a large number in its unit."""
+    spring = jl.System(lambda q, qdot: 0.5 * qdot**2 - 0.5 * (q - 2e4) ** 2)
+    np.testing.assert_allclose(jl.equilibrium(spring, 1e4).q, 2e4, rtol=EXACT)
+
+
 @pytest.mark.parametrize("x, y, sign, stability", [(0.3, -1.1, 1, "stable"), (-0.1, 0.8, -1, "unstable")])
 def test_a_pendulum_on_a_rod(x, y, sign, stability):
     """From a guess off the constraint; λ = −(tension), tension m g below and −m g above."""

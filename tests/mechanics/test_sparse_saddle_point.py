@@ -90,7 +90,7 @@ def test_derivatives_forward_and_reverse(name):
     along = tuple(jnp.asarray(np.random.default_rng(4).normal(size=z.shape)) for z in given)
     _, forward = jax.jvp(value, given, along)
     reverse = sum(jnp.sum(g * d) for g, d in zip(jax.grad(value, (0, 1, 2))(*given), along, strict=True))
-    h = 1e-5
+    h = 1e-4
     moved = lambda s: value(*(z + s * h * d for z, d in zip(given, along, strict=True)))
     differences = (8 * (moved(1) - moved(-1)) - (moved(2) - moved(-2))) / (12 * h)
     np.testing.assert_allclose([forward, reverse], differences, rtol=2e-7)

@@ -1,0 +1,110 @@
+"""Chains of rods between points: how time, compilation and memory grow with their number, beside the same by hand.
+
+python tests/benchmarks/bench_growth.py [most links]
+
+By hand: for the chain S has three diagonals, in one call of a tridiagonal solve. Medians of 30 calls, each length in a process of its own;
+and 1 s of motion of 200 links and of 1000, each of unit length and mass.
+"""
+
+import subprocess
+import sys
+from time import perf_counter
+
+LENGTHS, MOTIONS = (64, 256, 1024, 4096, 10_000), (200, 1000)
+
+
+def chain(n):
+    """L in arrays, and rods between neighbours."""
+    import jax.numpy as jnp
+
+    import jaxlag as jl
+
+    def rods(q, l):
+        return jnp.sum(jnp.diff(jnp.concatenate([jnp.zeros((1, 2)), q]), axis=0) ** 2, axis=1) - l**2
+
+    weight = lambda q, qdot, m, g: 0.5 * m * jnp.sum(qdot**2) - m * g * jnp.sum(q[:, 1])
+    angles = jnp.linspace(0.3, 1.2, n)
+    start = jnp.cumsum(jnp.stack([jnp.sin(angles), -jnp.cos(angles)], axis=1), axis=0)
+    return jl.System(weight, holonomic={"rods": rods}), start, {"m": 1.0, "g": 9.81, "l": 1.0}
+
+
+def by_hand(q, v, params):
+    """Lagrange's equations of the first kind for this chain."""
+    import jax.numpy as jnp
+    from jax import lax
+
+    m, g = params["m"], params["g"]
+    nothing = jnp.zeros((1, 2))
+    s, w = (jnp.diff(jnp.concatenate([nothing, x]), axis=0) for x in (q, v))
+    inverse = jnp.concatenate([jnp.zeros(1), jnp.full(len(q), 1 / m)])
+    on = 4 * jnp.sum(s**2, axis=1) * (inverse[1:] + inverse[:-1])
+    beside = jnp.append(-4 * jnp.sum(s[1:] * s[:-1], axis=1) * inverse[1:-1], 0)
+    falling = jnp.concatenate([nothing, jnp.tile(jnp.array([[0.0, -g]]), (len(q), 1))])
+    right = -2 * jnp.sum(w**2, axis=1) - 2 * jnp.sum(s * jnp.diff(falling, axis=0), axis=1)
+    multipliers = lax.linalg.tridiagonal_solve(jnp.roll(beside, 1), on, beside, right[:, None])[:, 0]
+    pull = 2 * multipliers[:, None] * s
+    return falling[1:] + (pull - jnp.concatenate([pull[1:], nothing])) / m, multipliers
+
+
+def timed(function, *given, times=30):
+    """The first call, and the median of others."""
+    import jax
+    import numpy as np
+
+    calls = []
+    for _ in range(times + 1):
+        start = perf_counter()
+        result = jax.block_until_ready(function(*given))
+        calls.append(perf_counter() - start)
+    return calls[0], float(np.median(calls[1:])), result
+
+
+def accelerations(n):
+    """One line of the table."""
+    import jax
+    import numpy as np
+
+    import jaxlag as jl
+
+    system, q, params = chain(n)
+    given = q, 0.1 * q[::-1], params
+    first, each, found = timed(jax.jit(lambda *given: jl.acceleration(system, *given)), *given)
+    first_by_hand, each_by_hand, expected = timed(jax.jit(by_hand), *given)
+    off = float(np.abs(found.qddot - expected[0]).max() / np.abs(expected[0]).max())
+    print(f"{n:>7}{1e3 * each:>12.3f}{1e3 * each_by_hand:>12.3f}{each / each_by_hand:>8.2f}{first:>9.2f}{first_by_hand:>9.2f}{off:>11.1e}")
+
+
+def motion(n):
+    """1 s from rest."""
+    import resource
+
+    import jax.numpy as jnp
+    import numpy as np
+
+    import jaxlag as jl
+
+    system, q, params = chain(n)
+    ts = np.linspace(0.0, 1.0, 11)
+    run = lambda params: jl.simulate(system, q, jnp.zeros_like(q), ts, params, works=True)
+    first, each, found = timed(run, params, times=5)
+    balance = float(np.abs(found.balance()).max())
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e3
+    print(f"{n:>7} links, 1 s: {each:.3f} s, the first {first:.1f} s; balance {balance:.1e}; {peak:.0f} MB")
+
+
+def main():
+    if len(sys.argv) == 3:
+        import jax
+
+        jax.config.update("jax_enable_x64", True)
+        return {"acceleration": accelerations, "motion": motion}[sys.argv[1]](int(sys.argv[2]))
+    most = int(sys.argv[1]) if len(sys.argv) > 1 else LENGTHS[-1]
+    print(f"{'links':>7}{'jaxlag ms':>12}{'by hand ms':>12}{'ratio':>8}{'first s':>9}{'by hand':>9}{'difference':>11}", flush=True)
+    for kind, lengths in (("acceleration", LENGTHS), ("motion", MOTIONS)):
+        for n in lengths:
+            if n <= most:
+                subprocess.run([sys.executable, __file__, kind, str(n)], check=True)
+
+
+if __name__ == "__main__":
+    main()
