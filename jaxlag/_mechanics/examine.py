@@ -255,7 +255,8 @@ def _measure(flat: Flat, t, q, v):
 def _defects(mode, t, q, v):
     """λ; and how far q̈ and λ, computed by the rewritten program, are from the equations as JAX alone differentiates them.
 
-    Of M q̈ − f − Gᵀλ and of G q̈ + γ: what is left, and with the largest term; zeros where inertia is missing.
+    Of M q̈ − f − Gᵀλ and of G q̈ + γ: what is left, and with the largest term; zeros where inertia is missing, and where no q̈ satisfies
+    all rows, as beside the constraints of a linkage with redundant ones.
     """
     v = completed(mode, t, q, v).v
     qddot, multipliers, sound = scalarised(lambda t, q, v: constrained_acceleration(mode, t, q, v))(t, q, v)
@@ -269,7 +270,9 @@ def _defects(mode, t, q, v):
     A, _ = augmented(jax.hessian(L, argnums=2)(t, q, v), G)
     moved = jnp.abs(jnp.linalg.inv(A)) @ sum(map(jnp.abs, terms))  # by each force alone, before they cancel each other
     in_rows = largest(G @ qddot + gamma), largest(jnp.abs(G) @ moved, gamma)
-    return multipliers, jnp.where(sound.determined & jnp.all(jnp.isfinite(qddot)), jnp.stack([*in_equations, *in_rows]), 0)
+    return multipliers, jnp.where(
+        sound.determined & sound.satisfied & jnp.all(jnp.isfinite(qddot)), jnp.stack([*in_equations, *in_rows]), 0
+    )
 
 
 def _redundant_rows(G, rows, eps):
