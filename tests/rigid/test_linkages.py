@@ -79,7 +79,7 @@ def started():
 
 @pytest.mark.slow
 def test_bennetts_linkage_moves_with_its_one_freedom():
-    """Its angles by Bennett's relation, its time by quadrature; the derivative by a length, of bars that keep their masses, by differences."""
+    """Angles by Bennett's relation, time by quadrature; the derivative by a length, of bars that keep their masses, by differences."""
     ts, q0, qdot0 = np.linspace(0, 2, 11), *started()
 
     def run(a):
