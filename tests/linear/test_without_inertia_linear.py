@@ -1,7 +1,8 @@
-"""A driven mass on a Maxwell element: responses, periodic motions, regression and pictures where a coordinate has no inertia."""
+"""A driven mass on a Maxwell element: responses, periodic motions, regression and printed equations where a coordinate has no inertia."""
 
 import jax.numpy as jnp
 import numpy as np
+import pytest
 
 import jaxlag as jl
 
@@ -32,6 +33,7 @@ def test_frequency_response():
     np.testing.assert_allclose(np.sort_complex(linear.eigenvalues), np.sort_complex(exact), rtol=1e-10)
 
 
+@pytest.mark.slow
 def test_a_forced_vibration_and_its_multipliers():
     """x = Re x̂ exp(iωt); a Floquet multiplier exp(sT) for each of three eigenvalues: ż is no part of the state."""
     pushed = jl.System(ENERGY, dissipation=DASHPOT, force={"push": lambda t, w: {"x": jnp.cos(w * t)}})
@@ -47,6 +49,7 @@ def test_a_forced_vibration_and_its_multipliers():
     assert orbit.is_stable
 
 
+@pytest.mark.slow
 def test_regression_of_stiffness_and_damping():
     """From the motion alone, in the weak form: the node's equation has no acceleration to miss."""
     ts = np.linspace(0, 10, 1001)
@@ -57,4 +60,4 @@ def test_regression_of_stiffness_and_damping():
 
 def test_linear_equations_on_paper():
     equations = jl.equations(DRIVEN, START[0], P | {"f": 0.0}, linearised_at={"x": 0, "z": 0, "f": 0}, inputs=("f",))
-    print(equations)
+    assert "m δẍ + (k + c) δx − c δz = δf\nb δż − c δx + c δz = 0" in str(equations)

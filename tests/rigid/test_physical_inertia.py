@@ -69,6 +69,6 @@ def test_the_inertia_of_a_tumbling_body_is_identified():
         chi2 += off @ np.linalg.solve(fit.covariance, off)
         m, _, Theta = rigid.inertia.physical(fit.params["body"])
         least, middle, most = np.linalg.eigvalsh(Theta)
-        assert abs(m - M) < 0.05 and 0 < least and most < least + middle
+        assert abs(m - M) < 0.05 and least > 0 and most < least + middle
         np.testing.assert_allclose(Theta, THETA, rtol=0, atol=4e-3)
     assert abs(chi2 - 10 * count) < 4 * np.sqrt(20 * count)
