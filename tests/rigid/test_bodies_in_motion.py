@@ -76,6 +76,14 @@ def test_a_heavy_top_by_angles_and_by_a_quaternion():
     np.testing.assert_allclose(energy, weight * u0, rtol=1e-9)
 
 
+def test_the_card_says_where_angles_come_near_their_singularity():
+    """φ and ψ turn about the same axis where θ = 0."""
+    near, far = (jl.examine(BY_ANGLES, np.array([0.2, theta, 0.3]), RATES, PARAMS).findings for theta in (0.005, 0.2))
+    (found,) = [finding for finding in near if "singularity" in finding]
+    assert "'q[0]', 'q[2]'" in found and "quaternion" in found
+    assert not any("singularity" in finding for finding in far)
+
+
 def test_a_spinning_wing_nut_turns_over_and_over():
     """Dzhanibekov's flips: ω in the axes of the body by Jacobi's functions (Landau & Lifshitz, Mechanics, section 37), I₁ < I₂ < I₃."""
     I = np.array([1.0, 2.0, 2.5])
