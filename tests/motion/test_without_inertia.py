@@ -65,6 +65,21 @@ def test_gradients_of_the_maxwell_element():
         np.testing.assert_allclose(second[name][name], (moved(name, 1) - 2 * exact(P) + moved(name, -1)) / h**2, rtol=1e-5, atol=1e-5)
 
 
+def test_redundant_rows_beside_a_maxwell_element():
+    """A mass of two halves, tied by two rows that say the same: λ of least norm, and together half of the spring's force."""
+    tied = jl.System(
+        lambda q, qdot, m, c: 0.25 * m * (qdot["x"] ** 2 + qdot["y"] ** 2) + stretched(q, c),
+        dissipation=lambda qdot, b: 0.5 * b * qdot["z"] ** 2,
+        holonomic={"tie": lambda q: q["x"] - q["y"], "twice": lambda q: 2 * q["x"] - 2 * q["y"]},
+    )
+    motion = jl.simulate(tied, Q0 | {"y": 1.0}, V0 | {"y": 0.3}, TS, P, **SHARP)
+    x, _, z = by_hand(P)
+    np.testing.assert_allclose(motion.q["x"], x, rtol=0, atol=1e-9)
+    np.testing.assert_allclose(motion.q["z"], z, rtol=0, atol=1e-9)
+    np.testing.assert_allclose(motion.multipliers["tie"], 1.5 * (x - z) / 5, rtol=0, atol=1e-9)
+    np.testing.assert_allclose(motion.multipliers["twice"], 2 * motion.multipliers["tie"], rtol=0, atol=1e-9)
+
+
 def test_many_maxwell_elements():
     b = np.array([0.5, 0.7, 0.9])
     motions = jl.simulate_many(MAXWELL, Q0, V0, TS, P | {"b": b}, over=("b",), **SHARP)
