@@ -81,6 +81,7 @@ WINGS = {  # each imports only from those above it, and each file of a wing only
         "consistent_state",
         "acceleration",
         "power",
+        "findings",
         "examine",
     ],
     "_motion": [

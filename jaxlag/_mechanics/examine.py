@@ -14,13 +14,14 @@ from .._model.state_values import given_states
 from .._model.system import System
 from .._model.validation import at_state, checked, coordinates, state
 from .._program.scalarise import scalarised
+from . import findings
 from .constrained_acceleration import constrained_acceleration
 from .contact import in_contact, in_current_mode
 from .friction_elements import light_coordinates, unread_friction
 from .lagrange import applied_force, constraint_rows, inertia, position_residual, velocity_residual
 from .massless import completed, with_masses
 from .saddle_point import augmented
-from .singular_directions import UNDEFINED, is_defined, massless_coordinates, not_affine_in, tangent_basis
+from .singular_directions import UNDEFINED, is_defined, not_affine_in, tangent_basis
 
 
 @dataclasses.dataclass(frozen=True)
@@ -121,17 +122,18 @@ def examine(system: System, q: PyTree, qdot: PyTree, params: PyTree = None, *, t
     off, size, rows_off, rows_size = found["defects"].max(axis=0)
     defect = max(off / max(size, eps), rows_off / max(rows_size, eps) if rank == G.shape[0] else 0)  # rows may contradict each other
     names = entry_names(q, "q")
-    findings = [
-        *_without_inertia(names, M, G),
-        *_not_affine(names, found["not_affine_in"]),
-        *_pushes(names, M, G, rows, system),
-        *_findings(numbers, defect, found["M"].dtype),
-        *_pulling(system, found["multipliers"]),
+    found_out = [
+        *findings.without_inertia(names, M, G),
+        *findings.nearly_without_inertia(names, M, G),
+        *findings.not_affine(names, found["not_affine_in"]),
+        *findings.pushing(names, M, G, rows, system),
+        *findings.of_numbers(numbers, defect, found["M"].dtype),
+        *findings.pulling(system, found["multipliers"]),
         *_unread_friction(system, q, qdot, params, t, states),
     ]
     light = tuple(names[i] for i in np.flatnonzero(found["light"]))
     states = tuple(name for name, _ in system.states)
-    return Examination(**numbers, findings=tuple(findings), states=states, contacts=contacts, without_inertia=light)
+    return Examination(**numbers, findings=tuple(found_out), states=states, contacts=contacts, without_inertia=light)
 
 
 def _unread_friction(system, q, qdot, params, t, states):
@@ -139,79 +141,6 @@ def _unread_friction(system, q, qdot, params, t, states):
     q, qdot = state(q, qdot)
     t = jnp.asarray(t, jax.tree.leaves(q)[0].dtype)
     return unread_friction(*checked(system, t, q, qdot, params, given_states(system, states, q)))
-
-
-def _pulling(system, multipliers):
-    """One-sided constraints that would have to pull."""
-    for name in system.one_sided:
-        least, size = np.min(multipliers[name], initial=0.0), np.max(np.abs(multipliers[name]), initial=0.0)
-        if least < -np.sqrt(np.finfo(multipliers[name].dtype).eps) * size:
-            yield (
-                f"the one-sided constraint {name!r} would have to pull here (λ = {least:.3g}), so its contact would open: "
-                "the motion enforces it all the same, as an equality"
-            )
-
-
-def _without_inertia(names, M, G):
-    free = [names[i] for i in massless_coordinates(M, G)]
-    if free:
-        yield (
-            f"a direction that no constraint holds has no inertia: {', '.join(map(repr, free))}; add the missing mass (a small one with "
-            "`solver=diffrax.Kvaerno5()`), a constraint that holds it, or a D of its velocity, or leave the coordinate out"
-        )
-
-
-def _not_affine(names, where):
-    listed = ", ".join(repr(names[i]) for i in np.flatnonzero(where))
-    if listed:
-        yield f"a nonholonomic constraint is not affine in the velocity of {listed}: write its derivative, or a root of it"
-
-
-def _pushes(names, M, G, rows, system):
-    """Velocity constraints that tie a coordinate without inertia to others: their λ acts on these too, unlike a first-order law."""
-    size = np.max(np.abs(M), axis=1)
-    massless = size <= 100 * len(M) * np.finfo(M.dtype).eps * np.max(size, initial=0.0)
-    for name in (name for name, _ in system.nonholonomic):
-        for row in G[rows[name]]:
-            part = np.abs(row) > 1e-12 * np.max(np.abs(row), initial=0.0)
-            driven, pushed = ([names[i] for i in np.flatnonzero(part & of)] for of in (massless, ~massless))
-            if driven and pushed:
-                yield (
-                    f"constraint {name!r} ties {', '.join(map(repr, driven))}, without inertia, to {', '.join(map(repr, pushed))}, and its "
-                    "λ pushes these too: right for a rod or a gear, wrong for a law such as that of a spring and damper in series, "
-                    "which must push by a force or an energy alone"
-                )
-
-
-def _findings(numbers, defect, dtype):
-    if defect > float(jnp.finfo(dtype).eps) ** 0.5:
-        yield (
-            f"the accelerations miss Lagrange's equations, as JAX alone differentiates them, by {defect:.2g} of the largest term: "
-            "do not trust them, and report the functions of this system as an error of jaxlag"
-        )
-    if numbers["degrees_of_freedom"] == 0:
-        yield "no degree of freedom is left: the constraints hold every coordinate"
-    for name, count in numbers["redundant"].items():
-        yield (
-            f"of constraint {name!r} {count} of the rows follow from those before: the motion is unique, λ is the one of least norm; "
-            "leave these rows out where each reaction matters"
-        )
-    tolerance = float(jnp.finfo(dtype).eps) ** 0.5
-    for what, off in (("position", numbers["off_position"]), ("velocity", numbers["off_velocity"])):
-        for name, value in off.items():
-            if value > tolerance:
-                yield f"the {what} is off constraint {name!r} by {value:.2g}: `consistent_state` corrects it, `simulate` does so by itself"
-    for name, least in numbers["dissipated"].items():
-        if least < 0:
-            yield (
-                f"dissipation {name!r} adds energy near this state (q̇·∂D/∂q̇ = {least:.2g}): "
-                "right for wind or a moving belt, otherwise check its sign"
-            )
-    fastest, slowest = numbers["time_constants"]
-    if np.isfinite(slowest) and slowest > 1e4 * fastest:
-        yield f"the motion is stiff (time constants from {fastest:.2g} to {slowest:.2g}): use `solver=diffrax.Kvaerno5()`"
-    if jnp.finfo(dtype).bits < 64:
-        yield 'single precision: `jax.config.update("jax_enable_x64", True)` gives twice as many digits'
 
 
 def _measure(flat: Flat, t, q, v):
@@ -255,7 +184,8 @@ def _measure(flat: Flat, t, q, v):
 def _defects(mode, t, q, v):
     """λ; and how far q̈ and λ, computed by the rewritten program, are from the equations as JAX alone differentiates them.
 
-    Of M q̈ − f − Gᵀλ and of G q̈ + γ: what is left, and with the largest term; zeros where inertia is missing.
+    Of M q̈ − f − Gᵀλ and of G q̈ + γ: what is left, and with the largest term; zeros where inertia is missing, and where no q̈ satisfies
+    all rows, as beside the constraints of a linkage with redundant ones.
     """
     v = completed(mode, t, q, v).v
     qddot, multipliers, sound = scalarised(lambda t, q, v: constrained_acceleration(mode, t, q, v))(t, q, v)
@@ -269,7 +199,9 @@ def _defects(mode, t, q, v):
     A, _ = augmented(jax.hessian(L, argnums=2)(t, q, v), G)
     moved = jnp.abs(jnp.linalg.inv(A)) @ sum(map(jnp.abs, terms))  # by each force alone, before they cancel each other
     in_rows = largest(G @ qddot + gamma), largest(jnp.abs(G) @ moved, gamma)
-    return multipliers, jnp.where(sound.determined & jnp.all(jnp.isfinite(qddot)), jnp.stack([*in_equations, *in_rows]), 0)
+    return multipliers, jnp.where(
+        sound.determined & sound.satisfied & jnp.all(jnp.isfinite(qddot)), jnp.stack([*in_equations, *in_rows]), 0
+    )
 
 
 def _redundant_rows(G, rows, eps):

@@ -21,10 +21,11 @@ from .._program.scalarise import scalarised
 from .._program.sparse_jacobian import jacobian, sparsity_pattern
 from .constrained_root import Linear, root_of
 from .lagrange import applied_force, constraint_rows, inertia, velocity_residual
-from .saddle_point import Sound, reach_of, saddle_point
+from .saddle_point import Sound, is_determined, reach_of, saddle_point
 
 ITERATIONS = 100  # of Newton's method; from rest, a few more than from a motion
 HALVINGS = 1100  # of a step, from the largest number to the least
+NEAR = 0.1875  # exponent of eps (1.2e-3 in double precision), at which distance a D is flat that does not decide velocities
 RECIPROCAL = (
     "`lagrangian` and `force` must not couple the velocities of coordinates without inertia among each other, but do. "
     "Give these coordinates inertia, or write the coupling as a dissipation function."
@@ -33,8 +34,6 @@ NO_MULTIPLIERS = (
     "`dissipation` and `force` must not depend on `multipliers` where coordinates have no inertia, but one does. "
     "Give these coordinates a mass, or write the force by the coordinates."
 )
-
-
 SEVERAL = (
     "`dissipation` must hold a coordinate without inertia by one dry friction on one slip velocity, with springs and inputs beside it, but "
     "has another form: a slip between two such coordinates, in a plane, or with forces that depend on other velocities. "
@@ -180,10 +179,9 @@ def _check(flat: Flat, z, t, q, v) -> None:
 
 
 def _is_linear(flat: Flat, z, t, q, v) -> bool:
-    """Whether the force is seen to be affine in ż."""
+    """Whether the force is seen to be affine in ż: its slope does not depend on ż, not even by a comparison, as of unlike dampers."""
     slope = lambda w: jax.jvp(lambda w: smooth_force(flat, t, q, v.at[z].set(w))[z], (w,), (jnp.ones_like(w),))[1]
-    bend = lambda dw: jax.jvp(slope, (v[z],), (dw,))[1]
-    return not np.any(sparsity_pattern(bend, v[z]))
+    return not np.any(sparsity_pattern(slope, v[z]))
 
 
 def _by_newton(flat: Flat, z, rows, equations: Callable, t, q, v) -> tuple[Array, Array, Sound]:
@@ -219,11 +217,18 @@ def _by_newton(flat: Flat, z, rows, equations: Callable, t, q, v) -> tuple[Array
         start = jnp.concatenate([given, jnp.zeros_like(like[k:])]), jnp.zeros_like(given), jnp.array(True), jnp.array(0)
         w, left, _, _ = jax.lax.while_loop(lambda carry: carry[2] & (carry[3] < ITERATIONS), newton, start)
         scale = jnp.maximum(jnp.max(jnp.abs(force(given))), jnp.max(jnp.abs(force(jnp.zeros_like(given)))))
-        return w, (jnp.max(jnp.abs(left)) <= jnp.finfo(v.dtype).eps ** 0.5 * scale, linear(args, w).solution().sound.satisfied)
+        solved = jnp.max(jnp.abs(left)) <= jnp.finfo(v.dtype).eps ** 0.5 * scale
+        return w, (solved & resists(args, w[:k]), linear(args, w).solution().sound.satisfied)
 
-    w, (solved, satisfied) = root_of(residual, linear, search, (t, q, v), like)
+    def resists(args, w):
+        """Whether D is bent around w, where it may be flat at one place, as |ż|³ is at rest, or have no slope, as |ż|^1.5 has none."""
+        near = jnp.finfo(v.dtype).eps ** NEAR * (1 + jnp.abs(w)) * jnp.linspace(1, 2, k, dtype=v.dtype)
+        (above, G, *_), (below, *_) = (equations(*args, w + beside) for beside in (near, -near))
+        return is_determined(above.as_matrix() + below.as_matrix(), G)
+
+    w, sound = root_of(residual, linear, search, (t, q, v), like)
     rates, multipliers = jnp.split(w, [k])
-    return rates, multipliers, Sound(solved, satisfied)
+    return rates, multipliers, Sound(*sound)
 
 
 def _first_guess(force: Callable, at_rest: Linear, given: Float[Array, " k"]) -> Float[Array, " k"]:

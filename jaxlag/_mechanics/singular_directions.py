@@ -61,6 +61,16 @@ def massless_coordinates(M: np.ndarray, G: np.ndarray) -> list[int]:
     return [i for i, moves in enumerate(free) if np.any(moves > 1e-6)]
 
 
+def faint_direction(M: np.ndarray, G: np.ndarray) -> tuple[float, list[int]]:
+    """The least inertia in a direction that G allows, where each coordinate alone has 1, and the coordinates that take part in it."""
+    size = np.sqrt(np.diagonal(M))
+    if not np.all(size > 0):
+        return 1.0, []
+    N = tangent_basis(G / size, float(np.finfo(M.dtype).eps))
+    inertias, directions = np.linalg.eigh(N.T @ (M / np.outer(size, size)) @ N)
+    return (float(inertias[0]), [int(i) for i in np.flatnonzero(np.abs(N @ directions[:, 0]) > 0.3)]) if inertias.size else (1.0, [])
+
+
 def is_defined(found: dict) -> bool:
     """Whether M, G and, where present, the residuals of the constraints are finite."""
     named = [found["M"], found["G"], *found.get("position", {}).values(), *found.get("velocity", {}).values()]

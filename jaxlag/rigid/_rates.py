@@ -62,6 +62,10 @@ class _Factors:
         self.closed, (self.whole,) = closed, closed.jaxpr.outvars
         self.made_by = {variable: equation for equation in closed.jaxpr.eqns for variable in equation.outvars}
         self.constants = dict(zip(closed.jaxpr.constvars, closed.consts, strict=True))
+        self.moving = set(closed.jaxpr.invars)
+        for equation in closed.jaxpr.eqns:
+            if any(not isinstance(x, core.Literal) and x in self.moving for x in equation.invars):
+                self.moving.update(equation.outvars)
 
     def evaluated(self, variables: Any, leaves: Any) -> list:
         """The arrays of some variables, and nothing else."""
@@ -70,6 +74,8 @@ class _Factors:
 
     def angular_velocity(self, R: Any, values: Any, rates: Any) -> Float[Array, "3"]:
         """ω of an array that is a rotation matrix."""
+        if R not in self.moving:  # the unit matrix, made of truth values, has no derivative
+            return jnp.zeros(3, R.aval.dtype)
         omega = lambda R: self.angular_velocity(R, values, rates)
         kind, of = self._made(R)
         if kind in UNCHANGED:

@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy.optimize import brentq
 
 import jaxlag as jl
 
@@ -105,6 +106,26 @@ def test_rest_under_no_force_and_its_derivative():
     np.testing.assert_allclose(jax.grad(jax.grad(rate))(0.5, 1.5), 2 / 0.7**2, rtol=1e-9)
 
 
+PIECEWISE = {  # force, and the rate at which D balances it
+    "unlike dampers": (lambda qdot: jnp.where(qdot > 0, 2.0, 1.0) * qdot**2 / 2, lambda F: np.where(F > 0, F / 2, F)),
+    "dead zone": (lambda qdot: jnp.maximum(jnp.abs(qdot) - 0.5, 0) ** 2, lambda F: np.sign(F) * (0.5 + np.abs(F) / 2)),
+    "Huber": (
+        lambda qdot: jnp.where(jnp.abs(qdot) < 1, qdot**2 / 2, jnp.abs(qdot) - 0.5) + qdot**2 / 2,
+        lambda F: np.where(np.abs(F) < 2, F / 2, F - np.sign(F)),
+    ),
+}
+
+
+@pytest.mark.parametrize("name", PIECEWISE)
+def test_quadratic_pieces(name):
+    """Of which the slope of the force is a number here and another there: they were taken for linear, with the number at rest."""
+    D, exact = PIECEWISE[name]
+    F, guess = np.array([3.0, 1.0, 1e-3, -1e-3, -1.0, -3.0]), np.array([0.0, 2.0, -2.0])
+    rate = jax.vmap(lambda F, v: jl.consistent_state(jl.System(lambda q, F: F * q, dissipation=D), 0.0, v, {"F": F})[1])
+    for start in guess:
+        np.testing.assert_allclose(rate(F, np.full(6, start)), exact(F), rtol=1e-12)
+
+
 def test_drag_in_the_plane_and_a_slope_that_differs_by_direction():
     """D = k|ż|³/3 + ½ b ż₁²: the balance k|ż|ż + b ż₁ = F, put in."""
     drag = jl.System(lambda q, F: F @ q, dissipation=lambda qdot, k, b: k * (qdot @ qdot + 1e-300) ** 1.5 / 3 + b * qdot[0] ** 2 / 2)
@@ -112,6 +133,20 @@ def test_drag_in_the_plane_and_a_slope_that_differs_by_direction():
     F = 0.3 * np.linalg.norm(rates, axis=1, keepdims=True) * rates + rates * [2.0, 0.0]
     solve = jax.vmap(lambda F: jl.consistent_state(drag, jnp.zeros(2), jnp.ones(2), {"F": F, "k": 0.3, "b": 2.0})[1])
     np.testing.assert_allclose(solve(F), rates, rtol=1e-8)
+
+
+def test_drag_beside_a_constraint_that_moves():
+    """k|ẋ|ẋ = 2 + λ and b ẏ = −y + 2λ with ẋ + 2ẏ = cos t: one equation for ẋ by bisection."""
+    bar = jl.System(
+        lambda q: 2.0 * q["x"] - 0.5 * q["y"] ** 2,
+        dissipation=lambda qdot, k, b: k * jnp.abs(qdot["x"]) ** 3 / 3 + 0.5 * b * qdot["y"] ** 2,
+        holonomic={"bar": lambda t, q: q["x"] + 2 * q["y"] - jnp.sin(t)},
+    )
+    x = brentq(lambda x: 2 * (0.7 * abs(x) * x - 2) - 0.3 - 0.4 * (1 - x) / 2, -10, 10, xtol=1e-14)
+    start = {"x": -0.6, "y": 0.3}, {"x": 0.0, "y": 0.0}, {"k": 0.7, "b": 0.4}
+    _, rates = jl.consistent_state(bar, *start)
+    np.testing.assert_allclose([rates["x"], rates["y"]], [x, (1 - x) / 2], rtol=1e-12)
+    np.testing.assert_allclose(jl.acceleration(bar, *start).multipliers["bar"], 0.7 * abs(x) * x - 2, rtol=1e-11)
 
 
 # What is not decided, or not covered

@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from scipy.special import ellipj, ellipk
+from scipy.special import ellipj, ellipk, elliprf, elliprj
 
 import jaxlag as jl
 from jaxlag import rigid
@@ -31,10 +31,22 @@ def as_quaternion(angles, rates):
     return q, rigid.quaternion_rate(q, rigid.angular_velocity(EULER)(angles, rates))
 
 
-def test_a_heavy_top_by_angles_and_by_a_quaternion():
-    """The same motion over 20 s, some 290 turns; and its nutation by elliptic functions (Goldstein, section 5.7).
+def third_kind(n, amplitude, k2):
+    """∫dα/((1 − n sin²α) √(1 − k² sin²α)) from 0 to an amplitude, of any number of turns (DLMF 19.25.14)."""
+    turns = np.round(amplitude / np.pi)
 
-    u = cos θ moves between two zeros of u̇² = f(u), cubic, as u₁ + (u₂ − u₁) sn²(½√(β(u₃ − u₁)) (t − t₀)).
+    def within(alpha):
+        s, c = np.sin(alpha), np.cos(alpha)
+        given = c**2, 1 - k2 * s**2, 1.0
+        return s * elliprf(*given) + n / 3 * s**3 * elliprj(*given, 1 - n * s**2)
+
+    return within(amplitude - turns * np.pi) + 2 * turns * within(np.pi / 2)
+
+
+def test_a_heavy_top_by_angles_and_by_a_quaternion():
+    """The same motion over 20 s, some 290 turns; and its nutation and precession by elliptic functions (Goldstein, section 5.7).
+
+    u = cos θ moves between two zeros of u̇² = f(u), cubic, as u₁ + (u₂ − u₁) sn²(½√(β(u₃ − u₁)) (t − t₀)), and φ̇ = (b − au)/(1 − u²).
     """
     ts = np.linspace(0, 20, 401)
     tight = {"rtol": 1e-12, "atol": 1e-13}
@@ -51,8 +63,25 @@ def test_a_heavy_top_by_angles_and_by_a_quaternion():
     u1, u2, u3 = np.sort(f.roots().real)
     k2, rate = (u2 - u1) / (u3 - u1), 0.5 * np.sqrt(beta * (u3 - u1))
     np.testing.assert_allclose(u2, u0, rtol=1e-12)  # it falls from its highest point
-    sn, *_ = ellipj(rate * ts + ellipk(k2), k2)
+    sn, _, _, amplitude = ellipj(rate * ts + ellipk(k2), k2)
     np.testing.assert_allclose(axes[:, 2, 2], u1 + (u2 - u1) * sn**2, atol=1e-8)
+    parts = [(b - s * a) / 2 / (1 - s * u1) * third_kind(s * (u2 - u1) / (1 - s * u1), amplitude, k2) for s in (1, -1)]
+    np.testing.assert_allclose(angles.q[:, 0] - ANGLES[0], (sum(parts) - sum(parts)[0]) / rate, atol=1e-8)
+
+    phi_dot, theta_dot, _ = np.array(angles.qdot).T
+    u, in_body = axes[:, 2, 2], np.array(jax.vmap(rigid.angular_velocity(rigid.quaternion))(turned.q, turned.qdot))
+    np.testing.assert_allclose(A * (1 - u**2) * phi_dot + C * spin * u, C * spin * u0, rtol=1e-9)  # angular momentum about the vertical
+    np.testing.assert_allclose(in_body[:, 2], spin, rtol=1e-9)  # and about the axis of the top
+    energy = 0.5 * A * ((1 - u**2) * phi_dot**2 + theta_dot**2) + weight * u
+    np.testing.assert_allclose(energy, weight * u0, rtol=1e-9)
+
+
+def test_the_card_says_where_angles_come_near_their_singularity():
+    """φ and ψ turn about the same axis where θ = 0."""
+    near, far = (jl.examine(BY_ANGLES, np.array([0.2, theta, 0.3]), RATES, PARAMS).findings for theta in (0.005, 0.2))
+    (found,) = [finding for finding in near if "singularity" in finding]
+    assert "'q[0]', 'q[2]'" in found and "quaternion" in found
+    assert not any("singularity" in finding for finding in far)
 
 
 def test_a_spinning_wing_nut_turns_over_and_over():
@@ -126,3 +155,37 @@ def test_a_gradient_through_a_top():
     found = jax.jit(lambda m: (jax.jacfwd(axis)(m), jax.jacrev(axis)(m)))(0.5)
     for derivative in found:
         np.testing.assert_allclose(derivative, expected, atol=1e-5)
+
+
+def ball(q):
+    return rigid.frame(q["x"], rigid.quaternion(q["p"]))
+
+
+BALL = jl.System(
+    lambda q, qdot, m, r, g, tilt: (
+        rigid.kinetic_energy(m, rigid.inertia.sphere(m, r), lambda q: q["x"], lambda q: rigid.quaternion(q["p"]))(q, qdot)
+        + m * g * (jnp.sin(tilt) * q["x"][0] - jnp.cos(tilt) * q["x"][2])
+    ),
+    holonomic={"unit": lambda q: rigid.unit(q["p"]), "stands": lambda q, r: rigid.on_plane(q["x"], rigid.frame()) - r},
+    nonholonomic={"rolls": lambda q, qdot, r: rigid.rolling_ball(ball, r)(q, qdot)},
+)
+
+
+@pytest.mark.slow
+def test_a_ball_rolls_down_a_slope():
+    """Its centre falls with 5/7 g sin tilt, however it spins; the friction is 2/7 m g sin tilt (Goldstein, section 2.4, for a ball)."""
+    m, g, r, tilt, spin = 0.5, 9.81, 0.1, 0.2, np.array([3.0, -2.0, 5.0])
+    q0 = {"x": np.array([0.0, 0.0, r]), "p": np.array([1.0, 0.0, 0.0, 0.0])}
+    qdot0 = {"x": np.cross(spin, [0.0, 0.0, r]), "p": rigid.quaternion_rate(q0["p"], spin)}
+    ts = np.linspace(0, 2, 11)
+
+    def run(tilt):
+        motion = jl.simulate(BALL, q0, qdot0, ts, {"m": m, "g": g, "r": r, "tilt": tilt}, rtol=1e-10, atol=1e-12)
+        return motion.q["x"][-1], (motion.q["x"], motion.multipliers)
+
+    slope, (x, multipliers) = jax.jit(jax.jacfwd(run, has_aux=True))(tilt)
+    way = qdot0["x"] * ts[:, None] + 5 / 14 * g * np.sin(tilt) * ts[:, None] ** 2 * np.array([1.0, 0.0, 0.0])
+    np.testing.assert_allclose(x, way + q0["x"], atol=1e-9)
+    np.testing.assert_allclose(slope, [5 / 14 * g * np.cos(tilt) * 4, 0, 0], atol=1e-8)
+    np.testing.assert_allclose(multipliers["rolls"], np.tile([-2 / 7 * m * g * np.sin(tilt), 0], (11, 1)), atol=1e-9)
+    np.testing.assert_allclose(multipliers["stands"], m * g * np.cos(tilt), rtol=1e-9)

@@ -1,0 +1,92 @@
+"""What `examine` says of a system, sentence by sentence, each with its cure."""
+
+import jax.numpy as jnp
+import numpy as np
+
+from .singular_directions import faint_direction, massless_coordinates
+
+FAINT = 5e-4  # of the inertia of each coordinate alone: Euler angles of a ball 2° from their singularity
+
+
+def pulling(system, multipliers):
+    """One-sided constraints that would have to pull."""
+    for name in system.one_sided:
+        least, size = np.min(multipliers[name], initial=0.0), np.max(np.abs(multipliers[name]), initial=0.0)
+        if least < -np.sqrt(np.finfo(multipliers[name].dtype).eps) * size:
+            yield (
+                f"the one-sided constraint {name!r} would have to pull here (λ = {least:.3g}), so its contact would open: "
+                "the motion enforces it all the same, as an equality"
+            )
+
+
+def without_inertia(names, M, G):
+    free = [names[i] for i in massless_coordinates(M, G)]
+    if free:
+        yield (
+            f"a direction that no constraint holds has no inertia: {', '.join(map(repr, free))}; add the missing mass (a small one with "
+            "`solver=diffrax.Kvaerno5()`), a constraint that holds it, or a D of its velocity, or leave the coordinate out"
+        )
+
+
+def nearly_without_inertia(names, M, G):
+    """Such as two Euler angles near their singularity, where they turn about the same axis."""
+    least, moving = faint_direction(M, G)
+    if 1e-12 < least < FAINT:
+        listed = ", ".join(repr(names[i]) for i in moving)
+        yield (
+            f"together {listed} have in one direction only {least:.2g} of the inertia that each has alone: where they are angles near "
+            "their singularity (`margin` of `rigid.euler`), steps become small; take another sequence, or a quaternion"
+        )
+
+
+def not_affine(names, where):
+    listed = ", ".join(repr(names[i]) for i in np.flatnonzero(where))
+    if listed:
+        yield f"a nonholonomic constraint is not affine in the velocity of {listed}: write its derivative, or a root of it"
+
+
+def pushing(names, M, G, rows, system):
+    """Velocity constraints that tie a coordinate without inertia to others: their λ acts on these too, unlike a first-order law."""
+    size = np.max(np.abs(M), axis=1)
+    massless = size <= 100 * len(M) * np.finfo(M.dtype).eps * np.max(size, initial=0.0)
+    for name in (name for name, _ in system.nonholonomic):
+        for row in G[rows[name]]:
+            part = np.abs(row) > 1e-12 * np.max(np.abs(row), initial=0.0)
+            driven, pushed = ([names[i] for i in np.flatnonzero(part & of)] for of in (massless, ~massless))
+            if driven and pushed:
+                yield (
+                    f"constraint {name!r} ties {', '.join(map(repr, driven))}, without inertia, to {', '.join(map(repr, pushed))}, and its "
+                    "λ pushes these too: right for a rod or a gear, wrong for a law such as that of a spring and damper in series, "
+                    "which must push by a force or an energy alone"
+                )
+
+
+def of_numbers(numbers, defect, dtype):
+    if defect > float(jnp.finfo(dtype).eps) ** 0.5:
+        yield (
+            f"the accelerations miss Lagrange's equations, as JAX alone differentiates them, by {defect:.2g} of the largest term: "
+            "do not trust them, and report the functions of this system as an error of jaxlag"
+        )
+    if numbers["degrees_of_freedom"] == 0:
+        yield "no degree of freedom is left: the constraints hold every coordinate"
+    for name, count in numbers["redundant"].items():
+        yield (
+            f"of constraint {name!r} {count} of the rows follow from those before: the motion is unique, λ is the one of least norm; "
+            "leave these rows out where each reaction matters"
+        )
+    tolerance = float(jnp.finfo(dtype).eps) ** 0.5
+    for what, off in (("position", numbers["off_position"]), ("velocity", numbers["off_velocity"])):
+        for name, value in off.items():
+            if value > tolerance:
+                yield f"the {what} is off constraint {name!r} by {value:.2g}: `consistent_state` corrects it, `simulate` does so by itself"
+    for name, least in numbers["dissipated"].items():
+        if least < 0:
+            yield (
+                f"dissipation {name!r} adds energy near this state (q̇·∂D/∂q̇ = {least:.2g}): "
+                "right for wind or a moving belt, otherwise check its sign"
+            )
+    fastest, slowest = numbers["time_constants"]
+    if np.isfinite(slowest) and slowest > 1e4 * fastest:
+        yield f"the motion is stiff (time constants from {fastest:.2g} to {slowest:.2g}): use `solver=diffrax.Kvaerno5()`"
+    if jnp.finfo(dtype).bits < 64:
+        yield 'single precision: `jax.config.update("jax_enable_x64", True)` gives twice as many digits'
