@@ -20,79 +20,48 @@ import jax.numpy as jnp
 import numpy as np
 
 import jaxlag as jl
+from jaxlag import rigid
 
 COORDINATES = ("x", "y", "z", "yaw", "roll", "pitch", "steer", "rear", "front")
-X, Y, Z = ONE = np.eye(3)
-CROSS = np.cross(ONE[:, None], ONE).transpose(2, 1, 0)  # CROSS @ a is the matrix [a]× of the cross product a × …
+AXLE = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])  # axes of a wheel, the third to the right
+ROAD = rigid.frame(axes=np.diag([1.0, -1, -1]))  # z = 0, the third axis up
 
 
-def rotation(axis, angle):
-    """Rodrigues' formula: 1 + sin α [a]× + (1 − cos α) [a]×²."""
-    K = CROSS @ axis
-    return ONE + jnp.sin(angle) * K + (1 - jnp.cos(angle)) * (K @ K)
-
-
-def parts(q, params):
-    """Frames R_B and R_H, and the centres of mass of the rear wheel, the rear frame, the front frame and the front wheel."""
-    p = params
-    R_B = rotation(Z, q["yaw"]) @ rotation(X, q["roll"]) @ rotation(Y, q["pitch"])
-    R_H = R_B @ rotation(jnp.sin(p["lambda_"]) * X + jnp.cos(p["lambda_"]) * Z, q["steer"])
-    R = q["x"] * X + q["y"] * Y + q["z"] * Z
-    B = R + R_B @ (p["x_B"] * X + (p["z_B"] + p["r_R"]) * Z)
-    hinge = R + R_B @ ((p["w"] + p["c"]) * X + p["r_R"] * Z)  # where the steering axis would meet the ground
-    H = hinge + R_H @ ((p["x_H"] - p["w"] - p["c"]) * X + p["z_H"] * Z)
-    F = hinge - R_H @ (p["c"] * X + p["r_F"] * Z)
-    return (R_B, R_H), (R, B, H, F)
-
-
-def angular_velocity(R, Rdot):
-    """ω in the axes of the frame R: [ω]× = Rᵀ Ṙ."""
-    return 0.5 * jnp.einsum("ijk,ij", CROSS, R.T @ Rdot)
-
-
-def lagrangian(q, qdot, params):
-    """T − V of the four parts; the inertia of a wheel in the axes of its frame stays the same as it turns."""
-    p, (frames, centres), (rates, velocities) = params, parts(q, params), jl.rate(parts)(0.0, q, qdot, params)
-    w_B, w_H = map(angular_velocity, frames, rates)
-    spins = w_B + qdot["rear"] * Y, w_B, w_H, w_H + qdot["front"] * Y
-    L = 0.0
-    for part, x, v, w in zip("RBHF", centres, velocities, spins, strict=True):
-        m, I = p[f"m_{part}"], inertia(part, p)
-        L += 0.5 * m * v @ v + 0.5 * w @ I @ w + m * p["g"] * x @ Z
-    return L
+def bodies(q, p):
+    """Frames at the centres of mass: of the rear wheel, the rear frame, the front frame, the front wheel."""
+    rear = rigid.frame([q["x"], q["y"], q["z"]], rigid.euler("zxy")([q["yaw"], q["roll"], q["pitch"]]))
+    tilt = rigid.rotation_y(p["lambda_"])
+    front = rear.on([p["w"] + p["c"], 0.0, p["r_R"]], tilt @ rigid.rotation_z(q["steer"]) @ tilt.T)
+    return {
+        "R": rear.on(axes=AXLE).on(axes=rigid.rotation_z(q["rear"])),
+        "B": rear.on([p["x_B"], 0.0, p["z_B"] + p["r_R"]]),
+        "H": front.on([p["x_H"] - p["w"] - p["c"], 0.0, p["z_H"]]),
+        "F": front.on([-p["c"], 0.0, -p["r_F"]], AXLE).on(axes=rigid.rotation_z(q["front"])),
+    }
 
 
 def inertia(part, p):
-    """Moments of inertia about the centre of mass; a wheel has I_zz = I_xx and I_xz = 0."""
-    I = lambda axes, otherwise: p.get(f"I_{part}{axes}", otherwise)
-    xx, xz = I("xx", None), I("xz", 0.0)
-    return xx * np.outer(X, X) + I("yy", None) * np.outer(Y, Y) + I("zz", xx) * np.outer(Z, Z) + xz * (np.outer(X, Z) + np.outer(Z, X))
+    """Moments of inertia about the centre of mass."""
+    if part in "RF":
+        return jnp.stack([p[f"I_{part}{axes}"] for axes in ("xx", "xx", "yy")])
+    xx, yy, zz, xz = (p[f"I_{part}{axes}"] for axes in ("xx", "yy", "zz", "xz"))
+    return jnp.array([[xx, 0.0, xz], [0.0, yy, 0.0], [xz, 0.0, zz]])
 
 
-def wheels(q, params):
-    """Of both wheels, the centre, the frame, and ρ from the centre to the lowest point."""
-    (R_B, R_H), (R, _, _, F) = parts(q, params)
-    for x, frame, r in ((R, R_B, params["r_R"]), (F, R_H, params["r_F"])):
-        n = frame @ Y
-        across = Z - (n @ Z) * n
-        yield x, frame, r * across / jnp.sqrt(across @ across)
+def lagrangian(q, qdot, params):
+    m, Theta = ({part: of(part) for part in "RBHF"} for of in (lambda part: params[f"m_{part}"], lambda part: inertia(part, params)))
+    T = rigid.kinetic_energy(m, Theta, lambda q: bodies(q, params))(q, qdot)
+    return T + params["g"] * sum(m[part] * frame.origin[2] for part, frame in bodies(q, params).items())
 
 
 def contacts(q, params):
-    """Heights of the lowest points of the wheels below the ground, g."""
-    (R, _, rear), (F, _, front) = wheels(q, params)
-    return {"rear": Z @ (R + rear), "front": Z @ (F + front)}
+    at = bodies(q, params)
+    return {name: rigid.wheel_height(at[part], params[f"r_{part}"], ROAD) for name, part in (("rear", "R"), ("front", "F"))}
 
 
 def slip(q, qdot, params):
-    """Velocities along the ground of the material points that touch it, a."""
-    rates, (R, _, _, F) = jl.rate(parts)(0.0, q, qdot, params)
-    along = {}
-    names = zip(("rear", "front"), wheels(q, params), rates, (R, F), strict=True)
-    for name, (_, frame, down), rate, v in names:
-        w = frame @ (angular_velocity(frame, rate) + qdot[name] * Y)
-        along[name] = ONE[:2] @ (v + (CROSS @ w) @ down)
-    return along
+    wheel = lambda part: rigid.rolling(lambda q: bodies(q, params)[part], params[f"r_{part}"], ROAD)(q, qdot)
+    return {"rear": wheel("R"), "front": wheel("F")}
 
 
 system = jl.System(lagrangian, holonomic={"contact": contacts}, nonholonomic={"rolling": slip})
