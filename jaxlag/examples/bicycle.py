@@ -1,15 +1,11 @@
 """The Whipple bicycle: two frames that a steering hinge joins, on two thin wheels that roll without slip.
 
 x forward, y to the right, z down; the centre (x, y, z) of the rear wheel, yaw, roll and pitch of the rear frame, the steering angle and
-the rotations of the wheels are nine coordinates. With the rotation matrices of the rear frame (B and the rider) and the front frame (H)
+the rotations of the wheels are nine coordinates. `bodies` gives the frames of the four parts as functions of these; `rigid` makes of them
 
-    R_B = R_z(yaw) R_x(roll) R_y(pitch),   R_H = R_B R_y(λ) R_z(steer) R_y(−λ),   ω = (Rᵀ Ṙ)^∨
+    T = Σ ½m ẋ·ẋ + ½ω·Iω,   g = h − r √(1 − (n·e)²),   a = ẋ + ω × ρ along the road,   ρ = −r (n − (n·e) e)/√(1 − (n·e)²)
 
-each part has T = ½m ẋ·ẋ + ½ω·Iω and V = −m g z. A wheel with its centre at x_W and its axle n touches the ground with its lowest point,
-
-    g = z_W + r √(1 − n_z²),   a = ẋ_W + ω_W × ρ in x and y,   ρ = r (e_z − n_z n)/√(1 − n_z²)
-
-which makes two holonomic and four nonholonomic constraints. Nothing is linearised here.
+with n, the normal of the road, and e, the axle of a wheel: two holonomic and four nonholonomic constraints. Nothing is linearised here.
 
 The parameters have the names and the values of the benchmark of Meijaard, Papadopoulos, Ruina & Schwab, Linearized dynamics equations for
 the balance and steer of a bicycle: a benchmark and review, Proc. R. Soc. A 463 (2007) 1955-1982, table 1. Positions and moments of inertia
@@ -23,15 +19,15 @@ import jaxlag as jl
 from jaxlag import rigid
 
 COORDINATES = ("x", "y", "z", "yaw", "roll", "pitch", "steer", "rear", "front")
-AXLE = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])  # axes of a wheel, the third to the right
-ROAD = rigid.frame(axes=np.diag([1.0, -1, -1]))  # z = 0, the third axis up
+AXLE = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])  # axes of a wheel: the third, its axle, to the right
+UP = np.diag([1.0, -1.0, -1.0])  # axes of the road: the third up
 
 
 def bodies(q, p):
-    """Frames at the centres of mass: of the rear wheel, the rear frame, the front frame, the front wheel."""
+    """Frames at the centres of mass: of the rear wheel, the rear frame with the rider, the front frame, the front wheel."""
     rear = rigid.frame([q["x"], q["y"], q["z"]], rigid.euler("zxy")([q["yaw"], q["roll"], q["pitch"]]))
-    tilt = rigid.rotation_y(p["lambda_"])
-    front = rear.on([p["w"] + p["c"], 0.0, p["r_R"]], tilt @ rigid.rotation_z(q["steer"]) @ tilt.T)
+    hinge = [jnp.sin(p["lambda_"]), 0.0, jnp.cos(p["lambda_"])]
+    front = rear.on([p["w"] + p["c"], 0.0, p["r_R"]], rigid.rotation(hinge, q["steer"]))
     return {
         "R": rear.on(axes=AXLE).on(axes=rigid.rotation_z(q["rear"])),
         "B": rear.on([p["x_B"], 0.0, p["z_B"] + p["r_R"]]),
@@ -40,28 +36,29 @@ def bodies(q, p):
     }
 
 
-def inertia(part, p):
-    """Moments of inertia about the centre of mass."""
-    if part in "RF":
-        return jnp.stack([p[f"I_{part}{axes}"] for axes in ("xx", "xx", "yy")])
-    xx, yy, zz, xz = (p[f"I_{part}{axes}"] for axes in ("xx", "yy", "zz", "xz"))
-    return jnp.array([[xx, 0.0, xz], [0.0, yy, 0.0], [xz, 0.0, zz]])
+def inertias(p):
+    """Moments of inertia about the centres of mass: of a wheel about two diameters and its axle."""
+    I = lambda part: jnp.array([[p[f"I_{part}xx"], 0, p[f"I_{part}xz"]], [0, p[f"I_{part}yy"], 0], [p[f"I_{part}xz"], 0, p[f"I_{part}zz"]]])
+    wheel = lambda part: [p[f"I_{part}xx"], p[f"I_{part}xx"], p[f"I_{part}yy"]]
+    return {"R": wheel("R"), "B": I("B"), "H": I("H"), "F": wheel("F")}
 
 
 def lagrangian(q, qdot, params):
-    m, Theta = ({part: of(part) for part in "RBHF"} for of in (lambda part: params[f"m_{part}"], lambda part: inertia(part, params)))
-    T = rigid.kinetic_energy(m, Theta, lambda q: bodies(q, params))(q, qdot)
-    return T + params["g"] * sum(m[part] * frame.origin[2] for part, frame in bodies(q, params).items())
+    m = {part: params[f"m_{part}"] for part in "RBHF"}
+    T = rigid.kinetic_energy(m, inertias(params), lambda q: bodies(q, params))(q, qdot)
+    return T + params["g"] * sum(m[part] * body.origin[2] for part, body in bodies(q, params).items())
 
 
 def contacts(q, params):
-    at = bodies(q, params)
-    return {name: rigid.wheel_height(at[part], params[f"r_{part}"], ROAD) for name, part in (("rear", "R"), ("front", "F"))}
+    """Heights of the wheels over the road, g."""
+    at, road = bodies(q, params), rigid.frame(axes=UP)
+    return {"rear": rigid.wheel_height(at["R"], params["r_R"], road), "front": rigid.wheel_height(at["F"], params["r_F"], road)}
 
 
 def slip(q, qdot, params):
-    wheel = lambda part: rigid.rolling(lambda q: bodies(q, params)[part], params[f"r_{part}"], ROAD)(q, qdot)
-    return {"rear": wheel("R"), "front": wheel("F")}
+    """Velocities along the road of the points of the wheels that touch it, a."""
+    wheel = lambda part: rigid.rolling(lambda q: bodies(q, params)[part], params[f"r_{part}"], rigid.frame(axes=UP))
+    return {"rear": wheel("R")(q, qdot), "front": wheel("F")(q, qdot)}
 
 
 system = jl.System(lagrangian, holonomic={"contact": contacts}, nonholonomic={"rolling": slip})

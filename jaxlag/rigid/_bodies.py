@@ -6,11 +6,12 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from ._frames import Frame
-from ._rates import body_rate, body_rates
-from ._vectors import floating, vector
+from ._rates import body_rate, rates
+from ._vectors import floating, known, vector
 from .inertia import check_inertia
 
 
@@ -80,6 +81,8 @@ def kinetic_energy(m: Any, Theta: Any, position: Callable, rotation: Callable | 
     """
     several = isinstance(m, (Mapping, list, tuple))
     masses, inertias = _as_dict(m) if several else {0: m}, _same_bodies(Theta, m, "Theta") if several else {0: Theta}
+    spins = [_axis_of_revolution(Theta) for Theta in inertias.values()]
+    in_axes = [lambda of, R, axis=axis: of.body(R) if axis is None else of.unspun(R, axis) for axis in spins]
     inertias = {name: check_inertia(Theta, f"`Theta[{name!r}]`" if several else "`Theta`") for name, Theta in inertias.items()}
 
     def bodies(q: Any) -> list[tuple[Array, Array]]:
@@ -89,11 +92,20 @@ def kinetic_energy(m: Any, Theta: Any, position: Callable, rotation: Callable | 
         return [_checked(frames[name]) for name in masses]
 
     def energy(q: Any, qdot: Any) -> Float[Array, ""]:
-        parts = zip(masses.values(), inertias.values(), body_rates(bodies, q, qdot), strict=True)
+        parts = zip(masses.values(), inertias.values(), rates(bodies, q, qdot, *in_axes), strict=True)
         T = [0.5 * m * (v @ v) + 0.5 * w @ (Theta @ w if Theta.ndim == 2 else Theta * w) for m, Theta, (v, w) in parts]
         return functools.reduce(jnp.add, T)
 
     return energy
+
+
+def _axis_of_revolution(Theta: Any) -> int | None:
+    """The axis about which all directions are alike: the moments about the other two are one and the same number."""
+    seen = known(Theta)
+    if seen is None and not isinstance(Theta, (list, tuple)) or len(Theta) != 3 or np.ndim(Theta[0]):
+        return None
+    same = (lambda i, j: seen[i] == seen[j]) if seen is not None else (lambda i, j: Theta[i] is Theta[j])
+    return next((axis for axis in (2, 1, 0) if same((axis + 1) % 3, (axis + 2) % 3)), None)
 
 
 def _as_dict(bodies: Any) -> dict:
@@ -107,7 +119,9 @@ def _same_bodies(given: Any, m: Any, name: str) -> dict:
     one_for_all = isinstance(given, Frame) or not isinstance(given, (Mapping, list, tuple))
     if one_for_all or set(_as_dict(given)) != set(names):
         found = "is one" if one_for_all else f"has {', '.join(map(repr, _as_dict(given)))}"
-        raise ValueError(f"`{name}` must have an entry for each of {', '.join(map(repr, names))}, as `m` has, but {found}. Name the same bodies.")
+        raise ValueError(
+            f"`{name}` must have an entry for each of {', '.join(map(repr, names))}, as `m` has, but {found}. Name the same bodies."
+        )
     return _as_dict(given)
 
 
