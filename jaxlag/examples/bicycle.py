@@ -44,6 +44,7 @@ def inertias(p):
 
 
 def lagrangian(q, qdot, params):
+    """T − V of the four parts."""
     m = {part: params[f"m_{part}"] for part in "RBHF"}
     T = rigid.kinetic_energy(m, inertias(params), lambda q: bodies(q, params))(q, qdot)
     return T + params["g"] * sum(m[part] * body.origin[2] for part, body in bodies(q, params).items())

@@ -102,7 +102,7 @@ def kinetic_energy(m: Any, Theta: Any, position: Callable, rotation: Callable | 
 def _axis_of_revolution(Theta: Any) -> int | None:
     """The axis about which all directions are alike: the moments about the other two are one and the same number."""
     seen = known(Theta)
-    if seen is None and not isinstance(Theta, (list, tuple)) or len(Theta) != 3 or np.ndim(Theta[0]):
+    if (seen is None and not isinstance(Theta, (list, tuple))) or len(Theta) != 3 or np.ndim(Theta[0]):
         return None
     same = (lambda i, j: seen[i] == seen[j]) if seen is not None else (lambda i, j: Theta[i] is Theta[j])
     return next((axis for axis in (2, 1, 0) if same((axis + 1) % 3, (axis + 2) % 3)), None)
