@@ -61,7 +61,9 @@ def kinetic_energy(m: Any, Theta: Any, position: Callable, rotation: Callable | 
       `Frame` at the centre of mass; or a dict or a sequence of them, of several bodies of which one carries another: then `m` and
       `Theta` are dicts or sequences as well.
 
-    **Returns:** a function of (q, qdot), to be added to a Lagrangian. Any consistent units.
+    **Returns:** a function of (q, qdot), to be added to a Lagrangian. Any consistent units. Where two of three moments are one and the same
+    number, as of a wheel, how far it has turned about the third axis drops out of T, if R ends with that rotation: `[A, A, C]` and
+    `… @ rigid.rotation_z(spin)`.
 
     **Raises:** `ValueError` where the inertia is that of no body, R is no rotation (as far as their numbers are known), or masses,
     inertias and frames are not those of the same bodies.
