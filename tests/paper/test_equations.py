@@ -338,7 +338,11 @@ NOTEBOOK_SYSTEMS = {  # by notebook and name: its coordinates
 RECORDED = {"11_driven_pendulum.pendulum"}  # driven by a recorded `Signal`, which has no formula
 WITH_CONTACTS = {f"15_bouncing_rocking_pecking.{name}" for name in ("ball", "block", "woodpecker")}  # `test_contact_equations`
 FROM_EXAMPLES = {"13_bicycle"}  # defines no system of its own
-SOLVED_BY_NUMBERS = {"05_closed_loops.four_bar", "05_closed_loops.platform"}  # for their formulas one would wait for minutes
+SOLVED_BY_NUMBERS = {
+    "05_closed_loops.four_bar",
+    "05_closed_loops.platform",
+    "17_gyroscope.racket",
+}  # for their formulas one would wait for minutes
 
 
 def code_of(notebook):
