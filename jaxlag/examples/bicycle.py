@@ -1,15 +1,11 @@
 """The Whipple bicycle: two frames that a steering hinge joins, on two thin wheels that roll without slip.
 
 x forward, y to the right, z down; the centre (x, y, z) of the rear wheel, yaw, roll and pitch of the rear frame, the steering angle and
-the rotations of the wheels are nine coordinates. With the rotation matrices of the rear frame (B and the rider) and the front frame (H)
+the rotations of the wheels are nine coordinates. `bodies` gives the frames of the four parts as functions of these; `rigid` makes of them
 
-    R_B = R_z(yaw) R_x(roll) R_y(pitch),   R_H = R_B R_y(λ) R_z(steer) R_y(−λ),   ω = (Rᵀ Ṙ)^∨
+    T = Σ ½m ẋ·ẋ + ½ω·Iω,   g = h − r √(1 − (n·e)²),   a = ẋ + ω × ρ along the road,   ρ = −r (n − (n·e) e)/√(1 − (n·e)²)
 
-each part has T = ½m ẋ·ẋ + ½ω·Iω and V = −m g z. A wheel with its centre at x_W and its axle n touches the ground with its lowest point,
-
-    g = z_W + r √(1 − n_z²),   a = ẋ_W + ω_W × ρ in x and y,   ρ = r (e_z − n_z n)/√(1 − n_z²)
-
-which makes two holonomic and four nonholonomic constraints. Nothing is linearised here.
+with n, the normal of the road, and e, the axle of a wheel: two holonomic and four nonholonomic constraints. Nothing is linearised here.
 
 The parameters have the names and the values of the benchmark of Meijaard, Papadopoulos, Ruina & Schwab, Linearized dynamics equations for
 the balance and steer of a bicycle: a benchmark and review, Proc. R. Soc. A 463 (2007) 1955-1982, table 1. Positions and moments of inertia
@@ -20,79 +16,50 @@ import jax.numpy as jnp
 import numpy as np
 
 import jaxlag as jl
+from jaxlag import rigid
 
 COORDINATES = ("x", "y", "z", "yaw", "roll", "pitch", "steer", "rear", "front")
-X, Y, Z = ONE = np.eye(3)
-CROSS = np.cross(ONE[:, None], ONE).transpose(2, 1, 0)  # CROSS @ a is the matrix [a]× of the cross product a × …
+AXLE = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])  # axes of a wheel: the third, its axle, to the right
+UP = np.diag([1.0, -1.0, -1.0])  # axes of the road: the third up
 
 
-def rotation(axis, angle):
-    """Rodrigues' formula: 1 + sin α [a]× + (1 − cos α) [a]×²."""
-    K = CROSS @ axis
-    return ONE + jnp.sin(angle) * K + (1 - jnp.cos(angle)) * (K @ K)
+def bodies(q, p):
+    """Frames at the centres of mass: of the rear wheel, the rear frame with the rider, the front frame, the front wheel."""
+    rear = rigid.frame([q["x"], q["y"], q["z"]], rigid.euler("zxy")([q["yaw"], q["roll"], q["pitch"]]))
+    hinge = [jnp.sin(p["lambda_"]), 0.0, jnp.cos(p["lambda_"])]
+    front = rear.on([p["w"] + p["c"], 0.0, p["r_R"]], rigid.rotation(hinge, q["steer"]))
+    return {
+        "R": rear.on(axes=AXLE).on(axes=rigid.rotation_z(q["rear"])),
+        "B": rear.on([p["x_B"], 0.0, p["z_B"] + p["r_R"]]),
+        "H": front.on([p["x_H"] - p["w"] - p["c"], 0.0, p["z_H"]]),
+        "F": front.on([-p["c"], 0.0, -p["r_F"]], AXLE).on(axes=rigid.rotation_z(q["front"])),
+    }
 
 
-def parts(q, params):
-    """Frames R_B and R_H, and the centres of mass of the rear wheel, the rear frame, the front frame and the front wheel."""
-    p = params
-    R_B = rotation(Z, q["yaw"]) @ rotation(X, q["roll"]) @ rotation(Y, q["pitch"])
-    R_H = R_B @ rotation(jnp.sin(p["lambda_"]) * X + jnp.cos(p["lambda_"]) * Z, q["steer"])
-    R = q["x"] * X + q["y"] * Y + q["z"] * Z
-    B = R + R_B @ (p["x_B"] * X + (p["z_B"] + p["r_R"]) * Z)
-    hinge = R + R_B @ ((p["w"] + p["c"]) * X + p["r_R"] * Z)  # where the steering axis would meet the ground
-    H = hinge + R_H @ ((p["x_H"] - p["w"] - p["c"]) * X + p["z_H"] * Z)
-    F = hinge - R_H @ (p["c"] * X + p["r_F"] * Z)
-    return (R_B, R_H), (R, B, H, F)
-
-
-def angular_velocity(R, Rdot):
-    """ω in the axes of the frame R: [ω]× = Rᵀ Ṙ."""
-    return 0.5 * jnp.einsum("ijk,ij", CROSS, R.T @ Rdot)
+def inertias(p):
+    """Moments of inertia about the centres of mass: of a wheel about two diameters and its axle."""
+    I = lambda part: jnp.array([[p[f"I_{part}xx"], 0, p[f"I_{part}xz"]], [0, p[f"I_{part}yy"], 0], [p[f"I_{part}xz"], 0, p[f"I_{part}zz"]]])
+    wheel = lambda part: [p[f"I_{part}xx"], p[f"I_{part}xx"], p[f"I_{part}yy"]]
+    return {"R": wheel("R"), "B": I("B"), "H": I("H"), "F": wheel("F")}
 
 
 def lagrangian(q, qdot, params):
-    """T − V of the four parts; the inertia of a wheel in the axes of its frame stays the same as it turns."""
-    p, (frames, centres), (rates, velocities) = params, parts(q, params), jl.rate(parts)(0.0, q, qdot, params)
-    w_B, w_H = map(angular_velocity, frames, rates)
-    spins = w_B + qdot["rear"] * Y, w_B, w_H, w_H + qdot["front"] * Y
-    L = 0.0
-    for part, x, v, w in zip("RBHF", centres, velocities, spins, strict=True):
-        m, I = p[f"m_{part}"], inertia(part, p)
-        L += 0.5 * m * v @ v + 0.5 * w @ I @ w + m * p["g"] * x @ Z
-    return L
-
-
-def inertia(part, p):
-    """Moments of inertia about the centre of mass; a wheel has I_zz = I_xx and I_xz = 0."""
-    I = lambda axes, otherwise: p.get(f"I_{part}{axes}", otherwise)
-    xx, xz = I("xx", None), I("xz", 0.0)
-    return xx * np.outer(X, X) + I("yy", None) * np.outer(Y, Y) + I("zz", xx) * np.outer(Z, Z) + xz * (np.outer(X, Z) + np.outer(Z, X))
-
-
-def wheels(q, params):
-    """Of both wheels, the centre, the frame, and ρ from the centre to the lowest point."""
-    (R_B, R_H), (R, _, _, F) = parts(q, params)
-    for x, frame, r in ((R, R_B, params["r_R"]), (F, R_H, params["r_F"])):
-        n = frame @ Y
-        across = Z - (n @ Z) * n
-        yield x, frame, r * across / jnp.sqrt(across @ across)
+    """T − V of the four parts."""
+    m = {part: params[f"m_{part}"] for part in "RBHF"}
+    T = rigid.kinetic_energy(m, inertias(params), lambda q: bodies(q, params))(q, qdot)
+    return T + params["g"] * sum(m[part] * body.origin[2] for part, body in bodies(q, params).items())
 
 
 def contacts(q, params):
-    """Heights of the lowest points of the wheels below the ground, g."""
-    (R, _, rear), (F, _, front) = wheels(q, params)
-    return {"rear": Z @ (R + rear), "front": Z @ (F + front)}
+    """Heights of the wheels over the road, g."""
+    at, road = bodies(q, params), rigid.frame(axes=UP)
+    return {"rear": rigid.wheel_height(at["R"], params["r_R"], road), "front": rigid.wheel_height(at["F"], params["r_F"], road)}
 
 
 def slip(q, qdot, params):
-    """Velocities along the ground of the material points that touch it, a."""
-    rates, (R, _, _, F) = jl.rate(parts)(0.0, q, qdot, params)
-    along = {}
-    names = zip(("rear", "front"), wheels(q, params), rates, (R, F), strict=True)
-    for name, (_, frame, down), rate, v in names:
-        w = frame @ (angular_velocity(frame, rate) + qdot[name] * Y)
-        along[name] = ONE[:2] @ (v + (CROSS @ w) @ down)
-    return along
+    """Velocities along the road of the points of the wheels that touch it, a."""
+    wheel = lambda part: rigid.rolling(lambda q: bodies(q, params)[part], params[f"r_{part}"], rigid.frame(axes=UP))
+    return {"rear": wheel("R")(q, qdot), "front": wheel("F")(q, qdot)}
 
 
 system = jl.System(lagrangian, holonomic={"contact": contacts}, nonholonomic={"rolling": slip})

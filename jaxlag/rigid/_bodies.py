@@ -1,13 +1,17 @@
 """The motion of rigid bodies, from their position and rotation as functions of q alone."""
 
-from collections.abc import Callable
+import functools
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import jax
+import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
-from ._rates import body_rate
-from ._vectors import floating, moving, vector
+from ._frames import Frame
+from ._rates import body_rate, rates
+from ._vectors import floating, known, vector
 from .inertia import check_inertia
 
 
@@ -42,8 +46,8 @@ def angular_velocity(rotation: Callable, axes: str = "body") -> Callable:
     return velocity
 
 
-def kinetic_energy(m: Any, Theta: Any, position: Callable, rotation: Callable) -> Callable:
-    r"""Kinetic energy of a rigid body.
+def kinetic_energy(m: Any, Theta: Any, position: Callable, rotation: Callable | None = None) -> Callable:
+    r"""Kinetic energy of a rigid body, or of several.
 
     $$ T = \tfrac12 m\,\dot x\cdot\dot x + \tfrac12\,\omega\cdot\Theta\,\omega $$
 
@@ -53,11 +57,16 @@ def kinetic_energy(m: Any, Theta: Any, position: Callable, rotation: Callable) -
     - `Theta`: Θ, its inertia about the centre of mass in the axes of the body, (3, 3), or (3,) about principal axes; `rigid.inertia` has
       those of many bodies.
     - `position`: x(q), the centre of mass, (3,).
-    - `rotation`: R(q), which turns components in the axes of the body into those in space.
+    - `rotation`: R(q), which turns components in the axes of the body into those in space. Without it, `position` gives both, as a
+      `Frame` at the centre of mass; or a dict or a sequence of them, of several bodies of which one carries another: then `m` and
+      `Theta` are dicts or sequences as well.
 
-    **Returns:** a function of (q, qdot), to be added to a Lagrangian. Any consistent units.
+    **Returns:** a function of (q, qdot), to be added to a Lagrangian. Any consistent units. Where two of three moments are one and the same
+    number, as of a wheel, how far it has turned about the third axis drops out of T, if R ends with that rotation: `[A, A, C]` and
+    `… @ rigid.rotation_z(spin)`.
 
-    **Raises:** `ValueError` where the inertia is that of no body, or R is no rotation (as far as their numbers are known).
+    **Raises:** `ValueError` where the inertia is that of no body, R is no rotation (as far as their numbers are known), or masses,
+    inertias and frames are not those of the same bodies.
 
     **Source:** Goldstein, Classical Mechanics, 3rd ed., eqs. 5.1 and 5.19 (König's theorem).
 
@@ -72,12 +81,57 @@ def kinetic_energy(m: Any, Theta: Any, position: Callable, rotation: Callable) -
     stone = jl.System(lagrangian, holonomic={"unit": lambda q: rigid.unit(q["p"])})
     ```
     """
-    Theta = check_inertia(Theta, "`Theta`")
-    omega = angular_velocity(rotation)
+    several = isinstance(m, (Mapping, list, tuple))
+    masses, inertias = _as_dict(m) if several else {0: m}, _same_bodies(Theta, m, "Theta") if several else {0: Theta}
+    spins = [_axis_of_revolution(Theta) for Theta in inertias.values()]
+    in_axes = [lambda of, R, axis=axis: of.body(R) if axis is None else of.unspun(R, axis) for axis in spins]
+    inertias = {name: check_inertia(Theta, f"`Theta[{name!r}]`" if several else "`Theta`") for name, Theta in inertias.items()}
+
+    def bodies(q: Any) -> list[tuple[Array, Array]]:
+        if rotation is not None:
+            return [(vector(position(q), "position"), rotation(q))]
+        frames = _same_bodies(position(q), m, "position") if several else {0: position(q)}
+        return [_checked(frames[name]) for name in masses]
 
     def energy(q: Any, qdot: Any) -> Float[Array, ""]:
-        _, v = moving(lambda q: vector(position(q), "position"), q, qdot)
-        w = omega(q, qdot)
-        return 0.5 * m * (v @ v) + 0.5 * w @ (Theta @ w if Theta.ndim == 2 else Theta * w)
+        parts = zip(masses.values(), inertias.values(), rates(bodies, q, qdot, *in_axes), strict=True)
+        T = [0.5 * m * (v @ v) + 0.5 * w @ (Theta @ w if Theta.ndim == 2 else Theta * w) for m, Theta, (v, w) in parts]
+        return functools.reduce(jnp.add, T)
 
     return energy
+
+
+def _axis_of_revolution(Theta: Any) -> int | None:
+    """The axis about which all directions are alike: the moments about the other two are one and the same number."""
+    seen = known(Theta)
+    if (seen is None and not isinstance(Theta, (list, tuple))) or len(Theta) != 3 or np.ndim(Theta[0]):
+        return None
+    same = (lambda i, j: seen[i] == seen[j]) if seen is not None else (lambda i, j: Theta[i] is Theta[j])
+    return next((axis for axis in (2, 1, 0) if same((axis + 1) % 3, (axis + 2) % 3)), None)
+
+
+def _as_dict(bodies: Any) -> dict:
+    """What is given for several bodies, by name or number."""
+    return dict(bodies) if isinstance(bodies, Mapping) else dict(enumerate(bodies))
+
+
+def _same_bodies(given: Any, m: Any, name: str) -> dict:
+    """What is given for several bodies, if they are those that have a mass."""
+    names = list(_as_dict(m))
+    one_for_all = isinstance(given, Frame) or not isinstance(given, (Mapping, list, tuple))
+    if one_for_all or set(_as_dict(given)) != set(names):
+        found = "is one" if one_for_all else f"has {', '.join(map(repr, _as_dict(given)))}"
+        raise ValueError(
+            f"`{name}` must have an entry for each of {', '.join(map(repr, names))}, as `m` has, but {found}. Name the same bodies."
+        )
+    return _as_dict(given)
+
+
+def _checked(frame: Any) -> tuple[Array, Array]:
+    """The place and the axes of a frame."""
+    if not isinstance(frame, Frame):
+        raise ValueError(
+            f"`position` must return a `Frame` where no `rotation` is given, but returned {type(frame).__name__}. Give `rotation`, "
+            "or return `rigid.frame(place, axes)`."
+        )
+    return vector(frame.origin, "origin"), frame.axes

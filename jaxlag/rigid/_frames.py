@@ -25,9 +25,11 @@ class Frame(NamedTuple):
         """A vector with the components `d` in these axes."""
         return self.axes @ vector(d, "d")
 
-    def on(self, origin: Any = (0.0, 0.0, 0.0), axes: Any = None) -> "Frame":
-        """A frame fixed to this one: a joint on a body. `origin` and `axes` are given in the axes of this frame; by default these axes."""
-        return Frame(self.point(origin), self.axes if axes is None else self.axes @ check_rotation(axes, "`axes`"))
+    def on(self, origin: Any = None, axes: Any = None) -> "Frame":
+        """A frame on this one: a joint on a body. `origin` and `axes` are given in the axes of this frame; by default they are its own."""
+        return Frame(
+            self.origin if origin is None else self.point(origin), self.axes if axes is None else self.axes @ check_rotation(axes, "`axes`")
+        )
 
 
 def frame(origin: Any = (0.0, 0.0, 0.0), axes: Any = None) -> Frame:

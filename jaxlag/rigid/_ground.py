@@ -8,7 +8,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from ._frames import Frame, frame
-from ._vectors import moving, vector
+from ._rates import AngularVelocities, rates
+from ._vectors import vector
 
 
 def on_plane(point: Any, plane: Frame) -> Float[Array, ""]:
@@ -66,7 +67,7 @@ def wheel_height(wheel: Frame, radius: Any, plane: Frame | None = None) -> Float
     ```
     """
     plane = frame() if plane is None else plane
-    return on_plane(wheel.origin, plane) - radius * _slope(wheel, plane)
+    return on_plane(wheel.origin, plane) - radius * _slope(wheel.axes[:, 2], plane)
 
 
 def rolling(wheel: Callable, radius: Any, plane: Frame | None = None) -> Callable:
@@ -92,11 +93,7 @@ def rolling(wheel: Callable, radius: Any, plane: Frame | None = None) -> Callabl
     """
     ground = frame() if plane is None else plane
 
-    def below(body: Frame) -> Array:
-        n, axle = ground.axes[:, 2], body.axes[:, 2]
-        return -radius * (n - (n @ axle) * axle) / _slope(body, ground)
-
-    return _sliding(wheel, below, ground)
+    return _sliding(wheel, lambda axle: _lowest(axle, radius, ground), ground)
 
 
 def rolling_ball(ball: Callable, radius: Any, plane: Frame | None = None) -> Callable:
@@ -116,20 +113,31 @@ def rolling_ball(ball: Callable, radius: Any, plane: Frame | None = None) -> Cal
     ```
     """
     ground = frame() if plane is None else plane
-    return _sliding(ball, lambda body: -radius * ground.axes[:, 2], ground)
+    return _sliding(ball, lambda axle: -radius * ground.axes[:, 2], ground)
 
 
 def _sliding(body: Callable, below: Callable, plane: Frame) -> Callable:
-    """The velocity of the point of a body that is at `below(frame)` from its origin."""
+    """The velocity of the point of a body that is at `below(its z axis)` from its origin."""
 
     def velocity(q: Any, qdot: Any) -> Float[Array, "2"]:
-        here, rates = moving(body, q, qdot)
-        fixed_to_it = here.axes.T @ below(here)  # as it moves on with the body
-        return plane.axes[:, :2].T @ (rates.origin + rates.axes @ fixed_to_it)
+        ((v, (axes, omega)),) = rates(lambda q: [body(q)], q, qdot, _turning)
+        return plane.axes[:, :2].T @ (v + jnp.cross(omega, below(axes[:, 2])))
 
     return velocity
 
 
-def _slope(wheel: Frame, plane: Frame) -> Float[Array, ""]:
+def _turning(of: AngularVelocities, R: Any) -> Callable:
+    """The axes of a frame, and its angular velocity in space."""
+    axes, omega = of.number(R), of.world(R)
+    return lambda: (axes()[0], omega())
+
+
+def _lowest(axle: Array, radius: Any, plane: Frame) -> Float[Array, "3"]:
+    """From the centre of a thin wheel to its point that is nearest to a plane, ρ."""
+    n = plane.axes[:, 2]
+    return -radius * (n - (n @ axle) * axle) / _slope(axle, plane)
+
+
+def _slope(axle: Array, plane: Frame) -> Float[Array, ""]:
     """The sine of the angle between the axle and the normal of the plane."""
-    return jnp.sqrt(1 - (plane.axes[:, 2] @ wheel.axes[:, 2]) ** 2)
+    return jnp.sqrt(1 - (plane.axes[:, 2] @ axle) ** 2)

@@ -1,5 +1,6 @@
 """The angular velocity of a rotation matrix, from the program that makes it: of a product, factor by factor."""
 
+import functools
 from collections.abc import Callable
 from typing import Any
 
@@ -14,6 +15,7 @@ from ._vectors import check_rotation, floating, known
 
 PRODUCT = (((1,), (0,)), ((), ()))  # the dimensions that A B sums over
 UNCHANGED = ("convert_element_type", "copy", "optimization_barrier")
+ABOUT = tuple(f"jaxlag.rigid._about_{axis}" for axis in "xyz")  # the kit's rotations about one axis
 FORMULAS: dict[str, Callable] = {}  # of the kit's rotations, by names that no other function has
 
 
@@ -29,37 +31,42 @@ def turning(formula: Callable) -> Callable[[Callable], Callable]:
 
 
 def body_rate(rotation: Callable, q: Any, qdot: Any) -> Float[Array, "3"]:
-    r"""Angular velocity, in its own axes, of a body whose rotation matrix is R(q).
+    """Angular velocity, in its own axes, of a body whose rotation matrix is R(q)."""
+    ((_, omega),) = rates(lambda q: [(jnp.zeros(0), rotation(q))], q, qdot, AngularVelocities.body)
+    return omega
+
+
+def rates(frames: Callable, q: Any, qdot: Any, *wanted: Callable) -> list[tuple[Array, Any]]:
+    r"""Velocities of places and angular velocities of axes, of frames that one program makes of q.
 
     $$ \omega_{AB} = B^T \omega_A + \omega_B, \qquad \omega_{A^T} = -A\,\omega_A, \qquad [\omega]_\times = R^T\dot R $$
 
-    The last by differentiating R: of a product as a whole it would make a mass matrix ten times as long.
+    The last by differentiating R: of a product as a whole it would make a mass matrix ten times as long. `wanted` says of each frame
+    what is returned beside the velocity of its place: a method of `AngularVelocities`.
 
     **Source:** Murray, Li & Sastry, A Mathematical Introduction to Robotic Manipulation, proposition 2.15.
     """
-    (leaves, structure), rates = jax.tree.flatten(jax.tree.map(floating, q)), jax.tree.leaves(jax.tree.map(floating, qdot))
-    matrix = lambda *leaves: check_rotation(rotation(jax.tree.unflatten(structure, leaves)), "`rotation` of a body")
+    (leaves, structure), tangents = jax.tree.flatten(jax.tree.map(floating, q)), jax.tree.leaves(jax.tree.map(floating, qdot))
+
+    def program(*leaves: Any) -> list:
+        return [(x, check_rotation(R, "`rotation` of a body")) for x, R in frames(jax.tree.unflatten(structure, leaves))]
+
     if known(leaves) is not None:
-        matrix(*leaves)  # which looks at its numbers
-    factors = _Factors(jax.make_jaxpr(matrix)(*leaves))
-    needed = _Needed()
-    jax.eval_shape(lambda: factors.angular_velocity(factors.whole, needed, needed))
-    numbers = jax.jvp(lambda *leaves: factors.evaluated(needed, leaves), tuple(leaves), tuple(rates))
-    return factors.angular_velocity(factors.whole, *(dict(zip(needed, x, strict=True)) for x in numbers))
-
-
-class _Needed(dict):
-    """Takes down which arrays of a program are asked for."""
-
-    def __missing__(self, variable: Any) -> Array:
-        return self.setdefault(variable, jnp.zeros(variable.aval.shape, variable.aval.dtype))
+        program(*leaves)  # which looks at its numbers
+    factors = _Factors(jax.make_jaxpr(program)(*leaves))
+    places, matrices = factors.closed.jaxpr.outvars[::2], factors.closed.jaxpr.outvars[1::2]
+    of = AngularVelocities(factors)
+    omegas = [axes(of, R) for axes, R in zip(wanted, matrices, strict=True)]
+    found = jax.jvp(lambda *leaves: factors.evaluated([*of.numbers, *places], leaves), tuple(leaves), tuple(tangents))
+    of.numbers.update(zip(of.numbers, zip(*found, strict=True), strict=False))
+    return [(v, omega()) for v, omega in zip(found[1][len(of.numbers) :], omegas, strict=True)]
 
 
 class _Factors:
-    """What a program makes a rotation matrix of."""
+    """What a program makes rotation matrices of."""
 
     def __init__(self, closed: Any):
-        self.closed, (self.whole,) = closed, closed.jaxpr.outvars
+        self.closed = closed
         self.made_by = {variable: equation for equation in closed.jaxpr.eqns for variable in equation.outvars}
         self.constants = dict(zip(closed.jaxpr.constvars, closed.consts, strict=True))
         self.moving = set(closed.jaxpr.invars)
@@ -72,40 +79,15 @@ class _Factors:
         jaxpr, _ = partial_eval.dce_jaxpr(self.closed.jaxpr.replace(outvars=list(variables)), [True] * len(variables), instantiate=True)
         return core.jaxpr_as_fun(core.ClosedJaxpr(jaxpr, self.closed.consts))(*leaves)
 
-    def angular_velocity(self, R: Any, values: Any, rates: Any) -> Float[Array, "3"]:
-        """ω of an array that is a rotation matrix."""
-        if R not in self.moving:  # the unit matrix, made of truth values, has no derivative
-            return jnp.zeros(3, R.aval.dtype)
-        omega = lambda R: self.angular_velocity(R, values, rates)
-        kind, of = self._made(R)
-        if kind in UNCHANGED:
-            return omega(*of)
-        if kind == "transpose":
-            return -values[of[0]] @ omega(*of)
-        if kind == "product" and any(map(self._is_rotation, of)):  # then the other factor is one too
-            A, B = of
-            return values[B].T @ omega(A) + omega(B)
-        if kind in FORMULAS:
-            return FORMULAS[kind](*zip(*(self._number(x, values, rates) for x in of), strict=True))
-        W = values[R].T @ rates[R]
-        return 0.5 * jnp.stack([W[2, 1] - W[1, 2], W[0, 2] - W[2, 0], W[1, 0] - W[0, 1]])
-
-    def _number(self, x: Any, values: Any, rates: Any) -> tuple[Array, Array]:
-        """An array that a rotation is made of, and its rate."""
-        if not isinstance(x, core.Literal):
-            return jnp.asarray(values[x]), jnp.asarray(rates[x])
-        number = jnp.asarray(x.val)
-        return number, jnp.zeros_like(number)
-
-    def _is_rotation(self, R: Any) -> bool:
+    def is_rotation(self, R: Any) -> bool:
         """Whether an array is a rotation matrix for certain."""
         if R in self.constants:
             seen = known(self.constants[R])
             return seen is not None and np.allclose(seen.T @ seen, np.eye(3), rtol=0, atol=1e-6) and bool(np.linalg.det(seen) > 0)
-        kind, of = self._made(R)
-        return kind in FORMULAS or (kind in (*UNCHANGED, "transpose", "product") and all(map(self._is_rotation, of)))
+        kind, of = self.made(R)
+        return kind in FORMULAS or (kind in (*UNCHANGED, "transpose", "product") and all(map(self.is_rotation, of)))
 
-    def _made(self, R: Any) -> tuple[str, list]:
+    def made(self, R: Any) -> tuple[str, list]:
         """By what an array is made, and of which."""
         if R not in self.made_by:
             return "", []
@@ -115,6 +97,84 @@ class _Factors:
             return equation.params["name"], of
         is_product = name == "dot_general" and _tuples(equation.params["dimension_numbers"]) == PRODUCT
         return "product" if is_product and all(x.aval.shape == (3, 3) for x in of) else name, of
+
+
+def _once(formula: Callable) -> Callable:
+    """A method whose value, a function without arguments, is made once for each of its arguments and worked out once."""
+
+    @functools.wraps(formula)
+    def made(self: Any, *given: Any) -> Callable:
+        key = formula.__name__, *given
+        if key not in self.made:
+            self.made[key] = functools.cache(formula(self, *given))
+        return self.made[key]
+
+    return made
+
+
+class AngularVelocities:
+    """Angular velocities of the rotation matrices of a program, as functions without arguments, of the arrays that they ask it for."""
+
+    def __init__(self, factors: _Factors):
+        self.factors = factors
+        self.numbers: dict[Any, Any] = {}  # by variables: what they are, and their rates, once they are known
+        self.made: dict[tuple, Callable] = {}
+
+    def number(self, x: Any) -> Callable[[], tuple[Array, Array]]:
+        """An array that the program makes, and its rate."""
+        if isinstance(x, core.Literal):
+            number = jnp.asarray(x.val)
+            return lambda: (number, jnp.zeros_like(number))
+        self.numbers[x] = None
+        return lambda: self.numbers[x]
+
+    @_once
+    def body(self, R: Any) -> Callable[[], Float[Array, "3"]]:
+        """ω of an array that is a rotation matrix, in the axes that are its columns."""
+        if R not in self.factors.moving:  # the unit matrix, made of truth values, has no derivative
+            return lambda: jnp.zeros(3, R.aval.dtype)
+        kind, of = self.factors.made(R)
+        if kind in UNCHANGED:
+            return self.body(*of)
+        if kind == "transpose":
+            A, omega = self.number(*of), self.body(*of)
+            return lambda: -A()[0] @ omega()
+        if kind == "product" and any(map(self.factors.is_rotation, of)):  # then the other factor is one too
+            (first, second), B = map(self.body, of), self.number(of[1])
+            return lambda: B()[0].T @ first() + second()
+        if kind in FORMULAS:
+            numbers = list(map(self.number, of))
+            return lambda: FORMULAS[kind](*zip(*(x() for x in numbers), strict=True))
+        whole = self.number(R)
+        return lambda: _vector(whole()[0].T @ whole()[1])
+
+    @_once
+    def world(self, R: Any) -> Callable[[], Float[Array, "3"]]:
+        """ω in the axes of space, in which the last rotation about an axis of the body does not show: ω_A + A ω_B."""
+        if R not in self.factors.moving:
+            return self.body(R)
+        kind, of = self.factors.made(R)
+        if kind == "product" and any(map(self.factors.is_rotation, of)):
+            (first, second), A = map(self.world, of), self.number(of[0])
+            return lambda: first() + A()[0] @ second()
+        if kind in ABOUT:
+            return self.body(R)
+        axes, omega = self.number(R), self.body(R)
+        return lambda: axes()[0] @ omega()
+
+    @_once
+    def unspun(self, R: Any, axis: int) -> Callable[[], Float[Array, "3"]]:
+        """ω in the axes before the last rotation, where that is about an axis of the body: ω_A + ω_B. Otherwise in those of the body."""
+        kind, of = self.factors.made(R)
+        if kind == "product" and self.factors.made(of[1])[0] == ABOUT[axis]:
+            first, second = map(self.body, of)
+            return lambda: first() + second()
+        return self.body(R)
+
+
+def _vector(W: Array) -> Float[Array, "3"]:
+    """The vector of a matrix [w]×."""
+    return 0.5 * jnp.stack([W[2, 1] - W[1, 2], W[0, 2] - W[2, 0], W[1, 0] - W[0, 1]])
 
 
 def _tuples(nested: Any) -> Any:

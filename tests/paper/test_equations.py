@@ -331,12 +331,19 @@ NOTEBOOK_SYSTEMS = {  # by notebook and name: its coordinates
     "10_swinging_pendulum.viscous, air, dry": None,
     "12_comfort_and_grip.vehicle": {"y": 0.0, "phi": 0.0, "wheels": np.zeros(2)},
     "14_damping_that_destabilises.column": {"phi1", "phi2"},
+    "17_gyroscope.gyroscope": {"psi", "theta", "phi"},
+    "17_gyroscope.racket": {"p": np.zeros(4)},
+    "17_gyroscope.wheel": {"x", "y", "z", "psi", "theta", "phi"},
 }
 RECORDED = {"11_driven_pendulum.pendulum"}  # driven by a recorded `Signal`, which has no formula
 WITH_CONTACTS = {f"15_bouncing_rocking_pecking.{name}" for name in ("ball", "block", "woodpecker")}  # `test_contact_equations`
 WITHOUT_INERTIA = {f"16_viscoelastic.{name}" for name in ("mount", "iwan")}  # `test_equations_without_inertia`
 FROM_EXAMPLES = {"13_bicycle"}  # defines no system of its own
-SOLVED_BY_NUMBERS = {"05_closed_loops.four_bar", "05_closed_loops.platform"}  # for their formulas one would wait for minutes
+SOLVED_BY_NUMBERS = {
+    "05_closed_loops.four_bar",
+    "05_closed_loops.platform",
+    "17_gyroscope.racket",
+}  # for their formulas one would wait for minutes
 
 
 def code_of(notebook):
