@@ -93,7 +93,7 @@ def _part(M: lx.AbstractLinearOperator, moving: np.ndarray) -> lx.AbstractLinear
     return lx.MatrixLinearOperator(M.as_matrix()[np.ix_(moving, moving)])
 
 
-def _columns(G: Rows, moving: np.ndarray) -> Rows:
+def _columns(G: Rows, moving: np.ndarray) -> Float[Array, "m k"] | SparseMatrix:
     return G.columns(moving) if isinstance(G, SparseMatrix) else G[:, moving]
 
 
