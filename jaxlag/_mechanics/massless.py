@@ -224,7 +224,7 @@ def _by_newton(flat: Flat, z, rows, equations: Callable, t, q, v) -> tuple[Array
         """Whether D is bent around w, where it may be flat at one place, as |ż|³ is at rest, or have no slope, as |ż|^1.5 has none."""
         near = jnp.finfo(v.dtype).eps ** NEAR * (1 + jnp.abs(w)) * jnp.linspace(1, 2, k, dtype=v.dtype)
         (above, G, *_), (below, *_) = (equations(*args, w + beside) for beside in (near, -near))
-        return is_determined(above.as_matrix() + below.as_matrix(), G)
+        return is_determined(lx.MatrixLinearOperator(above.as_matrix() + below.as_matrix()), G)
 
     w, sound = root_of(residual, linear, search, (t, q, v), like)
     rates, multipliers = jnp.split(w, [k])

@@ -218,5 +218,6 @@ NO_INERTIA = (
     "`lagrangian` must give every direction inertia that no constraint holds, but the mass matrix is singular "
     "(or not positive) on the null space of the constraints. Add the missing mass (a small one with a solver for stiff systems, "
     "`solver=diffrax.Kvaerno5()`), a constraint that holds it, or a dissipation function of its velocity: a coordinate that is not in the "
-    "kinetic energy at all may move by that alone, where it resists at every velocity. Or leave the coordinate out."
+    "kinetic energy at all may move by that alone, where it resists at every velocity and constraints on it are stated once. Or leave the "
+    "coordinate out."
 )
