@@ -148,6 +148,47 @@ def test_a_rolling_coin_runs_in_a_circle(theta):
     np.testing.assert_allclose(motion.multipliers["stands"], m * g, rtol=1e-6)
 
 
+@pytest.mark.slow
+def test_a_gradient_through_flips():
+    """Of ω after 5 s by ω₂ at the start, which is rotation about the unstable axis, against differences of Jacobi's functions."""
+    I, q0 = np.array([1.0, 2.0, 2.5]), jnp.array([1.0, 0.0, 0.0, 0.0])
+    free = jl.System(lambda q, qdot: rigid.kinetic_energy(1.0, I, lambda q: jnp.zeros(3), rigid.quaternion)(q, qdot), holonomic=rigid.unit)
+
+    def later(w2):
+        start = rigid.quaternion_rate(q0, jnp.stack([0.05 + 0 * w2, w2, 0 * w2]))
+        motion = jl.simulate(free, q0, start, [0.0, 5.0], rtol=1e-11, atol=1e-12)
+        return rigid.angular_velocity(rigid.quaternion)(motion.q[-1], motion.qdot[-1])
+
+    def by_jacobi(w2):
+        w0 = np.array([0.05, w2, 0.0])
+        E2, M2 = I @ w0**2, I**2 @ w0**2
+        k2 = (I[2] - I[1]) * (M2 - E2 * I[0]) / ((I[1] - I[0]) * (E2 * I[2] - M2))
+        sn, cn, dn, _ = ellipj(np.sqrt((I[1] - I[0]) * (E2 * I[2] - M2) / np.prod(I)) * 5.0 + ellipk(k2), k2)
+        first, third = np.sqrt((E2 * I[2] - M2) / (I[0] * (I[2] - I[0]))), np.sqrt((M2 - E2 * I[0]) / (I[2] * (I[2] - I[0])))
+        return np.array([first * dn, np.sqrt((M2 - E2 * I[0]) / (I[1] * (I[1] - I[0]))) * sn, third * cn])
+
+    h = 1e-4
+    expected = (8 * (by_jacobi(2 + h) - by_jacobi(2 - h)) - (by_jacobi(2 + 2 * h) - by_jacobi(2 - 2 * h))) / (12 * h)
+    for derivative in (jax.jacfwd(later)(2.0), jax.jacrev(later)(2.0)):
+        np.testing.assert_allclose(derivative, expected, rtol=0, atol=1e-6 * np.abs(expected).max())
+
+
+@pytest.mark.slow
+def test_a_gradient_through_a_rolling_coin():
+    """Of where it lies after half a second by its radius, forward and reverse, against differences."""
+    angles, rates = jnp.array([0.0, 1.1, 0.0]), jnp.array([2.0, 0.3, 5.0])
+
+    def later(r):
+        given = {"m": 0.3, "g": 9.81, "r": r}
+        start = {"x": jnp.stack([0 * r, 0 * r, r * jnp.sin(1.1)]), "angles": angles}, {"x": jnp.zeros(3), "angles": rates}
+        still = jl.consistent_state(COIN, *start, given, fixed=["angles"])
+        return jl.simulate(COIN, *still, [0.0, 0.5], given, rtol=1e-10, atol=1e-10).q["x"][-1]
+
+    expected = (later(0.1001) - later(0.0999)) / 2e-4
+    for derivative in (jax.jacfwd(later)(0.1), jax.jacrev(later)(0.1)):
+        np.testing.assert_allclose(derivative, expected, rtol=0, atol=1e-5 * np.abs(expected).max())
+
+
 def test_a_gradient_through_a_top():
     """Of where it points after half a second by its mass, forward and reverse, against differences."""
     axis = lambda m: jl.simulate(BY_QUATERNION, *as_quaternion(ANGLES, RATES), [0.0, 0.5], {"m": m, "g": 9.81}).q[-1]
