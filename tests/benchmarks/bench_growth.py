@@ -3,7 +3,7 @@
 python tests/benchmarks/bench_growth.py [most links]
 
 By hand: for the chain S has three diagonals, in one call of a tridiagonal solve. Medians of 30 calls, each length in a process of its own;
-and 1 s of motion of 200 links and of 1000, each of unit length and mass.
+and 1 s of motion of 200 links and of 1000, each of unit length and mass; and its gradient in the mass of each link.
 """
 
 import subprocess
@@ -92,15 +92,33 @@ def motion(n):
     print(f"{n:>7} links, 1 s: {each:.3f} s, the first {first:.1f} s; balance {balance:.1e}; {peak:.0f} MB")
 
 
+def gradient(n):
+    """Where the last link is after 1 s, by the mass of each."""
+    import jax
+    import jax.numpy as jnp
+    import numpy as np
+
+    import jaxlag as jl
+
+    system, q, params = chain(n)
+    weight = lambda q, qdot, m, g: jnp.sum(0.5 * m * jnp.sum(qdot**2, axis=1) - m * g * q[:, 1])
+    system = jl.System(weight, holonomic=dict(system.holonomic))
+    ts = np.linspace(0.0, 1.0, 11)
+    end = lambda m: jl.simulate(system, q, jnp.zeros_like(q), ts, params | {"m": m}).q[-1, -1, 0]
+    _, each, _ = timed(end, jnp.ones(n), times=5)
+    first, reverse, _ = timed(jax.jit(jax.grad(end)), jnp.ones(n), times=5)
+    print(f"{n:>7} links, gradient in {n} masses: {reverse:.3f} s, {reverse / each:.1f} times the motion, the first {first:.1f} s")
+
+
 def main():
     if len(sys.argv) == 3:
         import jax
 
         jax.config.update("jax_enable_x64", True)
-        return {"acceleration": accelerations, "motion": motion}[sys.argv[1]](int(sys.argv[2]))
+        return {"acceleration": accelerations, "motion": motion, "gradient": gradient}[sys.argv[1]](int(sys.argv[2]))
     most = int(sys.argv[1]) if len(sys.argv) > 1 else LENGTHS[-1]
     print(f"{'links':>7}{'jaxlag ms':>12}{'by hand ms':>12}{'ratio':>8}{'first s':>9}{'by hand':>9}{'difference':>11}", flush=True)
-    for kind, lengths in (("acceleration", LENGTHS), ("motion", MOTIONS)):
+    for kind, lengths in (("acceleration", LENGTHS), ("motion", MOTIONS), ("gradient", MOTIONS[:1])):
         for n in lengths:
             if n <= most:
                 subprocess.run([sys.executable, __file__, kind, str(n)], check=True)
