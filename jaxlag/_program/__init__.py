@@ -1,5 +1,5 @@
 """Programs of JAX, read and rewritten.
 
 One walk over jaxprs (`walker`), their interpretation over any scalar algebra (`interpreter`, `scalar_graph`), the structure of Jacobians,
-absolute values and norms as they are written, bounds over intervals of time, and compiler options.
+sparse matrices and their elimination, absolute values and norms as they are written, bounds over intervals of time, and compiler options.
 """
