@@ -147,6 +147,17 @@ def test_a_straight_chain_of_many_links_is_no_redundant_one():
     np.testing.assert_allclose(found.x, 0, atol=1e-8)
 
 
+def test_in_single_precision(single_precision):
+    jax.clear_caches()  # which know places as 64-bit integers
+    function, x, masses, f, a = (y if callable(y) else y.astype("float32") for y in problem("tree"))
+    found = solved(function, x, masses, f, a)
+    assert found.x.dtype == found.multipliers.dtype == jnp.float32
+    G = np.asarray(jax.jacrev(function)(x), float)
+    expected = by_hand(G, *(np.asarray(y, float) for y in (masses, f)), G @ np.asarray(a, float))
+    np.testing.assert_allclose(found.x, expected[0], rtol=0, atol=1e-4 * np.abs(expected[0]).max())
+    assert found.sound.determined and found.sound.satisfied
+
+
 def test_sparse_matrices_are_those_of_numpy():
     rng = np.random.default_rng(8)
     function = lambda x: jnp.append(jnp.diff(x) ** 2 * x[1:], jnp.sum(x[:30] ** 3))  # and one longer row
