@@ -51,6 +51,8 @@ def _by_arrays(function: Callable, push: Callable, x: Float[Array, " n"]) -> lx.
     except TooLong:
         return None
     m, n = pattern.shape
+    if pattern.nnz == 0:
+        return None
     if m == n == pattern.nnz and np.array_equal(pattern.indices, np.arange(n)) and np.array_equal(np.diff(pattern.indptr), np.ones(n)):
         return lx.DiagonalLinearOperator(push(jnp.ones_like(x)))
     if SPARSE * np.diff(pattern.indptr).max(initial=0) > n or SPARSE * max(color := colors(pattern)) >= n:
