@@ -59,7 +59,7 @@ def factorised(M: lx.DiagonalLinearOperator, G: SparseMatrix) -> Factors:
 
     start = (on, below), jnp.array(True), jnp.array(False)
     factors, _, shifted = lax.while_loop(lambda carry: carry[1], attempt, start)
-    return Factors(factors, everywhere(~shifted), D)
+    return Factors(factors, everywhere(~shifted & (jnp.sum(there) == G.shape[0])), D)
 
 
 def solver(M: lx.DiagonalLinearOperator, G: SparseMatrix, factors: Factors) -> tuple[Callable, Callable]:

@@ -112,6 +112,15 @@ def test_contradictions_are_said():
     assert not saddle_point(lx.DiagonalLinearOperator(masses), G, f, c).sound.satisfied
 
 
+@pytest.mark.parametrize("asked, satisfied", [(0.0, True), (1.0, False)])
+def test_rows_of_zeros_ask_for_nothing(asked, satisfied):
+    """As of a contact that is open, or of g = x² at x = 0, which no acceleration changes."""
+    function, x, masses, f, _ = problem("chain")
+    _, G = jax.jit(lambda x: jacobian(lambda x: jnp.append(function(x), x[5] ** 2), x))(x.at[5].set(0.0))
+    found = saddle_point(lx.DiagonalLinearOperator(masses), G, f, jnp.zeros(G.shape[0]).at[-1].set(asked))
+    assert found.sound.satisfied == satisfied and found.multipliers[-1] == 0
+
+
 def test_directions_without_mass_are_said():
     function, x, masses, f, a = problem("chain")
     assert not solved(function, x, masses.at[5].set(0.0), f, a).sound.determined
