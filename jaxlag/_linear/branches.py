@@ -5,7 +5,6 @@ from collections.abc import Callable, Iterator
 from typing import NamedTuple
 
 import numpy as np
-from scipy.optimize import linear_sum_assignment
 
 FINER = 8  # steps between two values that a user asks for
 
@@ -45,6 +44,8 @@ class Transition(NamedTuple):
 
 def continued(before: Spectrum, after: Spectrum) -> Spectrum:
     """The eigenvalues in the order of those before: near them, with eigenvectors that are alike."""
+    from scipy.optimize import linear_sum_assignment  # imported here because that takes a while
+
     size = max(np.max(np.abs(before.values), initial=0.0), np.finfo(float).tiny)
     alike = np.abs(_unit(before.vectors).conj().T @ _unit(after.vectors))
     moved = np.abs(before.values[:, None] - after.values[None, :]) / size

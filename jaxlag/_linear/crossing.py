@@ -7,7 +7,6 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-import scipy.linalg
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, PyTree
 
@@ -57,6 +56,8 @@ def located(matrix: Callable[[float], np.ndarray], transition: Transition) -> tu
 
 def _eigenvectors(A: np.ndarray, value: complex) -> tuple[np.ndarray, np.ndarray]:
     """yᴴ and x of the eigenvalue next to a value, of length 1."""
+    import scipy.linalg  # imported here because that takes a while
+
     values, left, right = scipy.linalg.eig(A, left=True, right=True)
     i = int(np.argmin(np.abs(values - value)))
     return left[:, i].conj(), right[:, i]

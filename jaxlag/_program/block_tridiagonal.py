@@ -14,7 +14,6 @@ import numpy as np
 import scipy.sparse
 from jax import lax
 from jaxtyping import Array, Float
-from scipy.sparse.csgraph import reverse_cuthill_mckee
 
 from .sparse_matrix import Places
 
@@ -38,6 +37,8 @@ class Elimination(NamedTuple):
 @functools.lru_cache(maxsize=64)
 def elimination(places: Places) -> Elimination:
     """In the order of Cuthill and McKee, reversed."""
+    from scipy.sparse.csgraph import reverse_cuthill_mckee  # imported here because that takes a while
+
     m = places.shape[0]
     pattern = places.pattern().astype(bool).astype(np.int64)
     coupled = (pattern @ pattern.T).tocsr()

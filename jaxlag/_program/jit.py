@@ -3,9 +3,13 @@
 On a CPU, XLA compiles each kernel with MLIR, which takes long. With its older emitters, programs compile a third faster and run as fast,
 except in batches (tests/benchmarks/bench_emitters.py). Programs called from Python get these options; within a user's own `jit` the
 choice is the user's: the environment variable XLA_FLAGS="--xla_cpu_use_fusion_emitters=false".
+
+While a program is traced, Python makes hundreds of thousands of small objects that stay, and its collector of cyclic garbage goes through
+all that there is again and again: a fifth of the time of README's first example. It waits until the program is there.
 """
 
 import functools
+import gc
 from collections.abc import Callable, Iterable
 from typing import Any
 
@@ -17,6 +21,20 @@ from jaxtyping import PyTree
 OLD_EMITTERS = {"xla_cpu_use_fusion_emitters": False}
 
 
+class GarbageStays:
+    """A block in which Python's collector of cyclic garbage waits; within another one it goes on waiting."""
+
+    __slots__ = ("waits",)
+
+    def __enter__(self) -> None:
+        self.waits = gc.isenabled()
+        gc.disable()
+
+    def __exit__(self, *_: object) -> None:
+        if self.waits:
+            gc.enable()
+
+
 def jitted(function: Callable, **options: Any) -> Callable:
     """`jax.jit` that traces arrays and treats all other leaves as static.
 
@@ -26,7 +44,8 @@ def jitted(function: Callable, **options: Any) -> Callable:
 
     @functools.wraps(function)
     def call(*given, **named):
-        return program(*_split(given, named))
+        with GarbageStays():
+            return program(*_split(given, named))
 
     return call
 
@@ -39,7 +58,8 @@ def compiled(function: Callable) -> Callable:
     def call(*given, **named):
         arrays, static = _split(given, named)
         program = _program_with_options(function) if is_called_by_python(arrays) else within
-        return program(arrays, static)
+        with GarbageStays():
+            return program(arrays, static)
 
     return call
 
