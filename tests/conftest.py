@@ -28,7 +28,7 @@ FILES = [file.relative_to(ROOT).with_suffix("") for file in ROOT.glob("jaxlag/**
 
 # Files without annotations of shapes have nothing to check, and the checks of their calls took a sixth of the CPU time of the tests
 with install_import_hook([".".join(file.parts) for file in FILES], "beartype.beartype"):
-    import jaxlag  # noqa: F401
+    from jaxlag._program.kept_programs import KEPT
 
 
 def pytest_collection_modifyitems(items):
@@ -61,3 +61,4 @@ def compilation_cache(tmp_path):
     for name, value in before.items():
         jax.config.update(name, value)
     cache_of_jax.reset_cache()
+    KEPT.keep_in(None)

@@ -1,4 +1,4 @@
-"""Compiled programs that outlast the process: JAX's persistent compilation cache, in a folder of the user's, of limited size."""
+"""Compiled programs that outlast the process: JAX's persistent compilation cache and ours, in a folder of the user's, of limited size."""
 
 import contextlib
 import errno
@@ -9,6 +9,8 @@ from pathlib import Path
 import jax
 from jax.experimental.compilation_cache import compilation_cache
 
+from .kept_programs import KEPT
+
 SMALLEST = {  # programs of any size: a fit has dozens of small ones, which take longer to compile than to read
     "jax_persistent_cache_min_compile_time_secs": 0.0,
     "jax_persistent_cache_min_entry_size_bytes": 0,
@@ -18,9 +20,11 @@ SMALLEST = {  # programs of any size: a fit has dozens of small ones, which take
 def keep_compiled(folder: str | os.PathLike | None = None, *, max_bytes: int = 2**30) -> Path:
     r"""Keeps compiled programs on disk, so that the next process reads them where it would compile them.
 
-    Call it once, before the first motion. It sets JAX's persistent compilation cache, for all programs of the process. A motion, its
-    derivatives and a fit are read from it as long as the functions, the shapes and the versions of JAX and jaxlag are the same; only
-    `simulate(..., progress=True)` compiles anew, as its progress bar is called by the compiled program.
+    Call it once, before the first motion. It sets JAX's persistent compilation cache, for all programs of the process; what Python calls,
+    as `simulate`, a gradient of it and `fit`, is on a CPU not traced either. It is found as long as the user's functions return the same
+    programs, and shapes, settings, and the versions of JAX and jaxlag are the same. Functions that were called before this one, that
+    have a derivative rule of their own (`jax.custom_jvp`) or call Python, and motions within the user's own `jit` are traced as ever;
+    only `simulate(..., progress=True)` compiles anew, as its progress bar is called by the compiled program.
 
     **Arguments:**
 
@@ -54,6 +58,7 @@ def keep_compiled(folder: str | os.PathLike | None = None, *, max_bytes: int = 2
             jax.config.update(setting, value)
     chosen = jax.config.values["jax_compilation_cache_dir"]
     if folder is None and chosen:
+        KEPT.keep_in(Path(chosen))
         return Path(chosen)
     path = _user_cache() / "jaxlag" if folder is None else Path(folder).expanduser().absolute()
     _make(path)
@@ -61,6 +66,7 @@ def keep_compiled(folder: str | os.PathLike | None = None, *, max_bytes: int = 2
     if chosen != str(path):
         compilation_cache.reset_cache()  # JAX looks at the setting only once
         compilation_cache.set_cache_dir(str(path))
+    KEPT.keep_in(path)
     return path
 
 

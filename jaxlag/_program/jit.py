@@ -18,6 +18,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import PyTree
 
+from .kept_programs import KEPT
+
 OLD_EMITTERS = {"xla_cpu_use_fusion_emitters": False}
 
 
@@ -57,9 +59,13 @@ def compiled(function: Callable) -> Callable:
     @functools.wraps(function)
     def call(*given, **named):
         arrays, static = _split(given, named)
-        program = _program_with_options(function) if is_called_by_python(arrays) else within
         with GarbageStays():
-            return program(arrays, static)
+            if not is_called_by_python(arrays):
+                return within(arrays, static)
+            program = _program_with_options(function)
+            if KEPT.folder is None or _has_tracers(arrays):
+                return program(arrays, static)
+            return KEPT.called(program, call, arrays, static)
 
     return call
 

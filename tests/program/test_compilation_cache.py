@@ -20,6 +20,10 @@ jax.config.update("jax_enable_x64", True)
 jl.keep_compiled(sys.argv[1])
 counts = collections.Counter()
 jax.monitoring.register_event_listener(lambda event, **_: counts.update([event.removeprefix("/jax/compilation_cache/")]))
+lowered = set()
+jax.monitoring.register_event_duration_secs_listener(
+    lambda event, _, fun_name=None, **__: lowered.add(fun_name) if event.endswith("to_mlir_module_duration") else None
+)
 ts = jnp.linspace(0.0, 3.0, 31)
 
 oscillator = jl.System(lambda q, qdot, c: 0.5 * qdot**2 - 0.5 * c * q**2, dissipation=lambda qdot, b: 0.5 * b * qdot**2)
@@ -44,23 +48,26 @@ for name, run in CASES.items():
     counts.clear()
     value = run()
     print(name, value, counts["compile_requests_use_cache"], counts["cache_hits"], sep=", ")
+print(*sorted(lowered), file=sys.stderr)
 """
 
 
 def in_a_process(folder, seed):
-    """(value, programs asked for, programs read from the cache) by case."""
+    """(value, programs asked for, programs read from JAX's cache) by case, and the names of all that were lowered."""
     environment = {name: value for name, value in os.environ.items() if "CACHE" not in name} | {"PYTHONHASHSEED": seed}
     run = subprocess.run([sys.executable, "-c", CODE, str(folder)], capture_output=True, text=True, env=environment)
     assert run.returncode == 0, run.stderr[-2000:]
     rows = [line.split(", ") for line in run.stdout.splitlines()]
-    return {name: (value, int(asked), int(read)) for name, value, asked, read in rows}
+    return {name: (value, int(asked), int(read)) for name, value, asked, read in rows}, run.stderr.split()
 
 
 @pytest.mark.slow
 def test_a_second_process_compiles_nothing(tmp_path):
-    """A program is not kept if it calls Python, and not found if it differs, e.g. by the order of a set, from process to process."""
-    first, second = (in_a_process(tmp_path, seed) for seed in "12")
+    """Nor does it trace what is large. A program is not kept if it calls Python, and not found if it differs, e.g. by the order of a set, from process to process."""
+    (first, lowered_first), (second, lowered) = (in_a_process(tmp_path, seed) for seed in "12")
     assert first.keys() == second.keys() and sum(asked - read for _, asked, read in first.values()) > len(first)
+    large = {"jit(_trajectory)", "jit(solved)", "jit(_linearise)"}
+    assert large <= {*lowered_first} and not large & {*lowered}
     for name, (value, asked, read) in second.items():
         assert (value, asked) == (first[name][0], read), name
 
