@@ -14,6 +14,7 @@ import os
 import pickle
 import platform
 import tempfile
+import threading
 from collections.abc import Callable, Iterator
 from importlib.metadata import version
 from pathlib import Path
@@ -102,7 +103,7 @@ def _words_for(function, arrays, static):
         kind = _kind(array)
         if len(kind) > 3:
             raise NotDescribable("arrays on other devices")
-        words.say(kind)
+        words.say(str(kind))
     leaves, structure = static
     words.value(leaves)
     words.structure(structure)
@@ -114,9 +115,9 @@ def _kind(array):
     if array is None:
         return (None,)
     if not isinstance(array, jax.Array):
-        return np.shape(array), str(array.dtype), False
+        return np.shape(array), array.dtype, False
     elsewhere = () if array.sharding == _first_device() else (array.sharding,)
-    return array.shape, str(array.dtype), array.weak_type, *elsewhere
+    return array.shape, array.dtype, array.weak_type, *elsewhere
 
 
 @functools.cache
@@ -149,17 +150,21 @@ def _head(words, out_tree) -> tuple[str, bytes]:
     return name, content.getvalue()
 
 
+_ONE_AT_A_TIME = threading.Lock()
+
+
 @contextlib.contextmanager
 def _compiled_afresh() -> Iterator[None]:
     """Without JAX's cache: XLA writes down only half of a program that it has not compiled but read."""
-    before = jax.config.values["jax_enable_compilation_cache"]
-    try:
-        jax.config.update("jax_enable_compilation_cache", False)
-        compilation_cache.reset_cache()  # JAX looks at the setting only once
-        yield
-    finally:
-        jax.config.update("jax_enable_compilation_cache", before)
-        compilation_cache.reset_cache()
+    with _ONE_AT_A_TIME:
+        before = jax.config.values["jax_enable_compilation_cache"]
+        try:
+            jax.config.update("jax_enable_compilation_cache", False)
+            compilation_cache.reset_cache()  # JAX looks at the setting only once
+            yield
+        finally:
+            jax.config.update("jax_enable_compilation_cache", before)
+            compilation_cache.reset_cache()
 
 
 def _write(path, content):
