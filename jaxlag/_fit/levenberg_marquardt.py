@@ -114,6 +114,7 @@ def _norms(J):
     return jnp.linalg.norm(J, axis=0)
 
 
+@compiled
 def _initialise(y, linearised, bounds):
     r, J, aux = linearised
     now = Iterate(y, r, J, aux, _cost(r), jnp.asarray(FIRST_DAMPING, y.dtype), _norms(J), J, _cost(r), jnp.asarray(0), jnp.asarray(RUNNING))
@@ -155,6 +156,7 @@ def _propose(now, bounds):
     return Trial(jnp.clip(now.y + step / scale, *bounds), J @ step, free_change, active)
 
 
+@compiled
 def _update(now, trial, linearised, bounds, tolerance, freedom):
     """Takes the trial where it is better, adapts the damping, and proposes the next."""
     r, J, aux = linearised
@@ -196,5 +198,5 @@ def _status(now, trial, taken, newton_like, tolerance, freedom):
     return jnp.where(now.status == RUNNING, status, now.status)
 
 
-SINGLE = tuple(compiled(f) for f in (_initialise, _update))
-BATCHED = tuple(compiled(jax.vmap(f)) for f in (_initialise, _update))
+SINGLE = _initialise, _update
+BATCHED = tuple(compiled(jax.vmap(f)) for f in SINGLE)
