@@ -14,7 +14,7 @@ from .channel_sigma import sigmas_of, weighted_by_residuals, weighted_by_spread
 from .experiment_batch import with_sigma
 from .levenberg_marquardt import INTERRUPTED, STEP_LIMIT, Iterate, Outcome, levenberg_marquardt
 from .multiple_shooting import join
-from .problem import Problem, failure_of, linearise, linearise_each, linearise_starts, without_jacobian
+from .problem import Problem, failure_of, held_by_jax, linearise, linearise_each, linearise_starts, without_jacobian
 
 SIGMA_ROUNDS = 10  # at most, of estimating sigma and the unknowns in turn,
 ROBUST_ROUNDS = 3  # with a robust loss, whose sigma need not settle,
@@ -110,8 +110,10 @@ def _minimise(problem, x, method, starts, limits):
 
 
 def _from_one_start(problem, x, limits):
+    held = held_by_jax(problem)
+
     def residuals(x):
-        found = linearise(problem, x)
+        found = linearise(held, x)
         return found.residuals, found.jacobian, found
 
     outcome = levenberg_marquardt(residuals, x, bounds=problem.bounds, **limits)

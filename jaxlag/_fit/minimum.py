@@ -98,5 +98,5 @@ def weighted_residuals(problem: Problem, found: Linearisation) -> Iterator[np.nd
     for batch, part in zip(problem.batches, found.batches, strict=True):
         count = len(batch.members)  # copies of the last one may follow
         values, sigma = jax.tree.map(lambda x, count=count: np.asarray(x)[:count], (batch.values, batch.sigma))
-        r = jax.tree.map(lambda z, p, s: (z - p) / s, values, part.channels, sigma)
+        r = jax.tree.map(lambda z, p, s: (z - np.asarray(p)) / s, values, part.channels, sigma)
         yield np.concatenate([np.reshape(leaf, (count, -1)) for leaf in jax.tree.leaves(r)], axis=1)

@@ -63,7 +63,7 @@ class Free:
         mean, deviation = _pair_for_each_entry(priors, "priors", free, entries, (0.0, np.inf))
         _check(start, lower, upper, deviation, entries)
         for i, leaf in enumerate(every):
-            if i not in chosen and _is_unknown(leaf):
+            if i not in chosen and is_unknown(leaf):
                 raise ValueError(f"`params` must be known where they are not free, but {names[i]!r} is NaN. Give it a value, or free it.")
         scale = xnp.where(start == 0, 1, xnp.abs(start)) if relative else xnp.ones_like(start)
         lower, upper, mean, deviation = (np.asarray(x, start.dtype) for x in (lower, upper, mean, deviation))
@@ -126,11 +126,11 @@ class Free:
         return {name: _part(tree, name) for name in self.names}
 
 
-def _is_unknown(leaf):
+def is_unknown(leaf: Any) -> bool:
     """Whether it is an array with NaN in it, as far as Python sees."""
     if isinstance(leaf, np.ndarray):
-        return leaf.dtype.kind in "fc" and np.isnan(leaf).any()
-    return eqx.is_inexact_array(leaf) and not _traced([leaf]) and np.any(np.isnan(leaf))
+        return leaf.dtype.kind in "fc" and bool(np.isnan(leaf).any())
+    return bool(eqx.is_inexact_array(leaf) and not _traced([leaf]) and np.isnan(leaf).any())
 
 
 def _traced(arrays):

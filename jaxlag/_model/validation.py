@@ -14,6 +14,7 @@ from .._program.jit import compiled, is_concrete
 from .._program.walker import used_arguments
 from .event import merged
 from .flat import Flat, StatesAt, bind, flat_like
+from .given import Given, known, remember
 from .injection import call, check_entries, described, missing
 from .numbers import Label, in_dtype, number, numbers
 from .state_values import given_states, of_first_order, sampled, shaped_like, start_values
@@ -111,6 +112,16 @@ def _check_visible(leaf: Any, label: Any) -> None:
             f"{label} must be numbers, arrays, or a pytree of them, but is a {kind}, whose numbers JAX cannot see. "
             f"Register its class, `jax.tree_util.register_dataclass({kind})`, make it an `equinox.Module`, or write a dict."
         )
+
+
+def state_and_params(q: Any, qdot: Any, params: PyTree, names: tuple[str, str] = ("q", "qdot")) -> Given:
+    """`state` and `parameters`, packed; a structure of plain numbers is checked once."""
+    found = known((q, qdot, params))
+    if found is None:
+        position, velocity = state(q, qdot, names)
+        found = Given.of((position, velocity, parameters(params, position)))
+        remember((q, qdot, params), found)
+    return found
 
 
 def sample_times(ts: Any, dtype: Any) -> Float[Array | np.ndarray, " T"]:
@@ -223,14 +234,14 @@ def without_events(system: System, label: str) -> None:
 
 def at_state(core: Callable[..., Any], system: System, q: Any, qdot: Any, params: Any, t: Any, states: Any = None) -> Any:
     """`core(flat, t, q, v)` of the checked system at a state given by the user; compiled once for each `core` and `system`."""
-    q, qdot = state(q, qdot)
-    t = number(t, "`t`", jax.tree.leaves(q)[0].dtype, cure="Pass one time, and use `jax.vmap` for several.")
-    return _at_state(core, system, t, q, qdot, parameters(params, q), given_states(system, states, q))
+    given = state_and_params(q, qdot, params)
+    t = number(t, "`t`", given.dtype, cure="Pass one time, and use `jax.vmap` for several.")
+    return _at_state(core, system, t, given, {} if states is None else given_states(system, states, given.trees[0]))
 
 
 @compiled
-def _at_state(core, system, t, q, qdot, params, states):
-    return core(*checked(system, t, q, qdot, params, states))
+def _at_state(core, system, t, given, states):
+    return core(*checked(system, t, *given.trees, states))
 
 
 def checked(system: System, t: Array, q: PyTree, qdot: PyTree, params: PyTree, states: Any) -> tuple[Flat, Array, Array, Array]:

@@ -34,6 +34,13 @@ from .stick_slip_solver import StickSlipSolver
 from .variational import VariationalEquations, derived, varied_along, with_variations
 from .wrapped_solver import ProjectedSolver, SamplingAdjoint
 
+CHOICES: dict[str, tuple[tuple[type, ...], str]] = {  # what may be chosen; the usual kinds first, since diffrax takes long to tell its own
+    "solver": ((ExplicitRungeKutta, dfx.AbstractSolver), "`jaxlag.Dop853()` or `diffrax.Kvaerno5()`"),
+    "stabilisation": ((Projection, Baumgarte, NoStabilisation), "`Projection()`, `Baumgarte()` or `NoStabilisation()`"),
+    "friction": ((StickSlip, Regularised), "`StickSlip()` or `Regularised(width)`"),
+    "adjoint": ((type(None), dfx.AbstractAdjoint), "`diffrax.RecursiveCheckpointAdjoint()`, or leave it out"),
+}
+
 
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
@@ -50,17 +57,9 @@ class SolverOptions:
     def of(cls, solver: Any, formulation: Formulation, max_steps: Any, adjoint: Any = None, progress: bool = False) -> "SolverOptions":
         """Checked, with the default solver where none is given."""
         solver = _default_solver() if solver is None else solver
-        for name, given, kinds, cure in (
-            ("solver", solver, (dfx.AbstractSolver,), "`jaxlag.Dop853()` or `diffrax.Kvaerno5()`"),
-            (
-                "stabilisation",
-                formulation.stabilisation,
-                (Projection, Baumgarte, NoStabilisation),
-                "`Projection()`, `Baumgarte()` or `NoStabilisation()`",
-            ),
-            ("friction", formulation.friction, (StickSlip, Regularised), "`StickSlip()` or `Regularised(width)`"),
-            ("adjoint", adjoint, (dfx.AbstractAdjoint, type(None)), "`diffrax.RecursiveCheckpointAdjoint()`, or leave it out"),
-        ):
+        chosen = {"solver": solver, "stabilisation": formulation.stabilisation, "friction": formulation.friction, "adjoint": adjoint}
+        for name, given in chosen.items():
+            kinds, cure = CHOICES[name]
             if not isinstance(given, kinds):
                 raise TypeError(f"`{name}` must be an object that makes the choice, but is {given!r}. Take e.g. {cure}.")
         count(max_steps, "`max_steps`", cure="The default is 100_000.")
@@ -78,6 +77,8 @@ def tolerances_of(rtol, atol, dtype) -> tuple[Array | np.ndarray, Array | np.nda
     if single:
         _warn_of_single_precision()
     defaults = (1e-4, 1e-6) if single else (1e-8, 1e-10)
+    if rtol is None and atol is None:
+        return np.asarray(defaults[0], dtype), np.asarray(defaults[1], dtype)
     rtol = number(defaults[0] if rtol is None else rtol, "`rtol`", dtype, least=0.0, cure=f"The default is {defaults[0]:g}.")
     atol = number(defaults[1] if atol is None else atol, "`atol`", dtype, positive=True, cure=f"The default is {defaults[1]:g}.")
     return rtol, atol

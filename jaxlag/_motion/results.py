@@ -1,5 +1,6 @@
 """Why a motion ended."""
 
+import functools
 from typing import Any
 
 import diffrax as dfx
@@ -101,7 +102,12 @@ OF_THE_STEPS = (RESULTS.max_steps_reached, RESULTS.dt_min_reached)  # which othe
 def has_failed(result: Any) -> bool:
     """Whether a motion has failed, as far as that is known: under `jit` it is not. Asked on the host, at a tenth of the time of `!=`."""
     code = result._value
-    return not isinstance(code, jax.core.Tracer) and bool(np.any(np.asarray(code) != np.asarray(RESULTS.successful._value)))  # type: ignore[attr-defined]
+    return not isinstance(code, jax.core.Tracer) and bool((np.asarray(code) != _successful()).any())
+
+
+@functools.cache
+def _successful() -> int:
+    return int(RESULTS.successful._value)  # type: ignore[attr-defined]
 
 
 def reason_of(result: Any) -> str:

@@ -4,7 +4,6 @@ from collections.abc import Mapping
 from typing import Any
 
 import diffrax as dfx
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, PyTree
 
@@ -14,15 +13,16 @@ from .._model.deprecation import renamed
 from .._model.event import Event
 from .._model.state_values import given_states
 from .._model.system import System
-from .._model.validation import parameters, sample_times, state
+from .._model.validation import state_and_params
 from .._program.jit import compiled, is_concrete
 from .derivative_rule import differentiable
 from .failure import raise_failure
 from .first_order import Formulation
 from .integrate import SolverOptions, tolerances_of
-from .padding import padded_signals, padded_times, with_params, without_padding
+from .padding import padded_signals, padded_times, without_padding
 from .progress import compiling
 from .solution_map import Inputs, SolutionMap, trajectory_of
+from .table import Table
 from .trajectory import Trajectory
 
 
@@ -91,30 +91,30 @@ def simulate(
     """
     works = renamed(works, "works", audit=audit)
     system = system if events is None else system.with_events(events)
-    q0, qdot0 = state(q0, qdot0, ("q0", "qdot0"))
-    dtype = jax.tree.leaves(q0)[0].dtype
+    given = state_and_params(q0, qdot0, params, ("q0", "qdot0"))
     options = SolverOptions.of(solver, Formulation(stabilisation, friction, works), max_steps, adjoint, progress)
-    ts, tolerances = sample_times(ts, dtype), tolerances_of(rtol, atol, dtype)
-    given, length = parameters(params, q0), ts.size
-    ts, params = padded_times(ts), padded_signals(given)
-    inputs = Inputs(None, q0, qdot0, params, tolerances, given_states(system, states, q0))
-    solution_map = SolutionMap(system, options)
+    (ts, length), tolerances = padded_times(ts, given.dtype), tolerances_of(rtol, atol, given.dtype)
+    states = {} if states is None else given_states(system, states, given.trees[0])
+    padded = padded_signals(given)
     with compiling("the motion", progress):
-        if adjoint is not None or is_concrete(inputs, ts):
-            trajectory = _trajectory(solution_map, inputs, ts)
+        if adjoint is not None or is_concrete(given.others, tolerances, states, ts):
+            table = _trajectory(system, options, padded, tolerances, states, ts)
+            q0, qdot0, params = given.trees
+            trajectory = table.trajectory(length, params)
         else:
-            solution = differentiable(solution_map)(inputs._replace(t0=ts[0]), ts)
+            q0, qdot0, params = given.trees
+            inputs = Inputs(ts[0], q0, qdot0, padded.trees[2], tolerances, states)
+            solution = differentiable(SolutionMap(system, options))(inputs, ts)
             trajectory = trajectory_of(system, options, params, jnp.asarray(ts), *solution)
-    if ts.size > length:
-        trajectory = without_padding(trajectory, length)
-    if params is not given:
-        trajectory = with_params(trajectory, given)
+            trajectory = without_padding(trajectory, length) if ts.size > length else trajectory
     if throw:
-        raise_failure(trajectory, (q0, qdot0, inputs.states))
+        raise_failure(trajectory, (q0, qdot0, states))
     return trajectory
 
 
 @compiled
-def _trajectory(solution_map, inputs, ts):
+def _trajectory(system, options, given, tolerances, states, ts):
     """The motion and its `Trajectory` in one program: to build that in Python takes as long as some ten steps of a vehicle."""
-    return trajectory_of(solution_map.system, solution_map.options, inputs.params, ts, *solution_map.solve(inputs, ts))
+    q0, qdot0, params = given.trees
+    solution = SolutionMap(system, options).solve(Inputs(None, q0, qdot0, params, tolerances, states), ts)
+    return Table.of(trajectory_of(system, options, params, ts, *solution))

@@ -253,6 +253,12 @@ def energies(motion: Trajectory) -> tuple[Float[Array, " T"], Float[Array, " T"]
     return motion.provenance.energies if isinstance(motion.provenance, Recorded) else _energies(motion)
 
 
+def of_samples(t: Trajectory) -> PyTree:
+    """All of a motion that has the samples as its first axis."""
+    counts = [count for name, count in t.stats.items() if name in COUNTED], [event.count for event in t.events.values()]
+    return t.ts, t.q, t.qdot, t.qddot, t.multipliers, t.works, t.friction, t.states, t.contacts, counts
+
+
 def _ravelled(tree):
     return jax.vmap(lambda leaf: ravel_pytree(leaf)[0])(tree)
 

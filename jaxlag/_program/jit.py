@@ -16,11 +16,14 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.extend.core import get_opaque_trace_state, take_current_trace
 from jaxtyping import PyTree
 
 from .kept_programs import KEPT
 
 OLD_EMITTERS = {"xla_cpu_use_fusion_emitters": False}
+with take_current_trace():
+    NOTHING_TRACED = get_opaque_trace_state()
 
 
 class GarbageStays:
@@ -94,7 +97,7 @@ def _split(given, named):
 
 def is_called_by_python(arrays: Iterable[Any] = ()) -> bool:
     """Whether the call is not being traced: under `jit` even what is computed from nothing is traced, under an eager `vmap` it is not."""
-    leaves = [_nothing(), *arrays]
+    leaves = list(arrays) if get_opaque_trace_state() == NOTHING_TRACED else [_nothing(), *arrays]
     return jax.default_backend() == "cpu" and (not _has_tracers(leaves) or all(map(_is_known, leaves)))
 
 

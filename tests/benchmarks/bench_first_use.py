@@ -1,7 +1,8 @@
 """First use: what a person waits for in fresh processes, each beside the same by hand with JAX and diffrax in the same run.
 
 The vehicle: seconds until its first motion, gradient and fit, and then of each again; by hand with hand-derived equations, diffrax and
-optimistix in their default settings (gradient in reverse mode; only the fit requires another adjoint). The pendulum of README's first
+optimistix in their default settings (gradient in reverse mode; only the fit requires another adjoint); and, when all is compiled, its
+motion called from Python beside the compiled one within `jax.jit`, and one acceleration. The pendulum of README's first
 example, a point on a rod with the constraint |r| = l: its first motion, gradient and Hessian, its first motion with dry friction in the
 joint and the gradient of that; by hand from its equations with the multiplier eliminated. The whole of that example, without and with
 `keep_compiled`. "import" is that of the libraries named.
@@ -74,6 +75,31 @@ VEHICLE = {
     "jaxlag": TIMED.format(imports="import jaxlag as jl", actions=JAXLAG),
     "JAX + diffrax by hand": TIMED.format(imports="import jax, diffrax as dfx, optimistix as optx", actions=BY_HAND),
 }
+
+CALLED = """
+import json, statistics, time
+import jax
+jax.config.update("jax_enable_x64", True)
+import jax.numpy as jnp
+import jaxlag as jl
+ts = jnp.linspace(0, 20, 1000)
+from jaxlag.examples import vehicle
+state, params = (vehicle.q0, vehicle.qdot0), vehicle.params
+by_python = lambda b: jl.simulate(vehicle.system, *state, ts, params | {"b": b}).q["y"]
+compiled = jax.jit(by_python)
+actions = {
+    "compiled": lambda: compiled(3000.0),
+    "called from Python": lambda: by_python(3000.0),
+    "acceleration, called from Python": lambda: jl.acceleration(vehicle.system, *state, params).qddot,
+}
+taken = {name: [] for name in actions}
+for turn in range(400):
+    for name, action in actions.items():
+        begin = time.perf_counter()
+        jax.block_until_ready(action())
+        taken[name].append(time.perf_counter() - begin)
+print(json.dumps({name: statistics.median(seconds[20:]) for name, seconds in taken.items()}))
+"""
 
 FIRST = """
 import json, resource, time
@@ -164,6 +190,13 @@ def vehicle(processes):
         yield f"vehicle: {task}", table({name: [run[task] for run in of_name] for name, of_name in runs.items()})
 
 
+def called(processes):
+    """Table of the vehicle's motion when everything is compiled: what Python adds to it, and one acceleration."""
+    with tempfile.TemporaryDirectory() as cache:
+        runs = [fresh(CALLED, cache) for _ in range(processes)]
+    yield "vehicle: compiled, and called from Python", table({name: [run[name] for run in runs] for name in runs[0]})
+
+
 def pendulum(processes):
     """Tables of the pendulum, with the peak memory of each process."""
     for task in ACTIONS:
@@ -197,7 +230,7 @@ def table(taken):
 
 
 def main(processes=5):
-    for tables in (example, pendulum, vehicle):
+    for tables in (example, pendulum, vehicle, called):
         record("first use", tables(processes))
 
 
