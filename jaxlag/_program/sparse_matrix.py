@@ -95,6 +95,15 @@ class SparseMatrix(eqx.Module):
         places = Places(self.places.rows[kept], new[self.places.columns[kept]], (self.shape[0], which.size))
         return SparseMatrix(self.values[kept], places)
 
+    def row_blocks(self, heights: tuple[int, ...]) -> list["SparseMatrix"]:
+        """The matrices that it consists of, one below the other."""
+        ends, parts = np.cumsum([0, *heights]), []
+        for start, end in zip(ends[:-1], ends[1:], strict=True):
+            kept = slice(*np.searchsorted(self.places.rows, [start, end]))
+            places = Places(self.places.rows[kept] - start, self.places.columns[kept], (int(end - start), self.shape[1]))
+            parts.append(SparseMatrix(self.values[kept], places))
+        return parts
+
     def as_matrix(self) -> Float[Array, "m n"]:
         """With its zeros."""
         return jnp.zeros(self.shape, self.values.dtype).at[self.places.rows, self.places.columns].set(self.values)
