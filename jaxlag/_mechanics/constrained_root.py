@@ -35,7 +35,7 @@ class Linear(NamedTuple):
         return -jnp.concatenate(solve(*jnp.split(residual, [self.f.size])))
 
 
-def is_without_curvature(M: lx.AbstractLinearOperator, G: Rows) -> bool:
+def is_without_curvature(M: Any, G: Any) -> bool:
     """Whether the curvature of constraints is left out of a step: with it, M would lose its structure."""
     return isinstance(M, StructuredInertia) or (isinstance(G, SparseMatrix) and isinstance(M, lx.DiagonalLinearOperator))
 

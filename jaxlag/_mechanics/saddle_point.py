@@ -15,9 +15,8 @@ from .pseudo_inverse import Inverse, Request, applied, by_rows, everywhere, inve
 from .sparse_saddle_point import factorised as sparsely_factorised
 from .sparse_saddle_point import is_satisfied
 from .sparse_saddle_point import solver as sparse_solver
-from .structured_inertia import StructuredInertia, by_inertia, is_positive
+from .structured_inertia import StructuredInertia, by_inertia, is_positive, root_of_inverse
 from .structured_inertia import factorised as structure_factorised
-from .structured_inertia import root_of_inverse
 
 Rows = Float[Array, "m n"] | SparseMatrix
 FEW = 16  # rows, up to which M⁻¹Gᵀ is computed where M is full but has a structure
@@ -71,9 +70,13 @@ def saddle_point(M: lx.AbstractLinearOperator, G: Rows, f, c, reach: Float[Array
     return jax.lax.cond(everywhere(jnp.all(heavy)), lambda: divided, full)
 
 
-def _for_rows(M: lx.AbstractLinearOperator, G: Rows) -> lx.AbstractLinearOperator:
-    """M with all its numbers, where so many rows are to be solved for that it takes less time."""
-    return lx.MatrixLinearOperator(M.as_matrix()) if isinstance(M, StructuredInertia) and G.shape[0] > FEW else M
+def _keeps_structure(M, G):
+    """Whether so few rows are to be solved for that M serves better by its structure than with all its numbers."""
+    return isinstance(M, StructuredInertia) and G.shape[0] <= FEW
+
+
+def _for_rows(M, G):
+    return M if _keeps_structure(M, G) or not isinstance(M, StructuredInertia) else lx.MatrixLinearOperator(M.as_matrix())
 
 
 def _saddle_point(M, G, f, c, reach) -> SaddlePoint:
@@ -204,7 +207,7 @@ def is_determined(M: lx.AbstractLinearOperator, G: Rows) -> Bool[Array, ""]:
     """Whether M is positive definite on the null space of G; a diagonal one beside sparse rows, everywhere."""
     if isinstance(G, SparseMatrix) and isinstance(M, lx.DiagonalLinearOperator):
         return jnp.all(M.diagonal > jnp.finfo(M.diagonal.dtype).eps * jnp.max(M.diagonal))
-    if isinstance(M, StructuredInertia) and G.shape[0] <= FEW:
+    if _keeps_structure(M, G):
         M = jax.lax.stop_gradient(M)
         return is_positive(M, structure_factorised(M))
     A = jax.lax.stop_gradient(augmented(M.as_matrix(), dense(G))[0])

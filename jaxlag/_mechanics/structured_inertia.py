@@ -1,7 +1,7 @@
 """Mass matrices of many coordinates that need no n × n numbers: sparse ones, and those of chains, full as they are.
 
-Positions of a chain in joint angles are running sums, x = Σ l sin φ. Between the sums the kinetic energy is sparse (`_program.running_sums`),
-and M x = f is solved link by link (`_program.recursive_elimination`), however many links each angle moves.
+Positions of a chain in joint angles are running sums, x = Σ l sin φ. Between the sums the kinetic energy is sparse
+(`_program.running_sums`), and M x = f is solved link by link (`_program.recursive_elimination`), however many links each angle moves.
 """
 
 from collections.abc import Callable
@@ -29,7 +29,9 @@ class StructuredInertia(lx.AbstractLinearOperator):
     @property
     def line(self) -> Line:
         """The order of its elimination."""
-        return line(self.slopes.places, self.sums)
+        found = line(self.slopes.places, self.sums)
+        assert found is not None  # or it would be a full matrix
+        return found
 
     @property
     def size(self) -> int:

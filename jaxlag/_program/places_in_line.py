@@ -90,7 +90,8 @@ def _places(rows, columns, of_sums, n: int, sums: tuple[RunningSum, ...]) -> np.
 
 def _slots(block: np.ndarray, n: int) -> tuple[np.ndarray, np.ndarray, int]:
     """The x in each block, padded by n; of each z its slot, the sums behind the x; and how many slots there are."""
-    slot, widths = np.empty(block.size, int), []
+    slot = np.empty(block.size, int)
+    widths: list[int] = []
     for part in (np.arange(n), np.arange(n, block.size)):
         order = part[np.argsort(block[part], kind="stable")]
         count = np.bincount(block[part], minlength=block.max() + 1)

@@ -131,7 +131,9 @@ class _Cuts:
         growth = [of if had == 1 else 1 for had, of in zip(array.shape, shape, strict=True)]
         if max(growth, default=1) >= MIN_LENGTH:
             axis = int(np.argmax(growth))
-            zeros = jnp.zeros([n - 1 if d == axis else n for d, n in enumerate([*array.shape[:axis], shape[axis], *array.shape[axis + 1 :]])], array.dtype)
+            zeros = jnp.zeros(
+                [n - 1 if d == axis else n for d, n in enumerate([*array.shape[:axis], shape[axis], *array.shape[axis + 1 :]])], array.dtype
+            )
             summands = jnp.concatenate([array, zeros], axis)
             array = self.cut(summands, RunningSum(summands.shape, axis, False))
         return jnp.broadcast_to(array, shape)

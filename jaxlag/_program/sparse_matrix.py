@@ -1,6 +1,7 @@
 """Matrices of which only the entries that are not zero by structure are kept: their places are known while tracing."""
 
 import functools
+import itertools
 from typing import Any
 
 import equinox as eqx
@@ -98,7 +99,7 @@ class SparseMatrix(eqx.Module):
     def row_blocks(self, heights: tuple[int, ...]) -> list["SparseMatrix"]:
         """The matrices that it consists of, one below the other."""
         ends, parts = np.cumsum([0, *heights]), []
-        for start, end in zip(ends[:-1], ends[1:], strict=True):
+        for start, end in itertools.pairwise(ends):
             kept = slice(*np.searchsorted(self.places.rows, [start, end]))
             places = Places(self.places.rows[kept] - start, self.places.columns[kept], (int(end - start), self.shape[1]))
             parts.append(SparseMatrix(self.values[kept], places))
