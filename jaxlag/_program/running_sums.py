@@ -64,10 +64,11 @@ def lifted(function: Callable, x: Float[Array, " n"]) -> Lifted | None:
     where summands are not affine in x: then f'' has more to it than these.
     """
     closed = jax.make_jaxpr(function)(x)
-    at_x = _Cuts()
-    at_x.run(closed, x)
-    if not at_x.sums:
+    at_x, looked = _Cuts(), _Cuts()
+    jax.eval_shape(lambda x: looked.run(closed, x), x)
+    if not looked.sums:
         return None
+    at_x.run(closed, x)
     z = jnp.concatenate([x, *at_x.values])
     ends = np.cumsum([x.size, *(s.size for s in at_x.sums)])[:-1]
 
@@ -85,7 +86,7 @@ def lifted(function: Callable, x: Float[Array, " n"]) -> Lifted | None:
         pattern = dependence(slopes, z)
     except TooLong:
         return None
-    if turning.nnz or max(color := colors(pattern)) >= MAX_COLORS:
+    if turning.nnz or np.diff(pattern.indptr).max() > MAX_COLORS or max(color := colors(pattern)) >= MAX_COLORS:
         return None
     return Lifted(entries(jax.linearize(slopes, z)[1], color, pattern, z), tuple(at_x.sums))
 
@@ -131,10 +132,7 @@ class _Cuts:
         growth = [of if had == 1 else 1 for had, of in zip(array.shape, shape, strict=True)]
         if max(growth, default=1) >= MIN_LENGTH:
             axis = int(np.argmax(growth))
-            zeros = jnp.zeros(
-                [n - 1 if d == axis else n for d, n in enumerate([*array.shape[:axis], shape[axis], *array.shape[axis + 1 :]])], array.dtype
-            )
-            summands = jnp.concatenate([array, zeros], axis)
+            summands = jnp.concatenate([array, jnp.repeat(jnp.zeros_like(array), shape[axis] - 1, axis)], axis)
             array = self.cut(summands, RunningSum(summands.shape, axis, False))
         return jnp.broadcast_to(array, shape)
 
