@@ -39,6 +39,9 @@ WINGS = {  # each imports only from those above it, and each file of a wing only
         "block_tridiagonal",
         "array_dependence",
         "sparse_jacobian",
+        "running_sums",
+        "places_in_line",
+        "recursive_elimination",
         "dependence",
         "polynomials",
         "absolute_values",
@@ -66,6 +69,7 @@ WINGS = {  # each imports only from those above it, and each file of a wing only
         "kinematics",
     ],
     "_mechanics": [
+        "structured_inertia",
         "lagrange",
         "pseudo_inverse",
         "sparse_saddle_point",

@@ -18,7 +18,7 @@ from .._program.jit import is_concrete
 from .._program.scalarise import scalarised
 from .._program.sparse_jacobian import MANY, jacobian
 from .._program.sparse_matrix import SparseMatrix, dense, row_sums
-from .constrained_root import Linear, root_of
+from .constrained_root import Linear, is_without_curvature, root_of
 from .contact import in_contact
 from .friction_elements import find_elements, with_all_masses
 from .lagrange import inertia, position_rows, rows_of, velocity_residual, velocity_rows
@@ -27,6 +27,7 @@ from .projection import metric_of_positions
 from .saddle_point import NO_INERTIA, Rows, is_determined, reach_of
 from .singular_directions import NOT_AFFINE, UNDEFINED, explained, not_affine_in
 from .stick_slip import first_mode, in_mode
+from .structured_inertia import StructuredInertia
 
 ITERATIONS = 16  # near the constraints four suffice
 WITHOUT_CURVATURE = 200  # of a step that leaves it out: each takes away a part, the more the nearer the start is
@@ -87,7 +88,9 @@ def nearest_state(flat: Flat, t, q0, v0, free: Sequence[int] | None = None) -> C
 
 
 def _part(M: lx.AbstractLinearOperator, moving: np.ndarray) -> lx.AbstractLinearOperator:
-    """Of M that of the coordinates `moving`; diagonal where there are many of them."""
+    """Of M that of the coordinates `moving`; diagonal where there are many of them, and in its structure where all of them move."""
+    if isinstance(M, StructuredInertia) and moving.size == M.size:
+        return M
     if isinstance(M, lx.DiagonalLinearOperator) and M.diagonal.size >= MANY:
         return lx.DiagonalLinearOperator(M.diagonal[moving])
     return lx.MatrixLinearOperator(M.as_matrix()[np.ix_(moving, moving)])
@@ -98,6 +101,8 @@ def _columns(G: Rows, moving: np.ndarray) -> Float[Array, "m k"] | SparseMatrix:
 
 
 def _is_finite(M: lx.AbstractLinearOperator) -> Bool[Array, ""]:
+    if isinstance(M, StructuredInertia):
+        return jnp.all(jnp.isfinite(M.slopes.values))
     return jnp.all(jnp.isfinite(M.diagonal if isinstance(M, lx.DiagonalLinearOperator) else M.as_matrix()))
 
 
@@ -127,7 +132,7 @@ def _nearest_position(flat: Flat, moving, t, q0, M) -> Float[Array, " n"]:
         g, G = position_rows(flat, t, q)
         reach = reach_of(q[moving], _off(g, row_sums(G), q) > _small(q))
         metric, G = M, _columns(G, moving)
-        if not (isinstance(G, SparseMatrix) and isinstance(M, lx.DiagonalLinearOperator)):  # there curvature would be no diagonal
+        if not is_without_curvature(M, G):
             G, straight = dense(G), M.as_matrix()
             curved = straight - jax.hessian(lambda q: multipliers @ flat.holonomic(t, q))(q)[np.ix_(moving, moving)]
             metric = lx.MatrixLinearOperator(jnp.where(is_determined(lx.MatrixLinearOperator(curved), G), curved, straight))
@@ -143,7 +148,8 @@ def _nearest_position(flat: Flat, moving, t, q0, M) -> Float[Array, " n"]:
             return jnp.concatenate([w[:free] + found.x, found.multipliers]), moved, i + 1
 
         start = jnp.concatenate([args[1][moving], jnp.zeros(size, like.dtype)])
-        most = WITHOUT_CURVATURE if isinstance(jax.eval_shape(linear, args, start).G, SparseMatrix) else ITERATIONS
+        step = jax.eval_shape(linear, args, start)
+        most = WITHOUT_CURVATURE if is_without_curvature(step.M, step.G) else ITERATIONS
         going_on = lambda carry: carry[1] & (carry[2] < most)
         return jax.lax.while_loop(going_on, newton, (start, jnp.array(True), jnp.array(0)))[0], None
 

@@ -11,6 +11,7 @@ from jaxtyping import Array, Float
 from .._program.implicit import implicit_root
 from .._program.sparse_matrix import SparseMatrix
 from .saddle_point import Rows, SaddlePoint, saddle_point, saddle_solver
+from .structured_inertia import StructuredInertia
 
 REFINEMENTS = 200  # of the derivative of a root, where curvature is left out of the step: each takes away a part
 
@@ -34,6 +35,11 @@ class Linear(NamedTuple):
         return -jnp.concatenate(solve(*jnp.split(residual, [self.f.size])))
 
 
+def is_without_curvature(M: Any, G: Any) -> bool:
+    """Whether the curvature of constraints is left out of a step: with it, M would lose its structure."""
+    return isinstance(M, StructuredInertia) or (isinstance(G, SparseMatrix) and isinstance(M, lx.DiagonalLinearOperator))
+
+
 def root_of(residual: Callable, linear: Callable, search: Callable, args: tuple, like: Float[Array, " w"]) -> tuple[Array, Any]:
     """w with residual(args, w) = 0, as `search(linear, args)` finds it, and what else that says; linear(args, w) is the slope there."""
     residual, of_residual = jax.closure_convert(residual, args, like)
@@ -44,7 +50,7 @@ def root_of(residual: Callable, linear: Callable, search: Callable, args: tuple,
 
     def change(everything, w, R):
         step = linear(everything[0], w, *everything[2])
-        if not isinstance(step.G, SparseMatrix):
+        if not is_without_curvature(step.M, step.G):
             return step.change(R)
         return _refined(lambda dw: jax.jvp(lambda w: of_all(everything, w), (w,), (dw,))[1], step, R)
 

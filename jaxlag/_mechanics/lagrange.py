@@ -14,15 +14,15 @@ from jaxtyping import Array, Float, PyTree
 from .._model.flat import Flat
 from .._model.system import System
 from .._model.validation import at_state
-from .._program.sparse_jacobian import jacobian
+from .._program.sparse_jacobian import MANY, jacobian
 from .._program.sparse_matrix import SparseMatrix, dense
+from .structured_inertia import structured_inertia
 
 
 def inertia(flat: Flat, t, q, v) -> tuple[lx.AbstractLinearOperator, Float[Array, " n"]]:
     """M and the force of the Lagrangian alone, ∂L/∂q − (∂²L/∂q̇∂q) q̇ − ∂²L/∂q̇∂t."""
     momentum = jax.grad(flat.lagrangian, argnums=2)
-    _, M = jacobian(lambda v: momentum(t, q, v), v)
-    M = lx.MatrixLinearOperator(M.as_matrix()) if isinstance(M, SparseMatrix) else M
+    M = structured_inertia(lambda v: flat.lagrangian(t, q, v), v) if v.size >= MANY else jacobian(lambda v: momentum(t, q, v), v)[1]
     _, carried = jax.jvp(lambda t, q: momentum(t, q, v), (t, q), (jnp.ones_like(t), v))
     return M, jax.grad(flat.lagrangian, argnums=1)(t, q, v) - carried
 

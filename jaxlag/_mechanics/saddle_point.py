@@ -8,14 +8,18 @@ import jax.numpy as jnp
 import lineax as lx
 from jaxtyping import Array, Bool, Float
 
+from .._program.recursive_elimination import Factors as Articulated
 from .._program.scalarise import scalarised
 from .._program.sparse_matrix import SparseMatrix, dense
 from .pseudo_inverse import Inverse, Request, applied, by_rows, everywhere, inverse_of
 from .sparse_saddle_point import factorised as sparsely_factorised
 from .sparse_saddle_point import is_satisfied
 from .sparse_saddle_point import solver as sparse_solver
+from .structured_inertia import StructuredInertia, by_inertia, is_positive, root_of_inverse
+from .structured_inertia import factorised as structure_factorised
 
 Rows = Float[Array, "m n"] | SparseMatrix
+FEW = 16  # rows, up to which M⁻¹Gᵀ is computed where M is full but has a structure
 
 
 class Sound(NamedTuple):
@@ -57,13 +61,22 @@ def saddle_point(M: lx.AbstractLinearOperator, G: Rows, f, c, reach: Float[Array
         found = saddle_point(M, G, f[:, None], c[:, None], reach)
         return found._replace(x=found.x[:, 0], multipliers=found.multipliers[:, 0])
     if not isinstance(M, lx.DiagonalLinearOperator):
-        return _saddle_point(M, dense(G), f, c, reach)
+        return _saddle_point(_for_rows(M, G), dense(G), f, c, reach)
     if isinstance(G, SparseMatrix):
         return _sparse_saddle_point(M, G, f, c)
     heavy = M.diagonal > jnp.finfo(f.dtype).eps ** 0.25 * jnp.max(jnp.abs(M.diagonal))
     divided = _saddle_point(lx.DiagonalLinearOperator(jnp.where(heavy, M.diagonal, 1)), G, f, c, reach)
     full = lambda: _saddle_point(lx.MatrixLinearOperator(M.as_matrix()), G, f, c, reach)
     return jax.lax.cond(everywhere(jnp.all(heavy)), lambda: divided, full)
+
+
+def _keeps_structure(M, G):
+    """Whether so few rows are to be solved for that M serves better by its structure than with all its numbers."""
+    return isinstance(M, StructuredInertia) and G.shape[0] <= FEW
+
+
+def _for_rows(M, G):
+    return M if _keeps_structure(M, G) or not isinstance(M, StructuredInertia) else lx.MatrixLinearOperator(M.as_matrix())
 
 
 def _saddle_point(M, G, f, c, reach) -> SaddlePoint:
@@ -85,7 +98,7 @@ def saddle_solver(M: lx.AbstractLinearOperator, G: Rows, f, c, reach: Float[Arra
     if isinstance(G, SparseMatrix) and isinstance(M, lx.DiagonalLinearOperator):
         solve, _ = _solver(M, G, sparsely_factorised(*jax.lax.stop_gradient((M, G))))
     else:
-        G = dense(G)
+        M, G = _for_rows(M, G), dense(G)
         solve, _ = _solver(M, G, _factorised(*jax.lax.stop_gradient((M, G, f[:, None], c[:, None], reach))))
 
     def solution(f, c):
@@ -101,7 +114,7 @@ class Factors(NamedTuple):
     """
 
     W: Float[Array, " m"] | None
-    cholesky: Float[Array, "n n"] | None
+    cholesky: Float[Array, "n n"] | Articulated | None
     inverse: Inverse
     determined: Bool[Array, ""]
     satisfied: Bool[Array, ""]
@@ -116,6 +129,9 @@ def _factorised(M, G, f, c, reach) -> Factors:
     if isinstance(M, lx.DiagonalLinearOperator):
         W, cholesky, determined = None, None, jnp.array(True)
         by_root = lambda B: B / jnp.sqrt(M.diagonal)[:, None]
+    elif isinstance(M, StructuredInertia):
+        W, cholesky = None, structure_factorised(M)
+        determined, by_root = is_positive(M, cholesky), root_of_inverse(M, cholesky)
     else:
         A, W = augmented(M.as_matrix(), G)
         cholesky = jnp.linalg.cholesky(jax.lax.optimization_barrier(A))  # the diagonal of A would be computed anew
@@ -123,7 +139,7 @@ def _factorised(M, G, f, c, reach) -> Factors:
         by_root = lambda B: jax.scipy.linalg.solve_triangular(cholesky, B, lower=True)
 
     def request():
-        length = None if reach is None else jnp.sqrt(reach @ M.as_matrix() @ reach)
+        length = None if reach is None else jnp.sqrt(reach @ (M.mv(reach) if isinstance(M, StructuredInertia) else M.as_matrix() @ reach))
         return Request(by_root(G.T).T, c, by_root(_load(G, W, f, c)), length)
 
     S = G @ _by_inertia(M, G, W, cholesky)(G.T)
@@ -140,6 +156,8 @@ def _by_inertia(M, G, W, cholesky):
     """B ↦ (M + GᵀWG)⁻¹ B."""
     if cholesky is None:
         return lambda B: B / M.diagonal[:, None]
+    if isinstance(M, StructuredInertia):
+        return by_inertia(M, cholesky)
     A = M.as_matrix() + G.T @ (W[:, None] * G)
     return lambda B: _solve(A, cholesky, B)
 
@@ -159,7 +177,9 @@ def _solution_jvp(primals, tangents):
     (M, G, f, c, factors), (dM, dG, df, dc, _) = primals, tangents
     x, multipliers = _solution(M, G, f, c, factors)
     solve, rotated = _solver(M, G, factors)
-    dx, d_multipliers = solve(df + dG.T @ multipliers - jax.vmap(dM.mv, 1, 1)(x), dc - dG @ x)
+    structured = isinstance(M, StructuredInertia)  # whose entries are factors of each other
+    turned = jax.jvp(lambda M: M.mv(x), (M,), (dM,))[1] if structured else jax.vmap(dM.mv, 1, 1)(x)
+    dx, d_multipliers = solve(df + dG.T @ multipliers - turned, dc - dG @ x)
     return (x, multipliers), (dx, d_multipliers + rotated(dG, multipliers))
 
 
@@ -187,6 +207,9 @@ def is_determined(M: lx.AbstractLinearOperator, G: Rows) -> Bool[Array, ""]:
     """Whether M is positive definite on the null space of G; a diagonal one beside sparse rows, everywhere."""
     if isinstance(G, SparseMatrix) and isinstance(M, lx.DiagonalLinearOperator):
         return jnp.all(M.diagonal > jnp.finfo(M.diagonal.dtype).eps * jnp.max(M.diagonal))
+    if _keeps_structure(M, G):
+        M = jax.lax.stop_gradient(M)
+        return is_positive(M, structure_factorised(M))
     A = jax.lax.stop_gradient(augmented(M.as_matrix(), dense(G))[0])
     return _is_positive(jnp.linalg.cholesky(A), A)
 

@@ -5,6 +5,7 @@ rods that each join two of many points take four directions in the plane, howeve
 """
 
 from collections.abc import Callable
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -32,6 +33,8 @@ def jacobian(function: Callable, x: Float[Array, " n"]) -> tuple[Float[Array, " 
     y, push = jax.linearize(function, x)
     if x.size >= MANY and (found := _by_arrays(function, push, x)) is not None:
         return y, found
+    if x.size >= MANY and y.size * SPARSE <= x.size:
+        return y, lx.MatrixLinearOperator(jax.jacrev(function)(x))  # of a few full rows, as of what the last link of a chain is held by
     pattern = np.ones((y.size, x.size), bool) if x.size <= MAX_DENSE_COLUMNS else sparsity_pattern(function, x)
     if pattern.shape[0] == pattern.shape[1] > MAX_DENSE_COLUMNS and np.array_equal(pattern, np.eye(x.size)):
         return y, lx.DiagonalLinearOperator(push(jnp.ones_like(x)))
@@ -57,9 +60,14 @@ def _by_arrays(function: Callable, push: Callable, x: Float[Array, " n"]) -> lx.
         return lx.DiagonalLinearOperator(push(jnp.ones_like(x)))
     if SPARSE * np.diff(pattern.indptr).max(initial=0) > n or SPARSE * max(color := colors(pattern)) >= n:
         return None
+    return entries(push, color, pattern, x)
+
+
+def entries(push: Callable, color: np.ndarray, pattern: Any, x: Float[Array, " n"]) -> SparseMatrix:
+    """The entries of a Jacobian, by directions of one color each."""
     places = Places.of(pattern)
     directions = along(push, color, x).T  # as they are computed: this way around they are read faster, too
-    return SparseMatrix(directions.ravel()[color[places.columns] * m + places.rows], places)
+    return SparseMatrix(directions.ravel()[color[places.columns] * places.shape[0] + places.rows], places)
 
 
 def along(push: Callable, color: np.ndarray, x: Float[Array, " n"]) -> Float[Array, "m c"]:

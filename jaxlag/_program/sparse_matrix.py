@@ -1,6 +1,7 @@
 """Matrices of which only the entries that are not zero by structure are kept: their places are known while tracing."""
 
 import functools
+import itertools
 from typing import Any
 
 import equinox as eqx
@@ -94,6 +95,15 @@ class SparseMatrix(eqx.Module):
         kept = kept[np.lexsort((new[self.places.columns[kept]], self.places.rows[kept]))]
         places = Places(self.places.rows[kept], new[self.places.columns[kept]], (self.shape[0], which.size))
         return SparseMatrix(self.values[kept], places)
+
+    def row_blocks(self, heights: tuple[int, ...]) -> list["SparseMatrix"]:
+        """The matrices that it consists of, one below the other."""
+        ends, parts = np.cumsum([0, *heights]), []
+        for start, end in itertools.pairwise(ends):
+            kept = slice(*np.searchsorted(self.places.rows, [start, end]))
+            places = Places(self.places.rows[kept] - start, self.places.columns[kept], (int(end - start), self.shape[1]))
+            parts.append(SparseMatrix(self.values[kept], places))
+        return parts
 
     def as_matrix(self) -> Float[Array, "m n"]:
         """With its zeros."""

@@ -2,8 +2,9 @@
 
 python tests/benchmarks/bench_growth.py [most links]
 
-By hand: for the chain S has three diagonals, in one call of a tridiagonal solve. Medians of 30 calls, each length in a process of its own;
-and 1 s of motion of 200 links and of 1000, each of unit length and mass; and its gradient in the mass of each link.
+By hand: for the chain S has three diagonals, in one call of a tridiagonal solve; in angles, the articulated inertias link by link. Medians
+of 30 calls, each length in a process of its own; and 1 s of motion of 200 links and of 1000, each of unit length and mass; and its
+gradient in the mass of each link.
 """
 
 import subprocess
@@ -46,6 +47,49 @@ def by_hand(q, v, params):
     return falling[1:] + (pull - jnp.concatenate([pull[1:], nothing])) / m, multipliers
 
 
+def chain_in_angles(n):
+    """The same chain, with running sums in L."""
+    import jax.numpy as jnp
+
+    import jaxlag as jl
+
+    def lagrangian(q, qdot, m, g, l):
+        vx, vy = jnp.cumsum(l * jnp.cos(q) * qdot), jnp.cumsum(l * jnp.sin(q) * qdot)
+        return jnp.sum(0.5 * m * (vx**2 + vy**2) + m * g * jnp.cumsum(l * jnp.cos(q)))
+
+    return jl.System(lagrangian), jnp.linspace(0.3, 1.2, n), {"m": 1.0, "g": 9.81, "l": 1.0}
+
+
+def by_hand_in_angles(q, v, params):
+    """q̈ by Featherstone's recursion: inertia and force of what hangs on each link, then the accelerations from the hook on."""
+    import jax.numpy as jnp
+    from jax import lax
+
+    m, g, l = params["m"], params["g"], params["l"]
+    zero = jnp.zeros(())
+    given = l * jnp.cos(q), l * jnp.sin(q), -l * jnp.sin(q) * v**2, l * jnp.cos(q) * v**2
+
+    def inwards(carry, link):
+        (xx, xy, yy, fx, fy), (c, s, bx, by) = carry, link
+        xx, yy, fy = xx + m, yy + m, fy - m * g
+        fx, fy = fx - xx * bx - xy * by, fy - xy * bx - yy * by  # of what hangs on it, if the link turned evenly
+        ux, uy = xx * c + xy * s, xy * c + yy * s
+        d = 1 / (c * ux + s * uy)
+        e = d * (c * fx + s * fy)
+        return (xx - d * ux * ux, xy - d * ux * uy, yy - d * uy * uy, fx - e * ux, fy - e * uy), (d * ux, d * uy, e)
+
+    def outwards(at, link):
+        (x, y), ((c, s, bx, by), (ux, uy, e)) = at, link
+        turn = e - ux * x - uy * y
+        return (x + c * turn + bx, y + s * turn + by), turn
+
+    _, inertias = lax.scan(inwards, (zero,) * 5, given, reverse=True)
+    return lax.scan(outwards, (zero, zero), (given, inertias))[1], None
+
+
+CHAINS = {"places": (chain, by_hand), "angles": (chain_in_angles, by_hand_in_angles)}
+
+
 def timed(function, *given, times=30):
     """The first call, and the median of others."""
     import jax
@@ -59,22 +103,24 @@ def timed(function, *given, times=30):
     return calls[0], float(np.median(calls[1:])), result
 
 
-def accelerations(n):
+def accelerations(n, kind):
     """One line of the table."""
     import jax
     import numpy as np
 
     import jaxlag as jl
 
-    system, q, params = chain(n)
+    make, of_hand = CHAINS[kind]
+    system, q, params = make(n)
     given = q, 0.1 * q[::-1], params
     first, each, found = timed(jax.jit(lambda *given: jl.acceleration(system, *given)), *given)
-    first_by_hand, each_by_hand, expected = timed(jax.jit(by_hand), *given)
+    first_by_hand, each_by_hand, expected = timed(jax.jit(of_hand), *given)
     off = float(np.abs(found.qddot - expected[0]).max() / np.abs(expected[0]).max())
-    print(f"{n:>7}{1e3 * each:>12.3f}{1e3 * each_by_hand:>12.3f}{each / each_by_hand:>8.2f}{first:>9.2f}{first_by_hand:>9.2f}{off:>11.1e}")
+    times = f"{1e3 * each:>12.3f}{1e3 * each_by_hand:>12.3f}{each / each_by_hand:>8.2f}{first:>9.2f}{first_by_hand:>9.2f}"
+    print(f"{n:>7} {kind}{times}{off:>11.1e}")
 
 
-def motion(n):
+def motion(n, kind):
     """1 s from rest."""
     import resource
 
@@ -83,16 +129,16 @@ def motion(n):
 
     import jaxlag as jl
 
-    system, q, params = chain(n)
+    system, q, params = CHAINS[kind][0](n)
     ts = np.linspace(0.0, 1.0, 11)
     run = lambda params: jl.simulate(system, q, jnp.zeros_like(q), ts, params, works=True)
     first, each, found = timed(run, params, times=5)
     balance = float(np.abs(found.balance()).max())
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e3
-    print(f"{n:>7} links, 1 s: {each:.3f} s, the first {first:.1f} s; balance {balance:.1e}; {peak:.0f} MB")
+    print(f"{n:>7} links in {kind}, 1 s: {each:.3f} s, the first {first:.1f} s; balance {balance:.1e}; {peak:.0f} MB")
 
 
-def gradient(n):
+def gradient(n, kind):
     """Where the last link is after 1 s, by the mass of each."""
     import jax
     import jax.numpy as jnp
@@ -100,28 +146,31 @@ def gradient(n):
 
     import jaxlag as jl
 
-    system, q, params = chain(n)
-    weight = lambda q, qdot, m, g: jnp.sum(0.5 * m * jnp.sum(qdot**2, axis=1) - m * g * q[:, 1])
-    system = jl.System(weight, holonomic=dict(system.holonomic))
+    system, q, params = CHAINS[kind][0](n)
+    if kind == "places":
+        weight = lambda q, qdot, m, g: jnp.sum(0.5 * m * jnp.sum(qdot**2, axis=1) - m * g * q[:, 1])
+        system = jl.System(weight, holonomic=dict(system.holonomic))
     ts = np.linspace(0.0, 1.0, 11)
-    end = lambda m: jl.simulate(system, q, jnp.zeros_like(q), ts, params | {"m": m}).q[-1, -1, 0]
+    end = lambda m: jnp.ravel(jl.simulate(system, q, jnp.zeros_like(q), ts, params | {"m": m}).q[-1, -1])[0]
     _, each, _ = timed(end, jnp.ones(n), times=5)
     first, reverse, _ = timed(jax.jit(jax.grad(end)), jnp.ones(n), times=5)
-    print(f"{n:>7} links, gradient in {n} masses: {reverse:.3f} s, {reverse / each:.1f} times the motion, the first {first:.1f} s")
+    print(
+        f"{n:>7} links in {kind}, gradient in {n} masses: {reverse:.3f} s, {reverse / each:.1f} times the motion, the first {first:.1f} s"
+    )
 
 
 def main():
-    if len(sys.argv) == 3:
+    if len(sys.argv) == 4:
         import jax
 
         jax.config.update("jax_enable_x64", True)
-        return {"acceleration": accelerations, "motion": motion, "gradient": gradient}[sys.argv[1]](int(sys.argv[2]))
+        return {"acceleration": accelerations, "motion": motion, "gradient": gradient}[sys.argv[1]](int(sys.argv[2]), sys.argv[3])
     most = int(sys.argv[1]) if len(sys.argv) > 1 else LENGTHS[-1]
-    print(f"{'links':>7}{'jaxlag ms':>12}{'by hand ms':>12}{'ratio':>8}{'first s':>9}{'by hand':>9}{'difference':>11}", flush=True)
+    print(f"{'links':>14}{'jaxlag ms':>12}{'by hand ms':>12}{'ratio':>8}{'first s':>9}{'by hand':>9}{'difference':>11}", flush=True)
     for kind, lengths in (("acceleration", LENGTHS), ("motion", MOTIONS), ("gradient", MOTIONS[:1])):
         for n in lengths:
-            if n <= most:
-                subprocess.run([sys.executable, __file__, kind, str(n)], check=True)
+            for coordinates in CHAINS if n <= most else ():
+                subprocess.run([sys.executable, __file__, kind, str(n), coordinates], check=True)
 
 
 if __name__ == "__main__":

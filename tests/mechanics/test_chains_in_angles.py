@@ -1,0 +1,193 @@
+"""Mass matrices of many coordinates: chains in angles, where they are full, and sparse ones, against dense ones by hand in NumPy."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.linalg import eigvalsh_tridiagonal
+
+import jaxlag as jl
+
+RNG = np.random.default_rng(3)
+GRAVITY = 9.81
+
+
+def lagrangian(q, qdot, m, l, g):
+    """Masses at the ends of links that turn by absolute angles from the vertical."""
+    heights = -jnp.cumsum(l * jnp.cos(q))
+    vx, vy = jnp.cumsum(l * jnp.cos(q) * qdot), jnp.cumsum(l * jnp.sin(q) * qdot)
+    return jnp.sum(0.5 * m * (vx**2 + vy**2) - m * g * heights)
+
+
+CHAIN = jl.System(lagrangian)
+
+
+def state(n):
+    given = {"m": RNG.uniform(0.5, 2.0, n), "l": RNG.uniform(0.8, 1.2, n), "g": GRAVITY}
+    return RNG.uniform(-1, 1, n), RNG.normal(size=n), given
+
+
+def by_hand(q, v, given):
+    """M and f of the chain: m_ij l_i l_j cos(φ_i − φ_j) with m_ij the mass beyond both links."""
+    m, l = given["m"], given["l"]
+    beyond = np.cumsum(m[::-1])[::-1]
+    i = np.arange(q.size)
+    shared = beyond[np.maximum(i[:, None], i)] * np.outer(l, l)
+    turn = q[:, None] - q
+    return shared * np.cos(turn), -(shared * np.sin(turn)) @ v**2 - beyond * l * given["g"] * np.sin(q)
+
+
+def close(found, expected, tolerance):
+    np.testing.assert_allclose(found, expected, rtol=0, atol=tolerance * np.abs(expected).max())
+
+
+@pytest.mark.parametrize("n", [80, 300])
+def test_acceleration_of_a_chain(n):
+    q, v, given = state(n)
+    close(jl.acceleration(CHAIN, q, v, given).qddot, np.linalg.solve(*by_hand(q, v, given)), 1e-10)
+
+
+def test_velocities_by_a_directional_derivative_and_several_chains_at_once():
+    """The same chain, written with the places alone."""
+
+    def from_places(q, qdot, m, l, g):
+        places = lambda q: jnp.cumsum(l[:, None] * jnp.stack([jnp.sin(q), -jnp.cos(q)], axis=1), axis=0)
+        x, v = jax.jvp(places, (q,), (qdot,))
+        return jnp.sum(0.5 * m * jnp.sum(v**2, axis=1) - m * g * x[:, 1])
+
+    system, (q, v, given) = jl.System(from_places), state(80)
+    qs = np.stack([q, -0.5 * q, q[::-1]])
+    found = jax.vmap(lambda q: jl.acceleration(system, q, v, given).qddot)(qs)
+    for q, qddot in zip(qs, found, strict=True):
+        close(qddot, np.linalg.solve(*by_hand(q, v, given)), 1e-10)
+
+
+def test_derivatives_in_each_mass_and_length():
+    """d(uᵀq̈) by M⁻¹(df − dM q̈), the closed forms differentiated by complex steps; forward, reverse, and of second order."""
+    q, v, given = state(80)
+    u, along = RNG.normal(size=80), {"m": RNG.normal(size=80), "l": 0.1 * RNG.normal(size=80), "g": 0.3}
+    moved = lambda h: {name: given[name] + h * along[name] for name in given}
+
+    def value(h):
+        M, f = by_hand(q + 0j, v, moved(h))
+        return u @ np.linalg.solve(M, f)
+
+    expected = np.imag(value(1e-30j)) / 1e-30
+    bend = (np.imag(value(1e-4 + 1e-30j)) - np.imag(value(-1e-4 + 1e-30j))) / 2e-34
+    ours = lambda given: u @ jl.acceleration(CHAIN, q, v, given).qddot
+    gradient = jax.grad(ours)(given)
+    np.testing.assert_allclose(sum(np.sum(gradient[name] * along[name]) for name in along), expected, rtol=1e-10)
+    slope = lambda given: jax.jvp(ours, (given,), (along,))[1]
+    np.testing.assert_allclose(jax.jvp(slope, (given,), (along,)), [expected, bend], rtol=1e-6)
+
+
+def numbers_in(program):
+    """The sizes of all arrays of a program, and how many equations there are."""
+    sizes, count = [0], 0
+    for equation in program.eqns:
+        sizes += [getattr(v.aval, "size", 0) for v in (*equation.invars, *equation.outvars)]
+        count += 1
+        for value in equation.params.values():
+            for part in value if isinstance(value, (tuple, list)) else [value]:
+                if hasattr(part, "eqns") or hasattr(part, "jaxpr"):
+                    within = numbers_in(getattr(part, "jaxpr", part))
+                    sizes, count = [*sizes, within[0]], count + within[1]
+    return max(sizes), count
+
+
+def test_no_matrix_of_all_coordinates():
+    programs = {}
+    for n in (256, 2000, 4096):
+        program = jax.make_jaxpr(lambda q, v, given: jl.acceleration(CHAIN, q, v, given))(*state(n))
+        largest, programs[n] = numbers_in(program.jaxpr)
+        assert largest <= 40 * n
+        assert max(np.size(x) for x in program.consts) <= 40 * n if program.consts else True
+    assert programs[256] == programs[2000] == programs[4096]
+
+
+def test_single_precision():
+    q, v, given = state(80)
+    single = lambda tree: jax.tree.map(lambda x: jnp.asarray(x, jnp.float32), tree)
+    found = jl.acceleration(CHAIN, *single((q, v, given))).qddot
+    assert found.dtype == jnp.float32
+    close(found, np.linalg.solve(*by_hand(q, v, given)), 1e-3)
+
+
+def laguerre_mode(n, root):
+    """Links 1 to n of the mode: differences Dₖ₊₁ = (k Dₖ − ξ Lₖ)/(k + 1) of Lₖ(ξ), which is how far mass k from below swings."""
+    differences, value, difference = [], 1.0, 0.0
+    for k in range(n):
+        difference = (k * difference - root * value) / (k + 1)
+        value += difference
+        differences.append(difference)
+    return np.array(differences[::-1])
+
+
+def test_a_hanging_chain_swings_as_laguerre_says():
+    """Near rest each mode of 500 links has ω² = g ξ/l with Lₙ(ξ) = 0, ξ by the three terms of its recursion."""
+    n = 500
+    given = {"m": np.ones(n), "l": np.ones(n), "g": GRAVITY}
+    roots = eigvalsh_tridiagonal(2.0 * np.arange(n) + 1, np.arange(1.0, n), select="i", select_range=(0, 4))
+    turned = jax.jit(lambda q: jax.jvp(lambda q: jl.acceleration(CHAIN, q, jnp.zeros(n), given).qddot, (jnp.zeros(n),), (q,))[1])
+    for root in roots:
+        mode = laguerre_mode(n, root)
+        close(-turned(mode), GRAVITY * root * mode, 1e-8)
+
+
+def rods(q, qdot, m, l):
+    """Uniform rods, turned against one another, on a sledge."""
+    angle, rate = jnp.cumsum(q["turn"]), jnp.cumsum(q["turn"] * 0 + qdot["turn"])
+    vx, vy = l * jnp.cos(angle) * rate, l * jnp.sin(angle) * rate
+    x, y = qdot["x"] + jnp.cumsum(vx) - vx / 2, jnp.cumsum(vy) - vy / 2
+    return 0.5 * m * jnp.sum(x**2 + y**2 + l**2 * rate**2 / 12) + 2.0 * qdot["x"] ** 2
+
+
+def test_rods_on_a_sledge_turned_against_one_another():
+    """M = JᵀJ of velocities by hand. Relative angles make it badly conditioned, so M q̈ is compared with the force, to rounding."""
+    n = 70
+    q, v = {"turn": RNG.uniform(-0.2, 0.2, n), "x": 0.3}, {"turn": np.zeros(n), "x": 0.0}
+    pull = RNG.normal(size=n + 1)
+    system = jl.System(rods, force=lambda: {"turn": pull[:n], "x": pull[n]})
+    found = jl.acceleration(system, q, v, {"m": 1.3, "l": 0.7}).qddot
+    angle, C = np.cumsum(q["turn"]), np.tril(np.ones((n, n)))
+    half = C - np.eye(n) / 2
+    sledge = np.eye(1, n + 1, n)
+    J = [half @ np.diag(0.7 * f(angle)) @ C for f in (np.cos, np.sin)]
+    vx, vy = np.hstack([J[0], np.ones((n, 1))]), np.hstack([J[1], np.zeros((n, 1))])
+    turning = np.hstack([0.7 * C, np.zeros((n, 1))])
+    M = 1.3 * (vx.T @ vx + vy.T @ vy + turning.T @ turning / 12) + 4.0 * sledge.T @ sledge
+    qddot = np.append(found["turn"], found["x"])
+    assert np.max(np.abs(M @ qddot - pull) / (np.abs(M) @ np.abs(qddot))) < 1e-14
+
+
+def test_a_chain_held_at_its_end():
+    """Two rows of all angles; M, G and the forces by hand."""
+    q, v, given = state(80)
+    end = lambda q, l: jnp.stack([jnp.sum(l * jnp.sin(q)), -jnp.sum(l * jnp.cos(q))])
+    held = jl.System(lagrangian, holonomic={"pin": end})
+    M, f = by_hand(q, v, given)
+    l = given["l"]
+    G = np.stack([l * np.cos(q), l * np.sin(q)])
+    gamma = np.stack([-l * np.sin(q), l * np.cos(q)]) @ v**2
+    x = np.linalg.solve(np.block([[M, -G.T], [G, np.zeros((2, 2))]]), np.append(f, -gamma))
+    found = jl.acceleration(held, q, v, given)
+    close(found.qddot, x[:80], 1e-9)
+    close(found.multipliers["pin"], x[80:], 1e-9)
+
+
+@pytest.mark.parametrize("n", [90])
+def test_a_bar_of_finite_elements(n):
+    """Consistent masses: M has three diagonals, a grounded bar in a chain of linear elements."""
+    energy = lambda q, qdot, m: jnp.sum(m / 6 * (qdot[1:] ** 2 + qdot[1:] * qdot[:-1] + qdot[:-1] ** 2)) - jnp.sum(jnp.diff(q) ** 2)
+    m, q, v = RNG.uniform(0.5, 2, n - 1), RNG.normal(size=n), RNG.normal(size=n)
+    M = np.zeros((n, n))
+    for k, each in enumerate(m):
+        M[k : k + 2, k : k + 2] += each / 6 * np.array([[2, 1], [1, 2]])
+    force = np.append(2 * np.diff(q), 0) - np.append(0, 2 * np.diff(q))
+    close(jl.acceleration(jl.System(energy), q, v, {"m": m}).qddot, np.linalg.solve(M, force), 1e-12)
+
+
+def test_a_chain_without_mass_at_its_end_is_refused():
+    q, v, given = state(80)
+    with pytest.raises(ValueError, match="must give every direction inertia"):
+        jl.acceleration(CHAIN, q, v, given | {"m": np.append(given["m"][:-1], 0.0)})
