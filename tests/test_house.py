@@ -34,6 +34,7 @@ WINGS = {  # each imports only from those above it, and each file of a wing only
         "compilation_cache",
         "sparse_matrix",
         "block_tridiagonal",
+        "block_tridiagonal_lu",
         "array_dependence",
         "sparse_jacobian",
         "dependence",

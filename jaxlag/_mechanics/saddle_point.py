@@ -9,6 +9,7 @@ import lineax as lx
 from jaxtyping import Array, Bool, Float
 
 from .._program.scalarise import scalarised
+from .._program.sparse_jacobian import MANY
 from .._program.sparse_matrix import SparseMatrix, dense
 from .pseudo_inverse import Inverse, Request, applied, by_rows, everywhere, inverse_of
 from .sparse_saddle_point import factorised as sparsely_factorised
@@ -60,10 +61,19 @@ def saddle_point(M: lx.AbstractLinearOperator, G: Rows, f, c, reach: Float[Array
         return _saddle_point(M, dense(G), f, c, reach)
     if isinstance(G, SparseMatrix):
         return _sparse_saddle_point(M, G, f, c)
+    if not c.size and f.shape[0] >= MANY:
+        return _free(M, f, c)
     heavy = M.diagonal > jnp.finfo(f.dtype).eps ** 0.25 * jnp.max(jnp.abs(M.diagonal))
     divided = _saddle_point(lx.DiagonalLinearOperator(jnp.where(heavy, M.diagonal, 1)), G, f, c, reach)
     full = lambda: _saddle_point(lx.MatrixLinearOperator(M.as_matrix()), G, f, c, reach)
     return jax.lax.cond(everywhere(jnp.all(heavy)), lambda: divided, full)
+
+
+def _free(M: lx.DiagonalLinearOperator, f, c) -> SaddlePoint:
+    """Without constraints each acceleration is that of its mass alone, however unlike these are: no matrix is needed beside."""
+    there = M.diagonal > 0
+    x = jnp.where(there[:, None], f / jnp.where(there, M.diagonal, 1)[:, None], jnp.nan)
+    return SaddlePoint(x, c, Sound(jnp.all(there), jnp.array(True)))
 
 
 def _saddle_point(M, G, f, c, reach) -> SaddlePoint:
