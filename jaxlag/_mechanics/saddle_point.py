@@ -197,7 +197,7 @@ def is_determined(M: lx.AbstractLinearOperator, G: Rows) -> Bool[Array, ""]:
     """Whether M is positive definite on the null space of G; a diagonal one beside sparse rows, everywhere."""
     if isinstance(G, SparseMatrix) and isinstance(M, lx.DiagonalLinearOperator):
         return jnp.all(M.diagonal > jnp.finfo(M.diagonal.dtype).eps * jnp.max(M.diagonal))
-    if isinstance(M, lx.DiagonalLinearOperator) and not G.shape[0] and M.diagonal.size >= MANY:
+    if isinstance(M, lx.DiagonalLinearOperator) and not len(dense(G)) and M.diagonal.size >= MANY:
         return jnp.all(M.diagonal > 0)
     A = jax.lax.stop_gradient(augmented(M.as_matrix(), dense(G))[0])
     return _is_positive(jnp.linalg.cholesky(A), A)

@@ -10,7 +10,6 @@ Source: Golub & Van Loan, Matrix Computations, 4th ed., section 4.5.
 import functools
 from typing import NamedTuple
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
