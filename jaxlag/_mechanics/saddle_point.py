@@ -10,6 +10,7 @@ from jaxtyping import Array, Bool, Float
 
 from .._program.recursive_elimination import Factors as Articulated
 from .._program.scalarise import scalarised
+from .._program.sparse_jacobian import MANY
 from .._program.sparse_matrix import SparseMatrix, dense
 from .pseudo_inverse import Inverse, Request, applied, by_rows, everywhere, inverse_of
 from .sparse_saddle_point import factorised as sparsely_factorised
@@ -64,6 +65,8 @@ def saddle_point(M: lx.AbstractLinearOperator, G: Rows, f, c, reach: Float[Array
         return _saddle_point(_for_rows(M, G), dense(G), f, c, reach)
     if isinstance(G, SparseMatrix):
         return _sparse_saddle_point(M, G, f, c)
+    if not c.size and f.shape[0] >= MANY:
+        return _free(M, f, c)
     heavy = M.diagonal > jnp.finfo(f.dtype).eps ** 0.25 * jnp.max(jnp.abs(M.diagonal))
     divided = _saddle_point(lx.DiagonalLinearOperator(jnp.where(heavy, M.diagonal, 1)), G, f, c, reach)
     full = lambda: _saddle_point(lx.MatrixLinearOperator(M.as_matrix()), G, f, c, reach)
@@ -77,6 +80,13 @@ def _keeps_structure(M, G):
 
 def _for_rows(M, G):
     return M if _keeps_structure(M, G) or not isinstance(M, StructuredInertia) else lx.MatrixLinearOperator(M.as_matrix())
+
+
+def _free(M: lx.DiagonalLinearOperator, f, c) -> SaddlePoint:
+    """Without constraints each acceleration is that of its mass alone, however unlike these are: no matrix is needed beside."""
+    there = M.diagonal > 0
+    x = jnp.where(there[:, None], f / jnp.where(there, M.diagonal, 1)[:, None], jnp.nan)
+    return SaddlePoint(x, c, Sound(jnp.all(there), jnp.array(True)))
 
 
 def _saddle_point(M, G, f, c, reach) -> SaddlePoint:
@@ -210,6 +220,8 @@ def is_determined(M: lx.AbstractLinearOperator, G: Rows) -> Bool[Array, ""]:
     if _keeps_structure(M, G):
         M = jax.lax.stop_gradient(M)
         return is_positive(M, structure_factorised(M))
+    if isinstance(M, lx.DiagonalLinearOperator) and not len(dense(G)) and M.diagonal.size >= MANY:
+        return jnp.all(M.diagonal > 0)
     A = jax.lax.stop_gradient(augmented(M.as_matrix(), dense(G))[0])
     return _is_positive(jnp.linalg.cholesky(A), A)
 

@@ -29,6 +29,7 @@ from .progress import Bar
 from .protocol import Arguments, FirstOrderSystem, Scales
 from .results import RESULTS, from_diffrax
 from .runge_kutta import Dop853, ExplicitRungeKutta, is_explicit
+from .sparse_implicit import in_structure
 from .step_size import GuardedController
 from .stick_slip_solver import StickSlipSolver
 from .variational import VariationalEquations, derived, varied_along, with_variations
@@ -163,7 +164,7 @@ def by_diffrax(
     projected = alone(equations.projected) if equations.projection else None
     solution = dfx.diffeqsolve.__wrapped__(  # all is within a program already, and `equinox.filter_jit` would keep what it is given
         dfx.ODETerm(alone(equations.rates)),
-        _wrapped(options, equations, projected, adjoint),
+        _wrapped(options, equations, projected, adjoint, (t0, y0, args)),
         t0,
         ts[-1],
         None,
@@ -182,9 +183,9 @@ def by_diffrax(
     return ys, from_diffrax(solution.result), stats | {"last": jax.lax.stop_gradient((last_t[0], last_y[0]))}
 
 
-def _wrapped(options, equations, projected, adjoint):
+def _wrapped(options, equations, projected, adjoint, start):
     """The chosen solver, with what the equations ask for at the ends of its steps."""
-    solver = options.solver
+    solver = in_structure(options.solver, equations, *start)
     if isinstance(adjoint, dfx.ForwardMode):
         if isinstance(solver, ExplicitRungeKutta):
             solver = dataclasses.replace(solver, reverse=False)
@@ -211,7 +212,7 @@ def in_one_loop(
     adjoint = dfx.RecursiveCheckpointAdjoint() if reverse else dfx.ForwardMode()
     meter, dense = Meter() if options.progress else dfx.NoProgressMeter(), not has_nodes(equations, args.params)
     back = in_one_kernel(equations.projected) if dense else equations.projected
-    solver = _wrapped(options, equations, back if equations.projection else None, adjoint)
+    solver = _wrapped(options, equations, back if equations.projection else None, adjoint, (t0, y0, args))
     numbers = y0, t0, args, ts, tolerances
     ys, (result, stats) = integrated(equations, solver, options.max_steps, meter, *numbers, directions, reverse=reverse, dense=dense)
     if dense and equations.projection:

@@ -63,7 +63,9 @@ def in_a_process(folder, seed):
 
 @pytest.mark.slow
 def test_a_second_process_compiles_nothing(tmp_path):
-    """Nor does it trace what is large. A program is not kept if it calls Python, and not found if it differs, e.g. by the order of a set, from process to process."""
+    """Nor does it trace what is large. A program is not kept if it calls Python, and not found if it differs from process to process, as
+    by the order of a set.
+    """
     (first, lowered_first), (second, lowered) = (in_a_process(tmp_path, seed) for seed in "12")
     assert first.keys() == second.keys() and sum(asked - read for _, asked, read in first.values()) > len(first)
     large = {"jit(_trajectory)", "jit(solved)", "jit(_linearise)"}
