@@ -25,6 +25,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.experimental import serialize_executable
 from jax.experimental.compilation_cache import compilation_cache
+from jax.tree_util import PyTreeDef, default_registry
 
 from .description import NotDescribable, Words
 from .user_calls import LEDGER, Call
@@ -143,7 +144,7 @@ def _head(words, out_tree) -> tuple[str, bytes]:
     calls = [LEDGER.of(function) for function in words.functions]
     name, content = f"jaxlag-{words.digest()}-{_answers(words, calls)}-cache", io.BytesIO()
     try:
-        for part in (calls, jax.tree.unflatten(out_tree, range(out_tree.num_leaves))):
+        for part in (calls, out_tree):
             _Pickler(content, words.objects).dump(part)
     except Exception as error:  # what cannot be pickled says so in many ways
         raise NotDescribable(str(error)) from error
@@ -182,9 +183,9 @@ def _read(file, words, arrays):
             answers = _answers(words, _Unpickler(content, words.objects).load())
             if not file.name.endswith(f"-{answers}-cache"):
                 return None
-            example, payload = _Unpickler(content, words.objects).load(), content.read()
-        structures = jax.tree.structure(((arrays,), {})), jax.tree.structure(example)
-        return serialize_executable.deserialize_and_load(payload, *structures, execution_devices=jax.devices()[:1])
+            out_tree, payload = _Unpickler(content, words.objects).load(), content.read()
+        in_tree = jax.tree.structure(((arrays,), {}))
+        return serialize_executable.deserialize_and_load(payload, in_tree, out_tree, execution_devices=jax.devices()[:1])
     except Exception:  # a damaged file; or the user's functions are other ones, which may do anything with such arguments
         return None
 
@@ -206,10 +207,12 @@ class _Pickler(pickle.Pickler):
         return self.numbers.get(id(x))
 
     def reducer_override(self, x):
-        """A structure as a tree of numbers: by itself it can be pickled only if it is one of Python's own containers."""
-        if not isinstance(x, jax.tree_util.PyTreeDef):
-            return NotImplemented
-        return jax.tree.structure, (jax.tree.unflatten(x, range(x.num_leaves)),)
+        """A structure node by node: by itself it can be pickled only if it is one of Python's own containers."""
+        return (_node, (x.node_data(), x.children())) if isinstance(x, PyTreeDef) else NotImplemented
+
+
+def _node(data, children):
+    return jax.tree.structure(0) if data is None else PyTreeDef.from_node_data_and_children(default_registry, data, children)
 
 
 class _Unpickler(pickle.Unpickler):
