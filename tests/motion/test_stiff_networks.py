@@ -132,6 +132,7 @@ def test_what_couples_everything_is_solved_as_before():
     np.testing.assert_allclose(found.q, expected, atol=1e-5)
 
 
+@pytest.mark.slow
 def test_single_precision_and_several_at_once():
     stiffness = np.array([5e4, 1e5, 2e5])
     q = start(40)
