@@ -132,6 +132,7 @@ def test_what_couples_everything_is_solved_as_before():
     np.testing.assert_allclose(found.q, expected, atol=1e-5)
 
 
+@pytest.mark.slow
 def test_single_precision_and_several_at_once():
     stiffness = np.array([5e4, 1e5, 2e5])
     q = start(40)
@@ -142,3 +143,14 @@ def test_single_precision_and_several_at_once():
     found = jl.simulate(CHAIN, *single, solver=STIFF)
     assert found.q.dtype == np.float32
     np.testing.assert_allclose(found.q, expected[:, 0], atol=1e-2)
+
+
+def test_many_free_points_of_unlike_masses():
+    """Each moves by its own mass, a billionth of another's or not; one without any is named."""
+    n = 64
+    system = jl.System(lambda q, qdot, m: 0.5 * jnp.sum(m * qdot**2) - jnp.sum(jnp.cos(q)))
+    m, q = np.geomspace(1e-9, 1.0, n), np.linspace(0.1, 1.0, n)
+    np.testing.assert_allclose(jl.acceleration(system, q, 0 * q, {"m": m}).qddot, np.sin(q) / m, rtol=1e-13)
+    m[3] = 0.0
+    with pytest.raises(ValueError, match="mass matrix is singular"):
+        jl.acceleration(system, q, 0 * q, {"m": m})
