@@ -124,6 +124,7 @@ WINGS = {  # each imports only from those above it, and each file of a wing only
         "integrate",
         "solution_map",
         "simulate",
+        "members",
         "simulate_many",
     ],
     "_linear": [
