@@ -84,6 +84,7 @@ WINGS = {  # each imports only from those above it, and each file of a wing only
         "consistent_state",
         "acceleration",
         "power",
+        "couplings",
         "findings",
         "examine",
     ],

@@ -66,8 +66,7 @@ def in_two_processes():
         free.bind(("127.0.0.1", 0))
         port = str(free.getsockname()[1])
     environment = os.environ | {"XLA_FLAGS": "--xla_force_host_platform_device_count=2", "PYTHONPATH": _path()}
-    arguments = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True, "env": environment, "cwd": Path(__file__).parent.parent}
-    both = [subprocess.Popen([sys.executable, "-c", JOIN, str(number), port], **arguments) for number in range(2)]
+    both = [_started([sys.executable, "-c", JOIN, str(number), port], environment) for number in range(2)]
     try:
         printed = [process.communicate(timeout=LONGEST) for process in both]
     finally:
@@ -75,6 +74,11 @@ def in_two_processes():
             process.kill()
     assert [process.returncode for process in both] == [0, 0], [errors[-1000:] for _, errors in printed]
     return [json.loads(out.splitlines()[-1]) for out, _ in printed]
+
+
+def _started(command, environment):
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
+    return subprocess.Popen(command, env=environment, cwd=Path(__file__).parent.parent, **pipes)
 
 
 def _path():

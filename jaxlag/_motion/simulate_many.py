@@ -1,7 +1,7 @@
 """Many motions of one system at once."""
 
 import functools
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import diffrax as dfx

@@ -3,14 +3,16 @@
 python tests/benchmarks/bench_growth.py [most links]
 
 By hand: for the chain S has three diagonals, in one call of a tridiagonal solve. Medians of 30 calls, each length in a process of its own;
-and 1 s of motion of 200 links and of 1000, each of unit length and mass; and its gradient in the mass of each link.
+1 s of motion of 200 links and of 1000, each of unit length and mass; and its gradient in the mass of each link. Beside the rods: the same
+chain, at rest, as a tree of hinges in MuJoCo, which nests no more than 1024 bodies; without the forces in the hinges. Its accelerations of
+the points are compared with those of the rods.
 """
 
 import subprocess
 import sys
 from time import perf_counter
 
-LENGTHS, MOTIONS = (64, 256, 1024, 4096, 10_000), (200, 1000)
+LENGTHS, MOTIONS, HINGES = (64, 256, 1024, 4096, 10_000), (200, 1000), (64, 256, 1000)
 
 
 def chain(n):
@@ -74,6 +76,47 @@ def accelerations(n):
     print(f"{n:>7}{1e3 * each:>12.3f}{1e3 * each_by_hand:>12.3f}{each / each_by_hand:>8.2f}{first:>9.2f}{first_by_hand:>9.2f}{off:>11.1e}")
 
 
+def hinged_in_mujoco(n, angles):
+    """Points on massless links, each hinged to the one before; the angles of the links against the vertical."""
+    import mujoco
+    import numpy as np
+
+    spec = mujoco.MjSpec()
+    spec.option.gravity = [0, 0, -9.81]
+    body = spec.worldbody
+    for k in range(n):
+        at = [float(k > 0), 0, 0]  # along the link, which lies along x where its angle is zero
+        body = body.add_body(pos=at, mass=1.0, ipos=[1, 0, 0], inertia=[1e-9] * 3, explicitinertial=True)
+        body.add_joint(type=mujoco.mjtJoint.mjJNT_HINGE, axis=[0, 1, 0])
+    model = spec.compile()
+    data = mujoco.MjData(model)
+    data.qpos[:] = np.diff(np.pi / 2 - angles, prepend=0)
+    return model, data
+
+
+def hinges(n):
+    """One line: MuJoCo's accelerations beside those of the rods, from rest."""
+    try:
+        import mujoco
+    except ImportError:
+        return print(f"{n:>7} hinges: skipped, since MuJoCo is not installed")
+    import jax
+    import jax.numpy as jnp
+    import numpy as np
+
+    import jaxlag as jl
+
+    system, q, params = chain(n)
+    _, of_rods, found = timed(jax.jit(lambda *given: jl.acceleration(system, *given)), q, jnp.zeros_like(q), params)
+    angles = np.linspace(0.3, 1.2, n)
+    model, data = hinged_in_mujoco(n, angles)
+    _, of_hinges, _ = timed(lambda: mujoco.mj_forward(model, data))
+    turning = -np.cumsum(data.qacc)[:, None] * np.stack([np.cos(angles), np.sin(angles)], axis=1)
+    off = np.abs(np.cumsum(turning, axis=0) - found.qddot).max() / np.abs(found.qddot).max()
+    times = f"MuJoCo {1e3 * of_hinges:.3f} ms, rods {1e3 * of_rods:.3f} ms: {of_hinges / of_rods:.1f} times"
+    print(f"{n:>7} hinges: {times}; difference {off:.0e}")
+
+
 def motion(n):
     """1 s from rest."""
     import resource
@@ -115,10 +158,11 @@ def main():
         import jax
 
         jax.config.update("jax_enable_x64", True)
-        return {"acceleration": accelerations, "motion": motion, "gradient": gradient}[sys.argv[1]](int(sys.argv[2]))
+        kinds = {"acceleration": accelerations, "hinges": hinges, "motion": motion, "gradient": gradient}
+        return kinds[sys.argv[1]](int(sys.argv[2]))
     most = int(sys.argv[1]) if len(sys.argv) > 1 else LENGTHS[-1]
     print(f"{'links':>7}{'jaxlag ms':>12}{'by hand ms':>12}{'ratio':>8}{'first s':>9}{'by hand':>9}{'difference':>11}", flush=True)
-    for kind, lengths in (("acceleration", LENGTHS), ("motion", MOTIONS), ("gradient", MOTIONS[:1])):
+    for kind, lengths in (("acceleration", LENGTHS), ("hinges", HINGES), ("motion", MOTIONS), ("gradient", MOTIONS[:1])):
         for n in lengths:
             if n <= most:
                 subprocess.run([sys.executable, __file__, kind, str(n)], check=True)
