@@ -155,9 +155,8 @@ def map_batch(of_one: Callable[..., Any], batch: ExperimentBatch, z: Any, *commo
         return jax.tree.map(lambda x: x[None], of_one(eqx.combine(first(arrays), others), z[0], *common))
     numbers, rest = eqx.partition(common, eqx.is_array)
     one = lambda given, numbers: of_one(eqx.combine(given[0], others), given[1], *eqx.combine(numbers, rest))
-    mapped = lambda arrays, z, numbers: of_each(lambda given: one(given, numbers), (arrays, z))
+    mapped = lambda members, numbers: of_each(lambda given: one(given, numbers), members)
     if batch.mesh is None:
-        return mapped(arrays, z, numbers)
-    by_device = lambda members, numbers: mapped(*members, numbers)
-    found = over_devices(by_device, batch.mesh, (arrays, padded(z, batch.mesh.size)), numbers)
+        return mapped((arrays, z), numbers)
+    found = over_devices(mapped, batch.mesh, (arrays, padded(z, batch.mesh.size)), numbers)
     return jax.tree.map(lambda x: x[: len(z)], found)
