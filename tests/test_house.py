@@ -91,6 +91,7 @@ WINGS = {  # each imports only from those above it, and each file of a wing only
         "consistent_state",
         "acceleration",
         "power",
+        "couplings",
         "findings",
         "examine",
     ],
@@ -133,6 +134,7 @@ WINGS = {  # each imports only from those above it, and each file of a wing only
         "integrate",
         "solution_map",
         "simulate",
+        "members",
         "simulate_many",
     ],
     "_linear": [

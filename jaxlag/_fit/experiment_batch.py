@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
-from jax.sharding import Mesh, NamedSharding, PartitionSpec
+from jax.sharding import Mesh, NamedSharding
 from jaxtyping import Array, Float, PyTree
 
 from .._mechanics.consistent_state import consistent_state
@@ -17,11 +17,9 @@ from .._mechanics.lagrange import constraint_rows, position_residual
 from .._model.paths import is_within
 from .._model.system import System
 from .._model.validation import at_state
-from .._motion.simulate_many import of_each, padded
+from .._motion.members import MEMBERS, all_devices, check_agreement, of_each, over_devices, padded
 from .._program.jit import numpy_for
 from .experiment import Experiment, start_entries, with_own
-
-EXPERIMENTS_AXIS = PartitionSpec("experiments")
 
 
 @jax.tree_util.register_dataclass
@@ -66,6 +64,7 @@ class ExperimentBatch:
 
 def batches_of(system: System, params: PyTree, experiments: Sequence[Experiment]) -> tuple[ExperimentBatch, ...]:
     """One batch for each kind of experiment, distributed over the devices where there are several."""
+    check_agreement(params=params, experiments=experiments)
     kinds: dict[Any, list[int]] = {}
     bases = [_tangent_basis(system, params, e) for e in experiments]
     for i, e in enumerate(experiments):
@@ -110,18 +109,20 @@ def _batch(experiments, bases, members):
 
 def _distributed(batch):
     """Over all devices, padded with copies of the last experiment so that each device has equally many."""
-    count, devices = len(batch.members), jax.device_count()
-    if min(count, devices) == 1:
+    if min(len(batch.members), jax.device_count()) == 1:
         return batch
-    batch = dataclasses.replace(batch, mesh=Mesh(np.array(jax.devices()), "experiments"))
-    sharding = NamedSharding(batch.mesh, EXPERIMENTS_AXIS)
-    return jax.tree.map(lambda x: jax.device_put(padded(x, devices), sharding) if eqx.is_array(x) else x, batch)
+    batch = dataclasses.replace(batch, mesh=all_devices())
+    return jax.tree.map(lambda x: _placed(padded(x, batch.mesh.size), batch.mesh) if eqx.is_array(x) else x, batch)
+
+
+def _placed(tree, mesh):
+    """On the devices that use it; where there are several processes, the recordings stay with each, which reads them too."""
+    return tree if jax.process_count() > 1 else jax.device_put(tree, NamedSharding(mesh, MEMBERS))
 
 
 def with_sigma(batch: ExperimentBatch, sigma: PyTree) -> ExperimentBatch:
     """The batch with another `sigma`, on the same devices."""
-    placed = sigma if batch.mesh is None else jax.device_put(sigma, NamedSharding(batch.mesh, EXPERIMENTS_AXIS))
-    return dataclasses.replace(batch, sigma=placed)
+    return dataclasses.replace(batch, sigma=sigma if batch.mesh is None else _placed(sigma, batch.mesh))
 
 
 def _tangent_basis(system, params, e):
@@ -154,9 +155,8 @@ def map_batch(of_one: Callable[..., Any], batch: ExperimentBatch, z: Any, *commo
         return jax.tree.map(lambda x: x[None], of_one(eqx.combine(first(arrays), others), z[0], *common))
     numbers, rest = eqx.partition(common, eqx.is_array)
     one = lambda given, numbers: of_one(eqx.combine(given[0], others), given[1], *eqx.combine(numbers, rest))
-    mapped = lambda arrays, z, numbers: of_each(lambda given: one(given, numbers), (arrays, z))
+    mapped = lambda members, numbers: of_each(lambda given: one(given, numbers), members)
     if batch.mesh is None:
-        return mapped(arrays, z, numbers)
-    specs = (EXPERIMENTS_AXIS, EXPERIMENTS_AXIS, PartitionSpec())
-    mapped = jax.shard_map(mapped, mesh=batch.mesh, in_specs=specs, out_specs=EXPERIMENTS_AXIS, check_vma=False)
-    return jax.tree.map(lambda x: x[: len(z)], mapped(arrays, padded(z, batch.mesh.size), numbers))
+        return mapped((arrays, z), numbers)
+    found = over_devices(mapped, batch.mesh, (arrays, padded(z, batch.mesh.size)), numbers)
+    return jax.tree.map(lambda x: x[: len(z)], found)

@@ -79,7 +79,7 @@ def fit(
 
     Units are any consistent set. Where no sigma is given, that of each channel is estimated along with the parameters, by maximum
     likelihood; experiments share it. Where residuals are correlated in time, the standard errors account for it, as the card says (`Fit`).
-    Interrupted with Ctrl-C, it returns the best parameters so far. Experiments of one kind run as a batch, on all devices.
+    Interrupted with Ctrl-C, it returns the best parameters so far. Experiments of one kind run as a batch, on all devices of all processes.
 
     **Returns:** a `Fit`.
 

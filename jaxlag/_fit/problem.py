@@ -10,8 +10,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from .._motion.members import of_each
 from .._motion.results import reason_of
-from .._motion.simulate_many import of_each
 from .._program.jit import compiled, numpy_for
 from .experiment import Experiment
 from .experiment_batch import ExperimentBatch, batches_of, map_batch

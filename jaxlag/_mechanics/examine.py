@@ -17,6 +17,7 @@ from .._program.scalarise import scalarised
 from . import findings
 from .constrained_acceleration import constrained_acceleration
 from .contact import in_contact, in_current_mode
+from .couplings import MATRICES, NOT_READ, couplings, uses_all_numbers
 from .friction_elements import light_coordinates, unread_friction
 from .lagrange import applied_force, constraint_rows, inertia, position_residual, velocity_residual
 from .massless import completed, with_masses
@@ -36,6 +37,8 @@ class Examination:
     - `time_constants`: 1/|eigenvalue| of the linearised motion, the fastest and the slowest, with the states beside q held.
     - `findings`: sentences with the cure. `contacts`: which contacts are closed, by name. `without_inertia`: coordinates whose velocity
       dissipation alone decides; they count as degrees of freedom.
+    - `couplings`: of 64 coordinates and more, by matrix and term, as ("G", "rods"): how many numbers may differ from zero (None where the
+      program is too long to be read), and of how many. The matrices: ∂²L/∂q̇², ∂²L/∂q², ∂²D/∂q̇², and rows of G.
     """
 
     coordinates: tuple[str, ...]
@@ -52,6 +55,7 @@ class Examination:
     states: tuple[str, ...] = ()
     contacts: dict[str, bool] = dataclasses.field(default_factory=dict)
     without_inertia: tuple[str, ...] = ()
+    couplings: dict[tuple[str, str], tuple[int | None, int]] = dataclasses.field(default_factory=dict)
 
     def __repr__(self) -> str:
         fastest, slowest = self.time_constants
@@ -64,6 +68,7 @@ class Examination:
             ("constraint rows", f"{self.rows}, of rank {self.rank}"),
             ("smallest inertia", f"{self.smallest_inertia:.3g}"),
             ("time constants", f"{fastest:.3g} … {slowest:.3g}"),
+            *((matrix, f"{_counted(entries)} of {size} numbers, {name}") for (matrix, name), (entries, size) in self.couplings.items()),
         ]
         lines = [f"  {name:<20}{value}" for name, value in rows]
         return "\n".join(["Examination", *lines, *(f"  - {finding}" for finding in self.findings or ("no issues found",))])
@@ -122,6 +127,7 @@ def examine(system: System, q: PyTree, qdot: PyTree, params: PyTree = None, *, t
     off, size, rows_off, rows_size = found["defects"].max(axis=0)
     defect = max(off / max(size, eps), rows_off / max(rows_size, eps) if rank == G.shape[0] else 0)  # rows may contradict each other
     names = entry_names(q, "q")
+    coupled = dict(sorted(found["couplings"].items(), key=lambda of: MATRICES.index(of[0][0])))
     found_out = [
         *findings.without_inertia(names, M, G),
         *findings.nearly_without_inertia(names, M, G),
@@ -129,11 +135,17 @@ def examine(system: System, q: PyTree, qdot: PyTree, params: PyTree = None, *, t
         *findings.pushing(names, M, G, rows, system),
         *findings.of_numbers(numbers, defect, found["M"].dtype),
         *findings.pulling(system, found["multipliers"]),
+        *findings.coupling_all(coupled, found["uses_all_numbers"], len(names)),
         *_unread_friction(system, q, qdot, params, t, states),
     ]
     light = tuple(names[i] for i in np.flatnonzero(found["light"]))
     states = tuple(name for name, _ in system.states)
-    return Examination(**numbers, findings=tuple(found_out), states=states, contacts=contacts, without_inertia=light)
+    counts = {of: (None if c.entries == NOT_READ else int(c.entries), int(c.size)) for of, c in coupled.items()}
+    return Examination(**numbers, findings=tuple(found_out), states=states, contacts=contacts, without_inertia=light, couplings=counts)
+
+
+def _counted(entries):
+    return "unread" if entries is None else str(entries)
 
 
 def _unread_friction(system, q, qdot, params, t, states):
@@ -166,6 +178,8 @@ def _measure(flat: Flat, t, q, v):
     split = rows_by_name(flat)
     psi, _, _ = constraint_rows(flat, t, q, v)
     return {
+        "couplings": couplings(flat, t, q, v),
+        "uses_all_numbers": uses_all_numbers(flat, t, q, v),
         "M": inertia(with_masses(flat, light, t, q, v) if light.size else flat, t, q, v)[0].as_matrix(),
         "light": jnp.isin(jnp.arange(q.size), light),
         "closed": closed,

@@ -3,6 +3,7 @@
 import jax.numpy as jnp
 import numpy as np
 
+from .couplings import NOT_READ, OF_L, OF_ROWS
 from .singular_directions import faint_direction, massless_coordinates
 
 FAINT = 5e-4  # of the inertia of each coordinate alone: Euler angles of a ball 2° from their singularity
@@ -90,3 +91,19 @@ def of_numbers(numbers, defect, dtype):
         yield f"the motion is stiff (time constants from {fastest:.2g} to {slowest:.2g}): use `solver=diffrax.Kvaerno5()`"
     if jnp.finfo(dtype).bits < 64:
         yield 'single precision: `jax.config.update("jax_enable_x64", True)` gives twice as many digits'
+
+
+def coupling_all(couplings, uses_all_numbers, n):
+    """Terms that leave no zeros to a solve for many coordinates."""
+    for (matrix, name), (entries, size, is_full) in couplings.items():
+        if not is_full or (matrix == OF_L and not uses_all_numbers):
+            continue
+        counted = "its program is too long to be read" if entries == NOT_READ else f"{entries} of {size} numbers"
+        each = "an acceleration takes" if matrix in (OF_L, OF_ROWS) else "implicit solvers and `linearise` take"
+        cure = (
+            "let each of its rows touch a few coordinates, as of rods between neighbours"
+            if matrix == OF_ROWS
+            else "write it as a sum of terms that touch a few coordinates each: positions, with rods as `holonomic` constraints, in place "
+            "of joint angles of which positions are cumulative sums"
+        )
+        yield f"{name!r} couples the {n} coordinates ({matrix}: {counted}), so that {each} time in proportion to n³: {cure}"

@@ -25,6 +25,7 @@ class Flat(NamedTuple):
     """A system with its parameters, over flat vectors q, v of length n and λ of length m: what the mechanics works on."""
 
     lagrangian: Callable[..., Float[Array, ""]]  # L(t, q, v)
+    lagrangians: dict[str, Callable[..., Float[Array, ""]]]  # its terms
     dissipations: dict[str, Callable[..., Float[Array, ""]]]  # D(t, q, v, λ)
     forces: dict[str, Callable[..., Float[Array, " n"]]]  # Q(t, q, v, λ)
     holonomic: Callable[..., Float[Array, " h"]]  # g(t, q), and zeros of the contacts that are open
@@ -69,6 +70,7 @@ def bind(system: System, like: PyTree, params: PyTree, states: StatesAt | None =
         bound.let_flow(*states[1:])
     return Flat(
         lagrangian=bound.lagrangian,
+        lagrangians={name: partial(bound.energy, (name, L)) for name, L in system.lagrangian},
         dissipations={name: partial(bound.dissipation, (name, D)) for name, D in system.dissipation},
         forces={name: partial(bound.force, (name, Q)) for name, Q in system.force},
         holonomic=bound.holonomic,
@@ -153,8 +155,10 @@ class _Bound:
         return call(function, label, at_time(self.params, t), **state, **states, **more)
 
     def lagrangian(self, t, q, v):
-        terms = (jnp.asarray(self.value("lagrangian", term, t, q, v), q.dtype) for term in self.system.lagrangian)
-        return sum(terms, start=jnp.zeros((), q.dtype))
+        return sum((self.energy(term, t, q, v) for term in self.system.lagrangian), start=jnp.zeros((), q.dtype))
+
+    def energy(self, term, t, q, v):
+        return jnp.asarray(self.value("lagrangian", term, t, q, v), q.dtype)
 
     def dissipation(self, term, t, q, v, multipliers):
         return jnp.asarray(self.value("dissipation", term, t, q, v, multipliers=self.unravel_multipliers(multipliers)), q.dtype)

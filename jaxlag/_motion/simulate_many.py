@@ -1,7 +1,7 @@
 """Many motions of one system at once."""
 
 import functools
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import diffrax as dfx
@@ -10,7 +10,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
-from jax.sharding import Mesh, PartitionSpec
 from jaxtyping import Array, PyTree
 
 from .._mechanics.friction_treatment import Regularised, StickSlip
@@ -29,6 +28,7 @@ from .derivative_rule import differentiable_batch
 from .failure import raise_failure
 from .first_order import EquationsOfMotion, Formulation
 from .integrate import SolverOptions, Variations, by_diffrax, initialised, is_variational, tolerances_of, with_status
+from .members import all_devices, check_agreement, of_each, over_devices, padded
 from .protocol import Arguments
 from .results import RESULTS
 from .simulate import simulate
@@ -64,7 +64,8 @@ def simulate_many(
 
     What `over` names has the members as its first axis. The result is that of `simulate` for each of them, within the tolerances, with
     the members as first axis of every field; derivatives are those of `simulate`, with up to 96 numbers of a member differentiated in
-    one pass. With several devices each takes its part of the members.
+    one pass. With several devices each takes its part of the members; so do several processes (`jax.distributed.initialize`) that make
+    this call with the same arguments, and each of them gets the whole result.
 
     **Arguments:**
 
@@ -99,6 +100,7 @@ def simulate_many(
     dtype = jnp.result_type(*jax.tree.leaves((everything["q0"], everything["qdot0"])))
     options = SolverOptions.of(solver, Formulation(stabilisation, friction), max_steps)
     common_steps = _choice_of_steps(common_steps, steps)
+    check_agreement(**everything, ts=ts)
     trajectory = _simulate_many(system, options, common_steps, own, shared, sample_times(ts, dtype), tolerances_of(rtol, atol, dtype))
     if throw:
         raise_failure(trajectory)
@@ -148,10 +150,9 @@ def _simulate_many(system, options, common_steps, own, shared, ts, tolerances):
         one = lambda own, *given: _one(system, options, eqx.combine(own, given[0], rest), *given[1:])
         batch = lambda own, *given: of_each(lambda own: one(own, *given), own)
     if min(members, jax.device_count()) > 1:
-        devices = Mesh(np.array(jax.devices()), "members")
+        devices = all_devices()
         own = jax.tree.map(lambda leaf: padded(leaf, devices.size), own)
-        split, all_ = PartitionSpec("members"), PartitionSpec()
-        batch = jax.shard_map(batch, mesh=devices, in_specs=(split, all_, all_, all_), out_specs=split, check_vma=False)
+        batch = functools.partial(over_devices, batch, devices)
     return jax.tree.map(lambda leaf: leaf[:members], batch(own, numbers, ts, tolerances))
 
 
@@ -170,19 +171,6 @@ def _share_steps(common_steps, equations, params, own):
             "time, or signals differ, but is True. Leave it out."
         )
     return common_steps is not False and not obstacle
-
-
-def of_each(function: Callable, members: PyTree) -> PyTree:
-    """`function` of each member, each with steps of its own.
-
-    In turn on a CPU, where in a batch all would go on until the slowest has ended, and pay for both branches of every choice.
-    """
-    return jax.lax.map(function, members) if jax.default_backend() == "cpu" else jax.vmap(function)(members)
-
-
-def padded(leaf: Array, size: int) -> Array:
-    """With copies of the last member, to a multiple of a size."""
-    return jnp.concatenate([leaf, jnp.repeat(leaf[-1:], -len(leaf) % size, axis=0)])
 
 
 def _one(system, options, everything, ts, tolerances):

@@ -58,7 +58,7 @@ def _by_arrays(function: Callable, push: Callable, x: Float[Array, " n"]) -> lx.
         return None
     if m == n == pattern.nnz and np.array_equal(pattern.indices, np.arange(n)) and np.array_equal(np.diff(pattern.indptr), np.ones(n)):
         return lx.DiagonalLinearOperator(push(jnp.ones_like(x)))
-    if SPARSE * np.diff(pattern.indptr).max(initial=0) > n or SPARSE * max(color := colors(pattern)) >= n:
+    if (color := few_colors(pattern)) is None:
         return None
     return entries(push, color, pattern, x)
 
@@ -68,6 +68,14 @@ def entries(push: Callable, color: np.ndarray, pattern: Any, x: Float[Array, " n
     places = Places.of(pattern)
     directions = along(push, color, x).T  # as they are computed: this way around they are read faster, too
     return SparseMatrix(directions.ravel()[color[places.columns] * places.shape[0] + places.rows], places)
+
+
+def few_colors(pattern: Any) -> np.ndarray | None:
+    """The colors of the columns of a sparse pattern; None where they are too many for its zeros to be left out."""
+    n = pattern.shape[1]
+    if SPARSE * np.diff(pattern.indptr).max(initial=0) > n or SPARSE * max(color := colors(pattern)) >= n:
+        return None
+    return color
 
 
 def along(push: Callable, color: np.ndarray, x: Float[Array, " n"]) -> Float[Array, "m c"]:

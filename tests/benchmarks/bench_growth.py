@@ -3,15 +3,16 @@
 python tests/benchmarks/bench_growth.py [most links]
 
 By hand: for the chain S has three diagonals, in one call of a tridiagonal solve; in angles, the articulated inertias link by link. Medians
-of 30 calls, each length in a process of its own; and 1 s of motion of 200 links and of 1000, each of unit length and mass; and its
-gradient in the mass of each link.
+of 30 calls, each length in a process of its own; 1 s of motion of 200 links and of 1000, each of unit length and mass; and its
+gradient in the mass of each link. Beside the rods: the same chain, at rest, as a tree of hinges in MuJoCo, which nests no more than 1024
+bodies; without the forces in the hinges. Its accelerations of the points are compared with those of the rods.
 """
 
 import subprocess
 import sys
 from time import perf_counter
 
-LENGTHS, MOTIONS = (64, 256, 1024, 4096, 10_000), (200, 1000)
+LENGTHS, MOTIONS, HINGES = (64, 256, 1024, 4096, 10_000), (200, 1000), (64, 256, 1000)
 
 
 def chain(n):
@@ -120,6 +121,47 @@ def accelerations(n, kind):
     print(f"{n:>7} {kind}{times}{off:>11.1e}")
 
 
+def hinged_in_mujoco(n, angles):
+    """Points on massless links, each hinged to the one before; the angles of the links against the vertical."""
+    import mujoco
+    import numpy as np
+
+    spec = mujoco.MjSpec()
+    spec.option.gravity = [0, 0, -9.81]
+    body = spec.worldbody
+    for k in range(n):
+        at = [float(k > 0), 0, 0]  # along the link, which lies along x where its angle is zero
+        body = body.add_body(pos=at, mass=1.0, ipos=[1, 0, 0], inertia=[1e-9] * 3, explicitinertial=True)
+        body.add_joint(type=mujoco.mjtJoint.mjJNT_HINGE, axis=[0, 1, 0])
+    model = spec.compile()
+    data = mujoco.MjData(model)
+    data.qpos[:] = np.diff(np.pi / 2 - angles, prepend=0)
+    return model, data
+
+
+def hinges(n, kind):
+    """One line: MuJoCo's accelerations beside those of the rods, from rest."""
+    try:
+        import mujoco
+    except ImportError:
+        return print(f"{n:>7} hinges: skipped, since MuJoCo is not installed")
+    import jax
+    import jax.numpy as jnp
+    import numpy as np
+
+    import jaxlag as jl
+
+    system, q, params = CHAINS[kind][0](n)
+    _, of_rods, found = timed(jax.jit(lambda *given: jl.acceleration(system, *given)), q, jnp.zeros_like(q), params)
+    angles = np.linspace(0.3, 1.2, n)
+    model, data = hinged_in_mujoco(n, angles)
+    _, of_hinges, _ = timed(lambda: mujoco.mj_forward(model, data))
+    turning = -np.cumsum(data.qacc)[:, None] * np.stack([np.cos(angles), np.sin(angles)], axis=1)
+    off = np.abs(np.cumsum(turning, axis=0) - found.qddot).max() / np.abs(found.qddot).max()
+    times = f"MuJoCo {1e3 * of_hinges:.3f} ms, rods {1e3 * of_rods:.3f} ms: {of_hinges / of_rods:.1f} times"
+    print(f"{n:>7} hinges: {times}; difference {off:.0e}")
+
+
 def motion(n, kind):
     """1 s from rest."""
     import resource
@@ -164,12 +206,13 @@ def main():
         import jax
 
         jax.config.update("jax_enable_x64", True)
-        return {"acceleration": accelerations, "motion": motion, "gradient": gradient}[sys.argv[1]](int(sys.argv[2]), sys.argv[3])
+        kinds = {"acceleration": accelerations, "hinges": hinges, "motion": motion, "gradient": gradient}
+        return kinds[sys.argv[1]](int(sys.argv[2]), sys.argv[3])
     most = int(sys.argv[1]) if len(sys.argv) > 1 else LENGTHS[-1]
     print(f"{'links':>14}{'jaxlag ms':>12}{'by hand ms':>12}{'ratio':>8}{'first s':>9}{'by hand':>9}{'difference':>11}", flush=True)
-    for kind, lengths in (("acceleration", LENGTHS), ("motion", MOTIONS), ("gradient", MOTIONS[:1])):
+    for kind, lengths in (("acceleration", LENGTHS), ("hinges", HINGES), ("motion", MOTIONS), ("gradient", MOTIONS[:1])):
         for n in lengths:
-            for coordinates in CHAINS if n <= most else ():
+            for coordinates in () if n > most else ("places",) if kind == "hinges" else CHAINS:
                 subprocess.run([sys.executable, __file__, kind, str(n), coordinates], check=True)
 
 
