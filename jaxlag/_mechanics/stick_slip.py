@@ -16,6 +16,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from .._model.flat import Flat
+from .._program.implicit import undifferentiated
 from .._program.scalarise import scalarised
 from .constrained_acceleration import constrained_acceleration
 from .friction_elements import FrictionElements
@@ -84,9 +85,15 @@ class Friction(NamedTuple):
     margin: Float[Array, " e"]
 
 
+# Scalar operations: those of an acceleration that is scalar code, and half as many for what follows from it. One with a rod and an element
+# of friction has 900; as arrays it takes 1.3 times as long to compile, and the watch of a step, which differentiates it, twice.
+MOST_OPERATIONS = 1200
+
+
 def friction(flat: Flat, elements: FrictionElements, sigma, t, q, v, feedback=None) -> Friction:
     """Friction forces on the slip velocities; `margin` < 0 where a mode has ended: the slip has reversed, or the bound is exceeded."""
-    return scalarised(lambda sigma, t, q, v: _friction(flat, elements, sigma, t, q, v, feedback))(sigma, t, q, v)
+    of_state = lambda sigma, t, q, v: _friction(flat, elements, sigma, t, q, v, feedback)
+    return scalarised(of_state, limit=MOST_OPERATIONS)(sigma, t, q, v)
 
 
 def _friction(flat, elements, sigma, t, q, v, feedback):
@@ -167,6 +174,7 @@ def select_mode(
     at_rest: Bool[Array, " e"],
     breaking: Bool[Array, " e"],
     contacts: Any = NoContact(),
+    friction_in: Callable | None = None,
 ) -> tuple[Mode, Any]:
     """Mode selection where the elements `at_rest` have no slip; the others continue to slip along σ.
 
@@ -174,10 +182,10 @@ def select_mode(
     force, and one that would start backwards sticks again, until none is beyond its bound and none moves backwards. Of dependent
     elements some may be at their bound while others hold them: one of the possible shares, with the same motion for all.
 
-    Where one of the `contacts` pulls or goes deeper in the mode that was found, it changes and all begins anew.
+    Where one of the `contacts` pulls or goes deeper in the mode that was found, it changes and all begins anew. `friction_in(σ, contacts)`
+    is the friction of this state in another mode, where there is a program of it already.
     """
-    of = elements.element_of_row
-    t, q, v = jax.lax.stop_gradient((t, q, v))
+    of, friction_in = elements.element_of_row, friction_in or _in_modes(flat, elements, t, q, v)
     loose = jnp.finfo(v.dtype).tiny ** 0.25  # a σ of this length slips without a force
     no, most = jnp.zeros(elements.size, bool), 4 * elements.size + 6
 
@@ -185,9 +193,7 @@ def select_mode(
         mode, stage = search.mode, search.stage
         released = at_rest & ~sticking(elements, mode.sigma)
         freed = jnp.where(stage == LOOSE, at_rest, released & (stage == HOLD))
-        found = jax.lax.stop_gradient(
-            friction(search.contacts.applied_to(flat), elements, jnp.where(freed[of], loose, mode.sigma), t, q, v)
-        )
+        found = friction_in(jnp.where(freed[of], loose, mode.sigma), search.contacts)
         rate = elements.norms(found.slip_rate)
 
         over = jnp.where(sticking(elements, mode.sigma), -found.margin, -jnp.inf)
@@ -234,8 +240,14 @@ def select_mode(
     start = _Search(jnp.array(LOOSE), contacts, Mode(resting, no, jnp.array(False), nothing), jnp.array(0), no, nothing)
     # Nothing here is differentiated, so that the loop may end by itself: a motion behind many jumps of an input takes a tenth less.
     going_on = lambda carry: (carry[0] < most * (1 + 4 * len(jax.tree.leaves(contacts)) * flat.rows)) & (carry[1].stage != DONE)
-    done = jax.lax.while_loop(going_on, lambda carry: (carry[0] + 1, turn(carry[1])), (0, start))[1]
+    search = lambda: jax.lax.while_loop(going_on, lambda carry: (carry[0] + 1, turn(carry[1])), (0, start))
+    done = undifferentiated(search)()[1]
     return done.mode, done.contacts
+
+
+def _in_modes(flat: Flat, elements: FrictionElements, t, q, v) -> Callable:
+    """Friction at this state as a function of σ and of the contacts."""
+    return lambda sigma, contacts: friction(contacts.applied_to(flat), elements, sigma, t, q, v)
 
 
 def _greatest(x, among):
@@ -250,13 +262,15 @@ def _torn(elements, t, q, v, found, free_rate, stuck):
     return _greatest(rate, stuck & (rate > 1e-6 * most) & (rate > 1e-9 * free_rate) & (most > 0))
 
 
-def first_mode(flat: Flat, elements: FrictionElements, t, q, v, contacts: Any = NoContact()) -> tuple[Mode, Any]:
+def first_mode(
+    flat: Flat, elements: FrictionElements, t, q, v, contacts: Any = NoContact(), friction_in: Callable | None = None
+) -> tuple[Mode, Any]:
     """The initial mode: what moves slips along its motion; what rests sticks or breaks away. And the contacts chosen with it."""
     slip = jax.lax.stop_gradient(elements.slip(t, q, v))
     size = elements.norms(slip)
     at_rest = elements.follows | (size <= slip_of(elements, t, q, v, 1e2 * jnp.finfo(v.dtype).eps * jnp.abs(v)))
     sigma = slip / jnp.where(at_rest, 1, size)[elements.element_of_row]
-    return select_mode(flat, elements, t, q, v, sigma, at_rest, jnp.zeros_like(at_rest), contacts)
+    return select_mode(flat, elements, t, q, v, sigma, at_rest, jnp.zeros_like(at_rest), contacts, friction_in)
 
 
 def slip_of(elements: FrictionElements, t, q, v, errors: Float[Array, " n"]) -> Float[Array, " e"]:

@@ -20,12 +20,7 @@ from .._mechanics.massless import completed, first_order
 from .._mechanics.power import energy_exchange, listed_powers
 from .._mechanics.projection import Baumgarte, NoStabilisation, Projection
 from .._mechanics.saddle_point import SaddlePoint
-from .._mechanics.stick_slip import (
-    in_mode,
-    redirected,
-    slip_of,
-    sticking,
-)
+from .._mechanics.stick_slip import Friction, friction, in_mode, redirected, slip_of, sticking
 from .._model.flat import Flat, StatesAt, bind
 from .._model.signal import broken_signals
 from .._model.state_values import NOTHING, Layout, of_first_order, period, ravelled, sampled
@@ -197,6 +192,13 @@ class EquationsOfMotion:
         feedback = self.formulation.stabilisation.feedback()
         return scalarised(lambda t, q, v: constrained_acceleration(mode, t, q, v, feedback))(t, q, v)
 
+    def friction(self, t, parts: Parts, args: Arguments, stabilised: bool = False) -> Friction:
+        """Friction in the mode of `parts`, without or with the feedback of a stabilisation: traced once, however often it is asked for."""
+        if self.rows == self.elements:  # scales are for what may turn
+            args = args._replace(scales=None)
+        stabilised &= self.formulation.stabilisation.feedback() is not None
+        return _friction(self, t, parts, args, stabilised)
+
     def where_closed(self, parts: Parts, function: Callable, otherwise: Callable) -> Any:
         """`function()`, or `otherwise()` where there are contacts, but no friction, and all of them are open: at less cost."""
         return jax.lax.cond(jnp.any(parts.closed > 0.5), function, otherwise) if self.contacts and not self.rows else function()
@@ -240,6 +242,14 @@ def _rates(equations: EquationsOfMotion, t, y, args):
     stuck = parts.time_stuck if elements is None else jnp.maximum(sticking(elements, sigma).astype(y.dtype), held)
     resting = Parts(*(jnp.zeros_like(part) for part in parts))
     return resting._replace(q=v, v=qddot, z=rates, works=powers, time_stuck=stuck).y
+
+
+@jitted
+def _friction(equations: EquationsOfMotion, t, parts: Parts, args, stabilised) -> Friction:
+    flat, _, elements = equations.mode(t, parts, args)
+    assert elements is not None  # asked where there is friction
+    feedback = equations.formulation.stabilisation.feedback() if stabilised else None
+    return friction(flat, elements, parts.sigma, t, parts.q, parts.v, feedback)
 
 
 @jitted

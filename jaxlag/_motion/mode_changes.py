@@ -23,7 +23,7 @@ from .._mechanics.contact import (
 from .._mechanics.friction_elements import FrictionElements
 from .._mechanics.impact import impact, no_impact
 from .._mechanics.return_mapping import returned
-from .._mechanics.stick_slip import Mode, first_mode, friction, select_mode, slip_of, sticking
+from .._mechanics.stick_slip import Mode, first_mode, select_mode, slip_of, sticking
 from .._model.flat import Flat, StatesAt
 from .._program.jit import jitted
 from .._program.time_bounds import bounds_over_time
@@ -72,7 +72,7 @@ def _margins(equations: EquationsOfMotion, t, parts: Parts, args):
         pressing = lambda: contact_rows(flat, equations.acceleration(mode, t, q, v).multipliers)
         forces = jax.lax.cond(jnp.any(closed), pressing, none) if equations.contacts else none()
         return jnp.concatenate([_contact_margins(flat, t, q, closed, forces), of_events, *unbounded])
-    found = friction(flat, elements, sigma, t, q, v)
+    found = equations.friction(t, parts, args)
     of_contacts = _contact_margins(flat, t, q, parts.closed > 0.5, contact_rows(flat, found.multipliers))
     of_elements = jnp.where((held > 0) | idle(flat, elements, sigma, found.bound), 1, found.margin)
     return jnp.concatenate([of_elements, of_contacts, of_events, found.bound, *unbounded])
@@ -174,7 +174,8 @@ def changed(equations: EquationsOfMotion, t, y, args: Arguments, ended: Bool[Arr
     if not equations.contacts:
         assert elements is not None
         stuck, slow = sticking(elements, parts.sigma) | (parts.held > 0), _slow(elements, t, parts, args.scales.error(parts.v))
-        mode, _ = select_mode(flat, elements, t, parts.q, parts.v, parts.sigma, stuck | of_friction | slow, of_friction & stuck)
+        along, given = in_other(equations, t, parts, args), (parts.sigma, stuck | of_friction | slow, of_friction & stuck)
+        mode, _ = select_mode(flat, elements, t, parts.q, parts.v, *given, friction_in=along)
         after = equations.projected(t, in_other_mode(elements, parts, mode).y, args)
         return Change(after, mode.consistent, jnp.array(True), jnp.array(True), jnp.all(~of_friction | stuck | slow))
     errors = args.scales.error(parts.q), args.scales.error(parts.v)
@@ -227,7 +228,8 @@ def behind_contact(equations: EquationsOfMotion, t, parts: Parts, args: Argument
         breaking = jnp.where(anew, elements.follows & ~stuck, of_friction & stuck)  # at its bound: the forces tell where it goes on
         along = jnp.where(anew, slip / jnp.where(size > 0, size, 1), parts.sigma)
         given = along, at_rest, breaking
-        mode, contacts = select_mode(flat, elements, t, q, found.v, *given, Contacts.of(flat, t, q, found.v, resting))
+        among = Contacts.of(flat, t, q, found.v, resting)
+        mode, contacts = select_mode(flat, elements, t, q, found.v, *given, among, in_other(equations, t, parts, args))
         chosen = Chosen(contacts.closed, mode, mode.consistent)
         parts = in_other_mode(elements, parts, mode)
     changes = (chosen.closed != closed) & ~hits
@@ -257,6 +259,16 @@ def _counted(t, parts: Parts, hits, opening, impulses, remaining):
     }
 
 
+def in_other(equations: EquationsOfMotion, t, parts: Parts, args: Arguments) -> Callable:
+    """Friction of this state as a function of σ and, where there are any, the contacts that are closed."""
+
+    def friction_in(sigma, contacts):
+        closed = contacts.closed.astype(parts.closed.dtype) if equations.contacts else parts.closed
+        return equations.friction(t, parts._replace(sigma=sigma, closed=closed), args)
+
+    return friction_in
+
+
 def in_other_mode(elements: FrictionElements, parts: Parts, mode: Mode) -> Parts:
     """y in another mode, and its transitions counted: what begins or ceases to slip, or slips another way, where there is friction."""
     of, sigma, held = elements.element_of_row, parts.sigma, parts.held
@@ -281,6 +293,6 @@ def started(equations: EquationsOfMotion, at: StatesAt, params) -> Start:
     if elements is None:
         return Start(parts.y, yes, yes, yes, yes, yes)
     parts = parts._replace(q=returned(flat, elements, t, parts.q, parts.v))
-    mode, _ = first_mode(flat, elements, t, parts.q, parts.v)
+    mode, _ = first_mode(flat, elements, t, parts.q, parts.v, friction_in=in_other(equations, t, parts, args))
     parts = parts._replace(sigma=mode.sigma, held=mode.held.astype(parts.q.dtype))
     return Start(equations.projected(t, parts.y, args), mode.consistent, ~jnp.any(mode.bound < 0), yes, yes, yes)

@@ -8,7 +8,7 @@ from jaxtyping import Array, Float, PyTree
 
 from .._mechanics.contact import contact_rows, gap_scales, idle
 from .._mechanics.saddle_point import Sound
-from .._mechanics.stick_slip import friction, friction_by_term, slip_of, sticking
+from .._mechanics.stick_slip import friction_by_term, slip_of, sticking
 from .first_order import EquationsOfMotion
 from .protocol import Arguments
 
@@ -59,7 +59,7 @@ def sample_at(equations: EquationsOfMotion, t, y, params, tolerances) -> tuple[S
     if elements is None:
         qddot, multipliers, sound = equations.acceleration(mode, t, q, v)
     else:
-        found = friction(flat, elements, sigma, t, q, v, equations.formulation.stabilisation.feedback())
+        found = equations.friction(t, parts, Arguments(params), stabilised=True)
         qddot, multipliers, sound = found.qddot, found.multipliers, Sound(jnp.array(True), jnp.array(True))
         friction_states = friction_by_term(elements, sigma, held > 0, t, q, v, found)
         stuck, load = sticking(elements, sigma), elements.norms(found.force)

@@ -141,7 +141,7 @@ class StickSlipSolver(ProjectedSolver):
 
     def _watch(self, split: Split, done: Piece, start, end, args, rest) -> Split:
         """What is seen along a piece: of the whole step when its mode ends, of the rest whether all is fine."""
-        seen = self._seen(start, end, done.dense, args, ~rest)
+        seen = self._seen(*jax.lax.stop_gradient((start, end, done.dense, args, ~rest)))
         fine = ~(seen.ended | seen.unsure | seen.negative)
         if not self.equations.elements:
             fine |= ~split.cut.consistent  # nothing can follow
@@ -196,8 +196,7 @@ class StickSlipSolver(ProjectedSolver):
 
     @jitted
     def _seen(self, t0, t1, dense, args, exactly):
-        """What is seen of the margins along a piece, on its dense output."""
-        t0, t1, dense, args = jax.lax.stop_gradient((t0, t1, dense, args))
+        """What is seen of the margins along a piece, on its dense output; not differentiated."""
         path = self.solver.interpolation_cls(t0=t0, t1=t1, **dense)
         of, modes = lambda t, y, start: margins(self.equations, t, y, args, start), self.equations.modes
         if not (self.equations.contacts or self.equations.events):

@@ -6,7 +6,6 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from .._mechanics.contact import roundings
-from .._mechanics.stick_slip import friction
 from .._model.event import Either, Rising
 from .._model.flat import Flat
 from .first_order import EquationsOfMotion
@@ -45,7 +44,7 @@ def _multipliers(equations, t, parts, args):
         return lambda t, q, v: jnp.zeros(flat.rows, v.dtype)
     if elements is None:
         return lambda t, q, v: equations.acceleration(mode, t, q, v).multipliers
-    return lambda t, q, v: friction(flat, elements, parts.sigma, t, q, v).multipliers
+    return lambda t, q, v: equations.friction(t, parts._replace(q=q, v=v), args).multipliers
 
 
 def sides(equations: EquationsOfMotion, t, parts: Parts, args: Arguments) -> tuple[Float[Array, " w"], Bool[Array, " w"]]:

@@ -194,3 +194,17 @@ def test_random_blocks(seed, monkeypatch):
         finer, _ = by_hand.Blocks(drawn(seed)).run(TS)
         error, off = np.max(np.abs(found - finer)), np.max(np.abs(finer - expected))
     assert error < 1e-7 + off
+
+
+def test_friction_stands_in_few_places_of_a_program():
+    """A motion of a bead on a rod with a rough joint; with friction written out wherever it is asked for it takes 22 800 lines."""
+    rod, start = (
+        jl.System(
+            lambda q, qdot, m: 0.5 * m * (qdot["x"] ** 2 + qdot["y"] ** 2) - 9.81 * m * q["y"],
+            dissipation={"joint": lambda q, qdot, F, l: F * jnp.abs(q["x"] * qdot["y"] - q["y"] * qdot["x"]) / l},
+            holonomic={"rod": lambda q, l: jnp.hypot(q["x"], q["y"]) - l},
+        ),
+        ({"x": 1.5, "y": 0.0}, {"x": 0.0, "y": 0.0}),
+    )
+    motion = lambda F: jl.simulate(rod, *start, np.linspace(0, 10, 201), {"m": 2.0, "l": 1.5, "F": F}).q["x"]
+    assert len(jax.jit(motion).lower(2.0).as_text().splitlines()) < 20_000

@@ -10,6 +10,7 @@ from scipy.special import ellipj
 
 import jaxlag as jl
 from jaxlag._motion import derivative_rule, solution_map
+from jaxlag._motion.variational import jvp_along
 from jaxlag.examples import pendulum, vehicle
 
 TS = jnp.linspace(0, 2, 41)
@@ -30,6 +31,19 @@ def differences(f, x, h):
         e = jnp.zeros_like(x).at[i].set(h[i])
         columns.append((8 * (f(x + e) - f(x - e)) - f(x + 2 * e) + f(x - 2 * e)) / (12 * h[i]))
     return jnp.stack(columns, axis=-1)
+
+
+@pytest.mark.parametrize("number", [1, 2])
+def test_derivatives_along_directions(number):
+    """Of sin(x₀) x₁, with x as something else; along one direction without the operations of a batch."""
+    function = lambda x: (jnp.sin(x[0]) * x[1], x)
+    x, directions = jnp.array([0.3, 0.7]), jnp.array([[1.0, -2.0], [4.0, 3.0]])[:, :number]
+    y, dy, aux = jvp_along(function, x, directions)
+    np.testing.assert_allclose(y, np.sin(0.3) * 0.7, rtol=1e-15)
+    np.testing.assert_allclose(dy, np.array([np.cos(0.3) * 0.7, np.sin(0.3)]) @ directions, rtol=1e-15)
+    assert np.array_equal(aux, x)
+    products = [e for e in jax.make_jaxpr(lambda dx: jvp_along(function, x, dx))(directions).eqns if e.primitive.name == "mul"]
+    assert {e.outvars[0].aval.shape for e in products} == ({()} if number == 1 else {(), (number,)})
 
 
 def test_vehicle_with_respect_to_every_parameter_and_initial_value():
