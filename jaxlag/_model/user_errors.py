@@ -18,6 +18,8 @@ import jax
 import jaxlib
 import numpy as np
 
+from .._program.kept_programs import CompiledAgain
+
 LIBRARIES = tuple(os.path.dirname(os.path.abspath(str(module.__file__))) + os.sep for module in (jax, jaxlib, eqx, np, contextlib))
 HERE = os.path.dirname(os.path.dirname(os.path.abspath(__file__))) + os.sep  # the package
 
@@ -101,6 +103,7 @@ def warn_of_recreated_functions(functions: list[tuple[str, Callable]], shapes: A
                 f"{made[0][0]} must be made once to be compiled once, but `{code.co_name}`, line {code.co_firstlineno} of "
                 f"{code.co_filename}, was created {RECREATIONS} times, and each time everything is compiled again. "
                 "Define it and the system once, outside the loop, and make what changes an entry of params.",
+                CompiledAgain,
                 stacklevel=levels_to_the_user(),
             )
 

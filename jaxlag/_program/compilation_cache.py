@@ -58,6 +58,9 @@ def keep_compiled(folder: str | os.PathLike | None = None, *, max_bytes: int = 2
             jax.config.update(setting, value)
     chosen = jax.config.values["jax_compilation_cache_dir"]
     if folder is None and chosen:
+        if "://" not in chosen:  # JAX knows folders of the cloud, too
+            with contextlib.suppress(OSError):
+                Path(chosen).mkdir(parents=True, exist_ok=True)
         KEPT.keep_in(Path(chosen))
         return Path(chosen)
     path = _user_cache() / "jaxlag" if folder is None else Path(folder).expanduser().absolute()

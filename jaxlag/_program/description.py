@@ -14,10 +14,13 @@ from typing import Any
 import jax
 import numpy as np
 from jax.extend import core
+from jax.extend.core import primitives
 
 from .user_calls import Call
 
 KNOWN = ("jax", "jaxlib", "jaxlag", "diffrax", "equinox", "optimistix", "lineax", "optax", "numpy", "jaxtyping", "builtins")
+WITH_METHODS = ("jaxlag", "diffrax", "optimistix", "lineax", "optax")  # packages whose classes a user derives others from
+PRIMITIVES = {x for x in vars(primitives).values() if isinstance(x, core.Primitive)}  # of JAX itself
 PLAIN = (type(None), bool, int, float, complex, str, bytes, type(...), slice)
 
 
@@ -42,25 +45,31 @@ class Words:
         """Adds words."""
         self.hash.update(repr(words).encode())
 
-    def structure(self, structure: Any) -> None:
-        """A structure of a pytree, with what it holds beside its leaves."""
+    def structure(self, structure: Any, within: bool = False) -> None:
+        """A structure of a pytree, with what it holds beside its leaves. What stands `within` a solver has methods that are called, and has
+        to be of a package, as has what is derived from one.
+        """
         node = structure.node_data()
         if node is None:
             self.say("leaf" if structure.num_leaves else "none")
             return
         kind, static = node
+        if not _is_known(kind) and (within or _is_derived(kind)):
+            raise NotDescribable(f"methods of {kind!r}")
         self.say("node", _name(kind), structure.num_nodes)
         self.value(static)
         for child in structure.children():
-            self.structure(child)
+            self.structure(child, within or _root(kind) in WITH_METHODS[1:])
 
     def value(self, x: Any) -> None:
         """A constant."""
+        if isinstance(x, jax.core.Tracer):
+            raise NotDescribable("a number that is traced")
         if isinstance(x, enum.Enum):
             self.say(_name(type(x)), x.name)
         elif type(x) in PLAIN:
             self.say(type(x).__name__, x)
-        elif isinstance(x, (np.ndarray, np.generic, jax.Array)) and not isinstance(x, jax.core.Tracer):
+        elif isinstance(x, (np.ndarray, np.generic, jax.Array)):
             array = np.asarray(x)
             self.say("array", str(array.dtype), array.shape, bool(getattr(x, "weak_type", False)), array.tobytes())
         elif isinstance(x, np.dtype):
@@ -93,7 +102,7 @@ class Words:
             self._parts(sorted(x))
         elif _is_of_package(x):
             self.say(x.__module__, x.__qualname__)
-        elif dataclasses.is_dataclass(x) and not callable(x):
+        elif dataclasses.is_dataclass(x) and not callable(x) and not _is_derived(type(x)):
             self._parts([(field.name, getattr(x, field.name, None)) for field in dataclasses.fields(x)])
         elif type(x).__module__.split(".")[0] == "jax" and (not callable(x) or isinstance(x, jax.sharding.Mesh)) and "0x" not in repr(x):
             self.say(repr(x))  # parts of equations: shardings, meshes, dimensions
@@ -131,6 +140,8 @@ class Words:
         for equation in jaxpr.eqns:
             if equation.primitive.name.startswith("custom_") and equation.primitive.name != "custom_linear_solve":
                 raise NotDescribable(f"{equation.primitive.name}, which has a derivative rule of its own")
+            if equation.primitive not in PRIMITIVES:
+                raise NotDescribable(f"{equation.primitive.name}, which is not of JAX")
             self.say(equation.primitive.name, str(equation.ctx))
             for v in equation.invars:
                 self.value(v.val) if isinstance(v, core.Literal) else self.say(name(v))
@@ -160,14 +171,34 @@ class Words:
         self.program(jax.make_jaxpr(returned)(shapes))
 
 
+def answer_of(function: Callable, call: Call) -> str | None:
+    """The digest of what a function returns for such arguments; None where that has no certain description."""
+    words = Words()
+    try:
+        words.answer(function, call)
+    except Exception:  # a function may do anything with arguments of unknown numbers
+        return None
+    return words.digest()
+
+
 def _name(kind: type) -> str:
     return f"{kind.__module__}.{kind.__qualname__}"
 
 
+def _root(x: Any) -> str:
+    """The package that a class or function is of."""
+    module = getattr(x, "__module__", None)
+    return module.split(".")[0] if isinstance(module, str) else ""
+
+
 def _is_known(x: Any) -> bool:
     """Whether it is a class or function of a package whose version is known."""
-    module = getattr(x, "__module__", None)
-    return isinstance(module, str) and module.split(".")[0] in KNOWN
+    return _root(x) in KNOWN
+
+
+def _is_derived(kind: type) -> bool:
+    """Whether it is a class of the user's that is derived from one of those packages."""
+    return not _is_known(kind) and any(_root(base) in WITH_METHODS for base in kind.__mro__)
 
 
 def _is_of_package(x: Any) -> bool:

@@ -13,8 +13,11 @@ import io
 import os
 import pickle
 import platform
+import sys
 import tempfile
 import threading
+import warnings
+import weakref
 from collections.abc import Callable, Iterator
 from importlib.metadata import version
 from pathlib import Path
@@ -27,7 +30,7 @@ from jax.experimental import serialize_executable
 from jax.experimental.compilation_cache import compilation_cache
 from jax.tree_util import PyTreeDef, default_registry
 
-from .description import NotDescribable, Words
+from .description import NotDescribable, Words, answer_of
 from .user_calls import LEDGER, Call
 
 PACKAGE = Path(__file__).parents[1]
@@ -46,44 +49,49 @@ BY_HAND = ("jax_debug_infs", "jax_debug_nans", "jax_default_device", "jax_disabl
 MOST = 128  # programs that a process finds again at once; one has some megabytes
 
 
+class CompiledAgain(UserWarning):
+    """Says that something is compiled again and again. It need not be said of a program that is found."""
+
+
 class KeptPrograms:
     """The programs in a folder, if one was chosen, and those of them that this process has found."""
 
     def __init__(self) -> None:
         self.folder: Path | None = None
         self._found: dict[Any, Callable | None] = {}
+        self._mark: weakref.ref | None = None
 
     def keep_in(self, folder: Path | None) -> None:
-        """From here on programs are kept in this folder, or in none."""
-        self.folder, LEDGER.is_open = folder, folder is not None
-        self._found.clear()
+        """From here on programs are kept in this folder, or in none, or none that cannot be written to."""
+        self.folder = folder if folder is not None and os.access(folder, os.W_OK | os.X_OK) else None
+        LEDGER.digest = None if self.folder is None else answer_of
+        self._found = {}
 
     def called(self, program: Any, function: Callable, arrays: list, static: Any) -> Any:
         """`program(arrays, static)`, from the folder if it is there, and into it if not."""
-        key = function, static, tuple(map(_kind, arrays)), _settings()
-        if key not in self._found:
-            while len(self._found) >= MOST:
-                del self._found[next(iter(self._found))]
-            self._found[key] = self._load_or_compile(program, function, arrays, static)
-        found = self._found[key]
+        if self._mark is None or self._mark() is None:  # after `jax.clear_caches()` nothing is left of what was found before
+            self._found, self._mark = {}, _marked_in_caches()
+        key, of_all = (function, static, tuple(map(_kind, arrays)), _settings()), self._found
+        if key not in of_all:
+            if len(of_all) >= MOST:
+                of_all.clear()
+            of_all[key] = self._load_or_compile(program, function, arrays, static)
+        found = of_all.get(key)
         return program(arrays, static) if found is None else found(arrays)
 
     def _load_or_compile(self, program, function, arrays, static):
+        """The compiled program; None where it is left to JAX."""
         try:
             words = _words_for(function, arrays, static)
-        except NotDescribable:
-            return None
-        for file in sorted(self.folder.glob(f"jaxlag-{words.digest()}-*-cache")):
-            if (found := _read(file, words, arrays)) is not None:
+            if (found := _read(self.folder, words, arrays)) is not None:
                 return found
-        lowered = program.lower(arrays, static)
-        try:
+            lowered = _lowered(program, arrays, static)
             name, head = _head(words, lowered.out_tree)
-        except NotDescribable:
-            return lowered.compile()
+        except (NotDescribable, OSError):
+            return None
         with _compiled_afresh():
             compiled = lowered.compile()
-        with contextlib.suppress(OSError, ValueError, NotImplementedError):  # a full disk; a program that calls Python
+        with contextlib.suppress(Exception):  # a full disk; a program that calls Python, which says so in many ways
             _write(self.folder / name, head + serialize_executable.serialize(compiled)[0])
         return compiled
 
@@ -91,23 +99,45 @@ class KeptPrograms:
 KEPT = KeptPrograms()
 
 
+class _Mark:
+    """What lives as long as JAX's caches are not cleared."""
+
+
+def _marked_in_caches():
+    mark = _Mark()
+    jax.jit(lambda x, mark: x, static_argnums=1)(0, mark)
+    return weakref.ref(mark)
+
+
+def _lowered(program, arrays, static):
+    """The lowered program. One that warns is left to JAX, as it is to warn in each process."""
+    with warnings.catch_warnings(record=True) as given:
+        warnings.simplefilter("always")
+        lowered = program.lower(arrays, static)
+    for w in given:
+        warnings.warn_explicit(w.message, w.category, w.filename, w.lineno, source=w.source)
+    if any(w.category is not CompiledAgain for w in given):
+        raise NotDescribable("a program that warns")
+    return lowered
+
+
 def _words_for(function, arrays, static):
     """All that a program is made of but the user's functions, which are listed."""
     if any(getattr(jax.config, name) for name in BY_HAND):
         raise NotDescribable("programs that the user looks into")
-    words = Words()
-    words.say(_surroundings(), str(_settings()))
+    words, kinds = Words(), list(map(_kind, arrays))
+    if any(len(kind) > 3 for kind in kinds):
+        raise NotDescribable("arrays on other devices")
+    words.say(_surroundings(), str(_settings()), str(kinds))
     words.value(function)
     if words.functions:
         raise NotDescribable("a function that its name does not tell")
-    for array in arrays:
-        kind = _kind(array)
-        if len(kind) > 3:
-            raise NotDescribable("arrays on other devices")
-        words.say(str(kind))
     leaves, structure = static
-    words.value(leaves)
-    words.structure(structure)
+    try:
+        words.value(leaves)
+        words.structure(structure)
+    except (TypeError, ValueError) as error:  # a function without a signature
+        raise NotDescribable(str(error)) from error
     return words
 
 
@@ -126,29 +156,34 @@ def _first_device():
     return jax.sharding.SingleDeviceSharding(jax.devices()[0])
 
 
-def _answers(words, calls: list[tuple[Call, ...]]) -> str:
-    """What the user's functions return for these calls, as a digest."""
-    if not all(calls) or len(calls) != len(words.functions):
-        raise NotDescribable("a function of the user's that is called in no known way")
-    returned = Words()
-    for function, of_function in zip(words.functions, calls, strict=True):
-        for call in of_function:
-            returned.answer(function, call)
-    return returned.digest()
+def _digest(*parts: Any) -> str:
+    return hashlib.sha256(repr(parts).encode()).hexdigest()[:32]
+
+
+def _answers(words, calls: list[tuple[Call, ...]]) -> list[list[str | None]]:
+    """What the user's functions return for these calls now."""
+    return [[answer_of(function, call) for call in of_one] for function, of_one in zip(words.functions, calls, strict=True)]
 
 
 def _head(words, out_tree) -> tuple[str, bytes]:
-    """Name and beginning of the file of a program: what is given and what the user's functions return, how they are called, what it
-    returns itself.
+    """Name and beginning of the file of a program: what is given, how the user's functions are called and what they return, which has to
+    be what they returned when they were called, and what the program returns itself.
     """
-    calls = [LEDGER.of(function) for function in words.functions]
-    name, content = f"jaxlag-{words.digest()}-{_answers(words, calls)}-cache", io.BytesIO()
+    noted = [LEDGER.of(function) for function in words.functions]
+    calls, then = [tuple(of_one) for of_one in noted], [list(of_one.values()) for of_one in noted]
+    if not all(calls) or _answers(words, calls) != then:
+        raise NotDescribable("a function of the user's of which not all is known")
+    content = io.BytesIO()
     try:
         for part in (calls, out_tree):
             _Pickler(content, words.objects).dump(part)
+        content.seek(0)
+        if [_Unpickler(content, words.objects).load() for _ in range(2)] != [calls, out_tree]:
+            raise NotDescribable("something that is not the same when it is read again")
     except Exception as error:  # what cannot be pickled says so in many ways
         raise NotDescribable(str(error)) from error
-    return name, content.getvalue()
+    head = content.getvalue()
+    return f"jaxlag-{words.digest()}-{hashlib.sha256(head).hexdigest()[:32]}-{_digest(then)}-cache", head
 
 
 _ONE_AT_A_TIME = threading.Lock()
@@ -169,25 +204,33 @@ def _compiled_afresh() -> Iterator[None]:
 
 
 def _write(path, content):
-    """At once, as another process may read it."""
-    with tempfile.NamedTemporaryFile(dir=path.parent, delete=False) as file:
-        file.write(content)
-    os.replace(file.name, path)
+    """At once, as another process may read it; behind its digest."""
+    with tempfile.TemporaryDirectory(dir=path.parent) as folder:
+        file = Path(folder) / path.name
+        file.write_bytes(hashlib.sha256(content).digest() + content)
+        os.replace(file, path)
 
 
-def _read(file, words, arrays):
-    """The program in a file, if it is the one that is asked for; None if not, or if it cannot be read."""
-    _have_lapack()
-    try:
-        with file.open("rb") as content:
-            answers = _answers(words, _Unpickler(content, words.objects).load())
-            if not file.name.endswith(f"-{answers}-cache"):
-                return None
-            out_tree, payload = _Unpickler(content, words.objects).load(), content.read()
-        in_tree = jax.tree.structure(((arrays,), {}))
-        return serialize_executable.deserialize_and_load(payload, in_tree, out_tree, execution_devices=jax.devices()[:1])
-    except Exception:  # a damaged file; or the user's functions are other ones, which may do anything with such arguments
-        return None
+def _read(folder, words, arrays):
+    """The program in the folder that is asked for; None if there is none that can be read."""
+    asked: dict[str, str | None] = {}  # the answers to each set of calls
+    for file in sorted(folder.glob(f"jaxlag-{words.digest()}-*-cache")):
+        *_, head, answers, _ = file.name.split("-")
+        if asked.get(head, answers) != answers:
+            continue
+        try:
+            digest, content = (whole := file.read_bytes())[:32], io.BytesIO(whole[32:])
+            if hashlib.sha256(content.getbuffer()).digest() != digest:
+                continue
+            asked[head] = asked.get(head) or _digest(_answers(words, _Unpickler(content, words.objects).load()))
+            if asked[head] == answers:
+                _have_lapack()
+                out_tree, in_tree = _Unpickler(content, words.objects).load(), jax.tree.structure(((arrays,), {}))
+                of_file = content.read(), in_tree, out_tree
+                return serialize_executable.deserialize_and_load(*of_file, execution_devices=jax.devices()[:1])
+        except Exception:  # a file of another kind; what was loaded would have been the same program
+            continue
+    return None
 
 
 @functools.cache
@@ -207,12 +250,21 @@ class _Pickler(pickle.Pickler):
         return self.numbers.get(id(x))
 
     def reducer_override(self, x):
-        """A structure node by node: by itself it can be pickled only if it is one of Python's own containers."""
-        return (_node, (x.node_data(), x.children())) if isinstance(x, PyTreeDef) else NotImplemented
+        """A structure node by node: by itself it can be pickled only if it is one of Python's own containers. A mark of a package is what
+        stands there under its name.
+        """
+        if isinstance(x, PyTreeDef):
+            return _node, (x.node_data(), x.children())
+        names = [name for name, y in vars(sys.modules[type(x).__module__]).items() if y is x] if getattr(x, "__dict__", None) == {} else []
+        return (_named, (type(x).__module__, names[0])) if names and not isinstance(x, type) else NotImplemented
 
 
 def _node(data, children):
     return jax.tree.structure(0) if data is None else PyTreeDef.from_node_data_and_children(default_registry, data, children)
+
+
+def _named(module, name):
+    return getattr(sys.modules[module], name)
 
 
 class _Unpickler(pickle.Unpickler):
@@ -234,8 +286,9 @@ def _surroundings() -> str:
     found = hashlib.sha256()
     for file in sorted(PACKAGE.rglob("*.py")):
         found.update(file.read_bytes())
-    processor = Path("/proc/cpuinfo")
-    flags = [line for line in processor.read_text().splitlines() if line.startswith(("flags", "model"))][:4] if processor.exists() else []
+    processor, telling = Path("/proc/cpuinfo"), ("flags", "model", "Features", "CPU")
+    lines = processor.read_text().splitlines() if processor.exists() else []
+    flags = [line for line in lines if line.startswith(telling)][:8]
     compiler = os.environ.get("XLA_FLAGS", ""), jax.devices()[0].client.platform_version
     found.update(repr(([version(name) for name in VERSIONS], platform.uname()[:1], platform.machine(), flags, compiler)).encode())
     return f"{platform.python_version()} {found.hexdigest()}"

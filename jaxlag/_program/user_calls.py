@@ -1,4 +1,4 @@
-"""What programs asked the user's functions for while they were traced: a program is known by the answers."""
+"""What programs asked the user's functions for while they were traced, and what these answered: a program is known by the answers."""
 
 import weakref
 from collections.abc import Callable, Hashable
@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-MOST_NUMBERS = 64  # of an array whose numbers Python knows, and a function may have looked at
+MOST_NUMBERS = 64  # of an array whose numbers Python knows: a function may have looked at them
 MOST_CALLS = 64  # of different kinds, of one function; one that was called in more ways is not followed any longer
 
 
@@ -28,6 +28,12 @@ class Known(NamedTuple):
     numbers: bytes
 
 
+class Same(NamedTuple):
+    """The very array that an earlier leaf is."""
+
+    leaf: int
+
+
 class Call(NamedTuple):
     """What a function was called with: the leaves and the structure of ((positional arguments), {arguments by name})."""
 
@@ -36,50 +42,57 @@ class Call(NamedTuple):
 
     @classmethod
     def of(cls, positional: list, by_name: dict[str, Any]) -> "Call | None":
-        """Of a call with these arguments; None if one of them has no hash."""
+        """Of a call with these arguments; None if one of them cannot be described."""
         leaves, structure = jax.tree.flatten((tuple(positional), by_name))
-        described = tuple(map(_described, leaves))
-        return cls(described, structure) if all(isinstance(leaf, Hashable) for leaf in described) else None
+        first: dict[int, int] = {}
+        described = [_described(leaf) if first.setdefault(id(leaf), i) == i else Same(first[id(leaf)]) for i, leaf in enumerate(leaves)]
+        return cls(tuple(described), structure) if all(isinstance(leaf, Hashable) for leaf in described) else None
 
     def arguments(self) -> tuple[list[jax.ShapeDtypeStruct], Callable]:
         """The shapes among the leaves, and the arguments as a function of arrays of these shapes."""
         shapes = [leaf for leaf in self.leaves if isinstance(leaf, Shape)]
 
         def filled(arrays: list) -> tuple[tuple, dict[str, Any]]:
-            given = iter(arrays)
-            return jax.tree.unflatten(self.structure, [next(given) if isinstance(leaf, Shape) else _value(leaf) for leaf in self.leaves])
+            given, leaves = iter(arrays), []
+            for leaf in self.leaves:
+                leaves.append(leaves[leaf.leaf] if isinstance(leaf, Same) else next(given) if isinstance(leaf, Shape) else _value(leaf))
+            return jax.tree.unflatten(self.structure, leaves)
 
         return [jax.ShapeDtypeStruct(x.shape, x.dtype, weak_type=x.weak) for x in shapes], filled
 
 
 class Ledger:
-    """The calls of each function while it is open. They are kept by function and not by program: a part of a program may have been traced
-    with an earlier one. A function of which not all calls are known has none here.
+    """The calls of each function while it is open, each with the digest of its answer then: a part of a program may have been traced with
+    an earlier one, and what a function closes over may have changed since. A function of which not all is known has none here.
     """
 
     def __init__(self) -> None:
-        self.is_open = False
-        self._calls: weakref.WeakKeyDictionary[Callable, dict[Call, None] | None] = weakref.WeakKeyDictionary()
+        self.digest: Callable[[Callable, Call], str | None] | None = None  # of an answer, while it is open; None where there is none
+        self._answers: weakref.WeakKeyDictionary[Callable, dict[Call, str] | None] = weakref.WeakKeyDictionary()
 
     def note(self, function: Callable, positional: list, by_name: dict[str, Any]) -> None:
-        """Writes a call down."""
+        """Writes a call down that has succeeded."""
         try:
-            calls = self._calls.setdefault(function, {} if self.is_open else None)
+            answers = self._answers.setdefault(function, None if self.digest is None else {})
         except TypeError:  # to which there are no weak references
             return
-        if calls is not None:
-            call = Call.of(positional, by_name) if self.is_open else None
-            if call is None or len(calls) > MOST_CALLS:
-                self._calls[function] = None
-            else:
-                calls[call] = None
+        if answers is None:
+            return
+        call = None if self.digest is None or len(answers) >= MOST_CALLS else Call.of(positional, by_name)
+        if call is not None and call in answers:
+            return
+        answer = None if call is None or self.digest is None else self.digest(function, call)
+        if call is None or answer is None:
+            self._answers[function] = None
+        else:
+            answers[call] = answer
 
-    def of(self, function: Callable) -> tuple[Call, ...]:
-        """The calls of a function; none if they are not all known."""
+    def of(self, function: Callable) -> dict[Call, str]:
+        """The calls of a function and its answers; none if they are not all known."""
         try:
-            return tuple(self._calls.get(function) or ())
+            return self._answers.get(function) or {}
         except TypeError:
-            return ()
+            return {}
 
 
 LEDGER = Ledger()
@@ -87,14 +100,15 @@ LEDGER = Ledger()
 
 def asked(function: Callable, positional: list, by_name: dict[str, Any]) -> Any:
     """`function(*positional, **by_name)`, written down in the ledger."""
+    returned = function(*positional, **by_name)
     LEDGER.note(function, positional, by_name)
-    return function(*positional, **by_name)
+    return returned
 
 
 def _described(leaf):
-    if isinstance(leaf, (np.ndarray, np.generic)) and leaf.size <= MOST_NUMBERS:
-        return Known(leaf.shape, str(leaf.dtype), leaf.tobytes())
-    if isinstance(leaf, (np.ndarray, np.generic, jax.Array)):
+    if isinstance(leaf, (np.ndarray, np.generic)):
+        return Known(leaf.shape, str(leaf.dtype), leaf.tobytes()) if leaf.size <= MOST_NUMBERS else leaf
+    if isinstance(leaf, jax.Array):
         return Shape(leaf.shape, str(leaf.dtype), bool(getattr(leaf, "weak_type", False)))
     return leaf
 
