@@ -53,7 +53,8 @@ class Call(NamedTuple):
         shapes = [leaf for leaf in self.leaves if isinstance(leaf, Shape)]
 
         def filled(arrays: list) -> tuple[tuple, dict[str, Any]]:
-            given, leaves = iter(arrays), []
+            given = iter(arrays)
+            leaves: list[Any] = []
             for leaf in self.leaves:
                 leaves.append(leaves[leaf.leaf] if isinstance(leaf, Same) else next(given) if isinstance(leaf, Shape) else _value(leaf))
             return jax.tree.unflatten(self.structure, leaves)
