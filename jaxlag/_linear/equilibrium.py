@@ -16,6 +16,7 @@ from .._model.state_values import given_states
 from .._model.system import System
 from .._model.validation import coordinates, parameters, state, without_contacts
 from .._program.jit import is_concrete, seen
+from .._program.sparse_jacobian import MANY
 from .not_differentiated import without_derivative
 from .rest import Rest, Search, steady_state
 from .sparse_rest import MOST_DENSE, many_at_rest
@@ -199,7 +200,8 @@ def _found(system: System, q: PyTree, qdot: PyTree, params: PyTree, t: Any, stat
 
 def _near(search, *given):
     """Of many coordinates in their structure, where they have one; where that finds none and they are not too many, as of few."""
-    found = many_at_rest(search, *given)
+    _, _, q, *_ = given
+    found = many_at_rest(search, *given) if sum(np.size(leaf) for leaf in jax.tree.leaves(q)) >= MANY else None
     if found is None:
         return steady_state(search, *given)
     values = seen(found)
