@@ -16,8 +16,10 @@ from .._model.state_values import given_states
 from .._model.system import System
 from .._model.validation import coordinates, parameters, state, without_contacts
 from .._program.jit import is_concrete, seen
+from .._program.sparse_jacobian import MANY
 from .not_differentiated import without_derivative
-from .rest import Search, steady_state
+from .rest import Rest, Search, steady_state
+from .sparse_rest import MOST_DENSE, many_at_rest
 from .stability import stability, undecided
 
 
@@ -28,8 +30,8 @@ class Equilibrium(eqx.Module):
     - `friction`: by dissipation term with dry friction, the force that holds and the bound that it would have to exceed.
     - `stability`: "stable", "unstable" or "neutral", by the potential energy on the constraints; elsewhere a sentence.
     - `stiffness`: the second variation of the potential on the constraints, relative to M: squares of natural frequencies, ascending;
-      without inertia, the eigenvalues of the stiffness itself. None where there is no potential, under `jit` and under `vmap`. Its
-      derivative is NaN: take those of `linearise`.
+      without inertia, the eigenvalues of the stiffness itself. None where there is no potential, of many coordinates that are each coupled
+      to a few, under `jit` and under `vmap`. Its derivative is NaN: take those of `linearise`.
     - `undecided`: coordinates on which nothing depends: they stay where they were.
     """
 
@@ -179,7 +181,7 @@ def _found(system: System, q: PyTree, qdot: PyTree, params: PyTree, t: Any, stat
         raise ValueError(f"`stable` must be False where forces are not from L, but there are {terms}. Write their potential into L.")
     t = number(t, "`t`", jax.tree.leaves(q)[0].dtype, cure="Pass one time, and use `jax.vmap` for several.")
     given = system, t, q, qdot, parameters(params, q), given_states(system, states, q)
-    found, names = steady_state(search, *given), entry_names(q, "q")
+    found, names = _near(search, *given), entry_names(q, "q")
     is_known = is_concrete(jax.lax.stop_gradient(found))
     values = seen(found)
     if found.friction and not (is_known and values is not None and values.succeeded):
@@ -194,6 +196,21 @@ def _found(system: System, q: PyTree, qdot: PyTree, params: PyTree, t: Any, stat
     stiffness, kind = stability(system, values)
     shown = None if stiffness is None else without_derivative(stiffness, given)
     return Equilibrium(*found[:5], found.t, shown, kind, undecided(values, names))
+
+
+def _near(search, *given):
+    """Of many coordinates in their structure, where they have one; where that finds none and they are not too many, as of few."""
+    _, _, q, *_ = given
+    found = many_at_rest(search, *given) if sum(np.size(leaf) for leaf in jax.tree.leaves(q)) >= MANY else None
+    if found is None:
+        return steady_state(search, *given)
+    values = seen(found)
+    if found.left.size > MOST_DENSE or (values is not None and np.all(values.succeeded)):
+        return found
+    if values is not None:
+        return steady_state(search, *given)
+    shown = jax.lax.cond(found.succeeded, lambda: found[:5], lambda: steady_state(search, *given)[:5])
+    return Rest(*shown, *found[5:])
 
 
 def _refuse(found, names):

@@ -10,6 +10,7 @@ import lineax as lx
 from jaxtyping import Array, Bool, Float
 
 from .._program.implicit import implicit_root
+from .._program.sparse_matrix import SparseMatrix
 
 ITERATIONS = 100
 Residual = Callable[[Any, Float[Array, " u"]], Float[Array, " r"]]  # R(args, w)
@@ -25,19 +26,31 @@ class Root(NamedTuple):
 def root_near(residual: Residual, args: Any, guess: Float[Array, " u"], ease: Float[Array, " u"] | float = 1.0) -> Root:
     """The root that Newton's method finds from a guess; of several that nothing decides between, the nearest, where to move one unknown
     costs less the greater its `ease`.
+    """
+    fixed = jax.lax.stop_gradient(args)
+    slope = lambda w: jax.jacfwd(residual, 1)(fixed, w)
+
+    def changes(w):
+        J = slope(w)
+        return lambda w: -least_change(J, residual(fixed, w), ease * (1 + jnp.abs(w)))
+
+    w = newton(changes, jax.lax.stop_gradient(guess))
+    return Root(differentiable_root(residual, args, w), is_root(slope(w), residual(fixed, w), w))
+
+
+def newton(changes: Callable[[Array], Callable[[Array], Array]], guess: Float[Array, " u"]) -> Float[Array, " u"]:
+    """Where Newton's method comes to rest; `changes(w)` is w' ↦ −J(w)⁻¹ R(w').
 
     A step is halved until the step that would follow it is shorter: a test that does not depend on the units of R or w.
 
     Source: Deuflhard, Newton Methods for Nonlinear Problems, section 3.3.2 (natural monotonicity test).
     """
-    fixed, eps = jax.lax.stop_gradient(args), jnp.finfo(guess.dtype).eps
-    slope = lambda w: jax.jacfwd(residual, 1)(fixed, w)
+    eps = jnp.finfo(guess.dtype).eps
     length = lambda step, w: jnp.max(jnp.abs(step) / (1 + jnp.abs(w)), initial=0.0)
 
     def turn(carry):
         w, _, i = carry
-        J = slope(w)
-        change = lambda w: -least_change(J, residual(fixed, w), ease * (1 + jnp.abs(w)))
+        change = changes(w)
         step = change(w)
 
         def is_shorter(part):
@@ -52,13 +65,13 @@ def root_near(residual: Residual, args: Any, guess: Float[Array, " u"], ease: Fl
         w, done, i = carry
         return (i < ITERATIONS) & ~done & jnp.all(jnp.isfinite(w))
 
-    w, _, _ = jax.lax.while_loop(is_on_its_way, turn, (jax.lax.stop_gradient(guess), jnp.array(False), jnp.array(0)))
-    return Root(differentiable_root(residual, args, w), is_root(slope(w), residual(fixed, w), w))
+    w, _, _ = jax.lax.while_loop(is_on_its_way, turn, (guess, jnp.array(False), jnp.array(0)))
+    return w
 
 
-def is_root(J: Array, R: Array, w: Array) -> Bool[Array, ""]:
+def is_root(J: Array | SparseMatrix, R: Array, w: Array) -> Bool[Array, ""]:
     """Whether a residual is zero: a change of w by rounding would bring as much about."""
-    allowed = jnp.finfo(w.dtype).eps ** 0.5 * (jnp.abs(J) @ (1 + jnp.abs(w)))
+    allowed = jnp.finfo(w.dtype).eps ** 0.5 * (abs(J) @ (1 + jnp.abs(w)))
     return jnp.all(jnp.isfinite(w)) & jnp.all(jnp.abs(R) <= allowed)
 
 

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
-from jaxtyping import Array, Bool, Float, PyTree
+from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from .._mechanics.friction_elements import FrictionElements, find_elements
 from .._mechanics.lagrange import applied_force, constraint_rows, inertia
@@ -32,6 +32,26 @@ class Search(NamedTuple):
     held: bool = False
 
 
+class Slopes(NamedTuple):
+    """M, and how the equations depend on q."""
+
+    M: Float[Array, "n n"]
+    by_q: Float[Array, "r n"]
+
+
+class Curvature(NamedTuple):
+    """What is said of the second variation of the potential on the constraints where its eigenvalues are not computed: how many are
+    certainly below zero and how many not certainly above, whether that decides, and whether there is a potential; and on which
+    coordinates nothing depends.
+    """
+
+    falling: Int[Array, ""]
+    not_rising: Int[Array, ""]
+    certain: Bool[Array, ""]
+    symmetric: Bool[Array, ""]
+    undecided: Bool[Array, " n"]
+
+
 class Rest(NamedTuple):
     """A steady state, and how it was found."""
 
@@ -46,8 +66,7 @@ class Rest(NamedTuple):
     uniform: Bool[Array, ""]  # whether it stays as it is
     left: Float[Array, " r"]  # what is left of the equations, in parts of what is allowed
     force: Float[Array, " n"]  # of these the forces
-    M: Float[Array, "n n"]
-    by_q: Float[Array, "r n"]  # how the equations depend on q
+    slopes: Slopes | Curvature
 
 
 class Unknowns(NamedTuple):
@@ -161,8 +180,7 @@ def _described(equations: Equations, given: Given, w: Array, found: Array) -> Re
         uniform,
         R / allowed,
         R[: q.size],
-        inertia(flat, t, q, v)[0].as_matrix(),
-        jax.jacfwd(in_terms_of_q)(jax.lax.stop_gradient(q)),
+        Slopes(inertia(flat, t, q, v)[0].as_matrix(), jax.jacfwd(in_terms_of_q)(jax.lax.stop_gradient(q))),
     )
 
 

@@ -9,7 +9,7 @@ from jaxtyping import Array
 
 from .._mechanics.singular_directions import tangent_basis
 from .._model.system import System
-from .rest import Rest
+from .rest import Curvature, Rest
 
 ELSEWHERE = "by the eigenvalues of `linearise`"
 
@@ -24,10 +24,13 @@ def stability(system: System, found: Rest) -> tuple[Array | None, str]:
         return None, f"{ELSEWHERE}: friction slips"
     if any(np.any(force) for force, _ in found.friction.values()):
         return None, "held by friction"
-    n, eps = len(found.M), float(np.finfo(found.M.dtype).eps)
-    K, G = -found.by_q[:n], found.by_q[n:]
+    if isinstance(found.slopes, Curvature):
+        return None, _by_inertia(found.slopes)
+    M, by_q = found.slopes
+    n, eps = len(M), float(np.finfo(M.dtype).eps)
+    K, G = -by_q[:n], by_q[n:]
     N = tangent_basis(G[np.any(G, axis=1)], eps)
-    K, M = N.T @ K @ N, N.T @ found.M @ N
+    K, M = N.T @ K @ N, N.T @ M @ N
     if np.max(np.abs(K - K.T), initial=0.0) > eps**0.5 * np.max(np.abs(K), initial=0.0):
         return None, f"{ELSEWHERE}: its forces have no potential"
     values, directions = np.linalg.eigh((M + M.T) / 2)
@@ -40,10 +43,21 @@ def stability(system: System, found: Rest) -> tuple[Array | None, str]:
     return jnp.asarray(stiffness), kind
 
 
+def _by_inertia(found: Curvature) -> str:
+    """What the signs of the pivots say."""
+    if not found.symmetric:
+        return f"{ELSEWHERE}: its forces have no potential"
+    if not found.certain:
+        return "not judged: the pivots of so many coordinates are within rounding"
+    return "unstable" if found.falling > 0 else "neutral" if found.not_rising > 0 else "stable"
+
+
 def undecided(found: Rest, names: Sequence[str]) -> tuple[str, ...]:
     """Coordinates on which nothing depends."""
     if any(np.any(force) for force, _ in found.friction.values()):
         return ()
-    size = np.max(np.abs(found.by_q), axis=0, initial=0.0)
-    dust = 100 * len(size) * np.finfo(found.M.dtype).eps * np.max(size, initial=0.0)
+    if isinstance(found.slopes, Curvature):
+        return tuple(name for name, alone in zip(names, found.slopes.undecided, strict=True) if alone)
+    size = np.max(np.abs(found.slopes.by_q), axis=0, initial=0.0)
+    dust = 100 * len(size) * np.finfo(size.dtype).eps * np.max(size, initial=0.0)
     return tuple(name for name, x in zip(names, size, strict=True) if x <= dust)

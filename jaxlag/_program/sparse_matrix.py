@@ -15,20 +15,22 @@ UNEVEN = 4  # rows are padded to the longest where that makes no more than so ma
 
 
 class Places:
-    """The rows and columns of the entries of a matrix, row by row; compared by them."""
+    """The rows and columns of the entries of a matrix, row by row; compared by them. `last`: the first of the rows that are eliminated
+    only after all that they are coupled with, as those of multipliers are.
+    """
 
-    def __init__(self, rows: np.ndarray, columns: np.ndarray, shape: tuple[int, int]):
-        self.rows, self.columns, self.shape = rows, columns, shape
-        self.key = shape, rows.tobytes(), columns.tobytes()
+    def __init__(self, rows: np.ndarray, columns: np.ndarray, shape: tuple[int, int], last: int | None = None):
+        self.rows, self.columns, self.shape, self.last = rows, columns, shape, last
+        self.key = shape, last, rows.tobytes(), columns.tobytes()
         self.hash = hash(self.key)
 
     @classmethod
-    def of(cls, pattern: Any) -> "Places":
+    def of(cls, pattern: Any, last: int | None = None) -> "Places":
         """Those of a sparse matrix of SciPy."""
         pattern = scipy.sparse.csr_matrix(pattern)
         pattern.sort_indices()
         m, n = pattern.shape
-        return cls(np.repeat(np.arange(m), np.diff(pattern.indptr)), np.asarray(pattern.indices, int), (m, n))
+        return cls(np.repeat(np.arange(m), np.diff(pattern.indptr)), np.asarray(pattern.indices, int), (m, n), last)
 
     def __eq__(self, other: object) -> bool:
         return isinstance(other, Places) and self.key == other.key
@@ -56,7 +58,7 @@ class Places:
     def transposed(self) -> tuple["Places", np.ndarray]:
         """Those of the transpose, and the numbers that its entries have here."""
         order = np.lexsort((self.rows, self.columns))
-        return Places(self.columns[order], self.rows[order], self.shape[::-1]), order
+        return Places(self.columns[order], self.rows[order], self.shape[::-1], self.last), order
 
 
 class SparseMatrix(eqx.Module):
@@ -86,6 +88,13 @@ class SparseMatrix(eqx.Module):
 
     def __neg__(self) -> "SparseMatrix":
         return SparseMatrix(-self.values, self.places)
+
+    def __abs__(self) -> "SparseMatrix":
+        return SparseMatrix(jnp.abs(self.values), self.places)
+
+    def plus_diagonal(self, x: Float[Array, " n"]) -> "SparseMatrix":
+        """With x added on the diagonal, all of which must be among the places."""
+        return SparseMatrix(self.values.at[np.flatnonzero(self.places.rows == self.places.columns)].add(x), self.places)
 
     def columns(self, which: np.ndarray) -> "SparseMatrix":
         """Some of its columns, in this order."""

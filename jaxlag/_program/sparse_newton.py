@@ -25,10 +25,16 @@ def newton_places(function: Callable, x: Float[Array, " k"], n: int) -> Places |
         found = dependence(function, x)
     except TooLong:
         return None
-    pattern = scipy.sparse.identity(n, bool, "csr") + found[:, :n] + found[:, n : 2 * n]
+    return sparse_places(found[:, :n] + found[:, n : 2 * n])
+
+
+def sparse_places(pattern: scipy.sparse.csr_matrix, last: int | None = None) -> Places | None:
+    """Those of a square matrix and its diagonal; None where a dense matrix serves better."""
+    n = pattern.shape[0]
+    pattern = scipy.sparse.identity(n, bool, "csr") + pattern
     if SPARSE * np.diff(pattern.indptr).max() > n or SPARSE * (max(colors(pattern)) + 1) > n:
         return None
-    places = Places.of(pattern)
+    places = Places.of(pattern, last)
     return places if SPARSE * order(places).size <= n else None
 
 

@@ -4,15 +4,16 @@ python tests/benchmarks/bench_growth.py [most links]
 
 By hand: for the chain S has three diagonals, in one call of a tridiagonal solve; in angles, the articulated inertias link by link. Medians
 of 30 calls, each length in a process of its own; 1 s of motion of 200 links and of 1000, each of unit length and mass; and its
-gradient in the mass of each link. Beside the rods: the same chain, at rest, as a tree of hinges in MuJoCo, which nests no more than 1024
-bodies; without the forces in the hinges. Its accelerations of the points are compared with those of the rods.
+gradient in the mass of each link; rest between two hooks, with the forces left. Beside the rods: the same chain, at rest, as a tree of
+hinges in MuJoCo, which nests no more than 1024 bodies; without the forces in the hinges. Its accelerations of the points are compared
+with those of the rods.
 """
 
 import subprocess
 import sys
 from time import perf_counter
 
-LENGTHS, MOTIONS, HINGES = (64, 256, 1024, 4096, 10_000), (200, 1000), (64, 256, 1000)
+LENGTHS, MOTIONS, HINGES, HANGING = (64, 256, 1024, 4096, 10_000), (200, 1000), (64, 256, 1000), (64, 256, 1024)
 
 
 def chain(n):
@@ -201,18 +202,50 @@ def gradient(n, kind):
     )
 
 
+def rest(n, kind):
+    """Between two hooks 0.6 n apart, from an arc; beside the closed form: tangents in arithmetic progression."""
+    import jax
+    import jax.numpy as jnp
+    import numpy as np
+    from scipy.optimize import brentq
+
+    import jaxlag as jl
+
+    hook = jnp.array([[0.6 * n, 0.0]])
+    joined = lambda q: jnp.diff(jnp.concatenate([jnp.zeros((1, 2)), q, hook]), axis=0)
+    weight = lambda q, qdot, m, g: 0.5 * m * jnp.sum(qdot**2) - m * g * jnp.sum(q[:, 1])
+    system = jl.System(weight, holonomic={"rods": lambda q, l: jnp.sum(joined(q) ** 2, axis=1) - l**2})
+    turn = brentq(lambda b: np.sum(np.cos(np.linspace(-b, b, n))) - 0.6 * n, 0.1, 2.5)
+    angles = np.linspace(-turn, turn, n)
+    start = np.cumsum(np.stack([np.cos(angles), np.sin(angles)], axis=1), axis=0)[:-1]
+    params = {"m": 1.0, "g": 9.81, "l": 1.0}
+    first, each, found = timed(lambda params: jl.equilibrium(system, start, params), params, times=5)
+    pull = 2 * found.multipliers["rods"][:, None] * joined(found.q)
+    left = float(np.abs(np.diff(pull, axis=0) + np.array([0, params["m"] * params["g"]])).max())
+    in_turn = np.arange(n) - (n - 1) / 2
+    slope = brentq(lambda a: np.sum(1 / np.hypot(1, a * in_turn)) - 0.6 * n, 1e-6, 10.0, xtol=1e-15)
+    expected = np.cumsum(slope * in_turn / np.hypot(1, slope * in_turn))[:-1]
+    off = float(np.abs(found.q[:, 1] - expected).max())
+    sag = lambda l: jl.equilibrium(system, start, params | {"l": l}).q[n // 2, 1]
+    _, gradient, _ = timed(jax.grad(sag), 1.0, times=5)
+    print(
+        f"{n:>7} links at rest: {1e3 * each:.1f} ms, the first {first:.1f} s, with derivative {1e3 * gradient:.1f} ms; "
+        f"forces left {left:.1e}, difference {off:.1e}, {found.stability}"
+    )
+
+
 def main():
     if len(sys.argv) == 4:
         import jax
 
         jax.config.update("jax_enable_x64", True)
-        kinds = {"acceleration": accelerations, "hinges": hinges, "motion": motion, "gradient": gradient}
+        kinds = {"acceleration": accelerations, "hinges": hinges, "motion": motion, "gradient": gradient, "rest": rest}
         return kinds[sys.argv[1]](int(sys.argv[2]), sys.argv[3])
     most = int(sys.argv[1]) if len(sys.argv) > 1 else LENGTHS[-1]
     print(f"{'links':>14}{'jaxlag ms':>12}{'by hand ms':>12}{'ratio':>8}{'first s':>9}{'by hand':>9}{'difference':>11}", flush=True)
-    for kind, lengths in (("acceleration", LENGTHS), ("hinges", HINGES), ("motion", MOTIONS), ("gradient", MOTIONS[:1])):
+    for kind, lengths in (("acceleration", LENGTHS), ("hinges", HINGES), ("motion", MOTIONS), ("gradient", MOTIONS[:1]), ("rest", HANGING)):
         for n in lengths:
-            for coordinates in () if n > most else ("places",) if kind == "hinges" else CHAINS:
+            for coordinates in () if n > most else ("places",) if kind in ("hinges", "rest") else CHAINS:
                 subprocess.run([sys.executable, __file__, kind, str(n), coordinates], check=True)
 
 

@@ -1,0 +1,126 @@
+"""Rest of many coordinates, each coupled to a few: no array of all by all.
+
+F(q, λ) = (f + Gᵀλ, g) = 0,    ∂F/∂(q, λ) = [−K Gᵀ; G 0]
+"""
+
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+import lineax as lx
+import numpy as np
+from jax import lax
+from jaxtyping import Array, Float, PyTree
+
+from .._mechanics.friction_elements import find_elements
+from .._mechanics.lagrange import imbalance, inertia
+from .._model.flat import Flat
+from .._model.state_values import start_values
+from .._model.system import System
+from .._model.validation import checked
+from .._program.block_tridiagonal_lu import factorised
+from .._program.jit import compiled
+from .._program.sparse_jacobian import MANY
+from .._program.sparse_matrix import SparseMatrix, row_sums
+from .newton import Root
+from .rest import Curvature, Equations, Given, Rest, Search
+from .sparse_descent import eigenvalues_below, sparse_minimum_near
+from .sparse_root import SparseEquations, refined, sparse_root_near
+
+MOST_DENSE = 400  # unknowns that are searched for with all zeros where the structure finds nothing: less than a minute
+
+
+class EquationsOfRest(Equations):
+    """f + Gᵀλ = 0 and g = 0, of derivatives of L and g alone."""
+
+    def __call__(self, given: Given, w: Float[Array, " u"]) -> Float[Array, " u"]:
+        flat, q, v, of = self.taken_apart(given, w)
+        lacking, _ = imbalance(flat, given.t, q, v, jnp.zeros_like(q), of.multipliers)
+        return jnp.concatenate([-lacking, flat.holonomic(given.t, q)]).astype(w.dtype)
+
+
+@compiled
+def many_at_rest(search: Search, system: System, t: Any, q: PyTree, qdot: PyTree, params: PyTree, states: PyTree) -> Rest | None:
+    """As `steady_state`; None where there are few coordinates, no structure, or more than forces and positions in the equations."""
+    flat, t, q0, v0 = checked(system, t, q, qdot, params, states)
+    beside = search.fixed or search.running or search.held or system.states or system.nonholonomic
+    if q0.size < MANY or beside or (search.stable and flat.rows) or find_elements(flat, t, q0, v0) is not None:
+        return None
+    values = start_values(system, states, t, q, qdot, params)
+    given = Given(eqx.filter(params, eqx.is_inexact_array), t, q0, v0)
+    start = lax.stop_gradient(jnp.concatenate([q0, jnp.zeros(flat.rows, q0.dtype)]))
+    of_rest = EquationsOfRest(search, system, q, params, values, given, flat)
+    equations = SparseEquations.of(of_rest, given, start, q0.size)
+    if equations is None:
+        return None
+    root = _searched(equations, lax.stop_gradient(given), flat, start, search.stable, can_descend=not (flat.rows or system.force))
+    return _described(of_rest, equations, given, equations.differentiable_root(given, root.w), root)
+
+
+def _searched(equations: SparseEquations, given: Given, flat: Flat, start: Array, stable: bool, can_descend: bool) -> Root:
+    """By Newton's method from the guess; where it finds nothing, or a minimum is asked for, from a minimum near the guess, where the
+    potential can be followed: springs that are not stretched yet have no stiffness across.
+    """
+    V = lambda q: -flat.lagrangian(given.t, q, given.v)
+    of_V = lambda q: (equations.residual(given, q), equations.jacobian(given, q))
+    if not can_descend:
+        return sparse_root_near(equations, given, _with_multipliers(equations, given, start))
+
+    def turn(carry):
+        _, attempts = carry
+        guess = lax.cond(attempts == 0, lambda: start, lambda: sparse_minimum_near(V, of_V, start))
+        return sparse_root_near(equations, given, guess), attempts + 1
+
+    nothing = Root(start, jnp.array(False)), jnp.array(1 if stable else 0)
+    return lax.while_loop(lambda carry: ~carry[0].found & (carry[1] < 2), turn, nothing)[0]
+
+
+def _with_multipliers(equations: SparseEquations, given: Given, w: Array) -> Array:
+    """With the multipliers that balance the forces best."""
+    J, n = equations.jacobian(given, w), given.q.size
+    of_q = np.arange(w.size) < n
+    within = of_q[J.places.rows] & of_q[J.places.columns]
+    A = SparseMatrix(jnp.where(within, 0, J.values), J.places).plus_diagonal(jnp.asarray(of_q, w.dtype))
+    balance = refined(A, factorised(A), jnp.where(of_q, -equations.residual(given, w), 0))
+    return w + jnp.where(of_q | ~jnp.all(jnp.isfinite(balance)), 0, balance)
+
+
+def _described(of_rest: EquationsOfRest, equations: SparseEquations, given: Given, w: Array, root: Root) -> Rest:
+    """A state of rest with all that is said of it."""
+    flat, q, v, of = of_rest.taken_apart(given, w)
+    known, at_rest = lax.stop_gradient((given, w))
+    J, R = equations.jacobian(known, at_rest), equations.residual(known, at_rest)
+    allowed = abs(J) @ (1 + jnp.abs(at_rest)) + jnp.finfo(w.dtype).tiny
+    shown = lambda x: jnp.where(root.found, x, jnp.nan)
+    alone = jnp.asarray(equations.alone[: q.size] > 0)
+    M = lax.stop_gradient(inertia(flat, given.t, q, v)[0])
+    return Rest(
+        flat.unravel(shown(q)),
+        flat.unravel(v),
+        {},
+        flat.unravel_multipliers(shown(of.multipliers)),
+        {},
+        jnp.array(False),
+        given.t,
+        root.found,
+        jnp.array(True),
+        R / allowed,
+        R[: q.size],
+        _curvature(J, M, alone),
+    )
+
+
+def _curvature(J: SparseMatrix, M: lx.AbstractLinearOperator, alone: Array) -> Curvature:
+    """By the inertia of J beside that of M: how many squares of natural frequencies are below zero, and how many within rounding."""
+    n, eps = alone.size, jnp.finfo(J.values.dtype).eps
+    mass = M.diagonal if isinstance(M, lx.DiagonalLinearOperator) else jnp.ones(n, J.values.dtype)
+    mass = jnp.where(jnp.min(mass) > 0, mass, 1)
+    difference = jnp.max(jnp.abs(J.T.values - J.values)) if J.T.places == J.places else jnp.inf
+    largest = jnp.max(row_sums(J)[:n] / mass)
+    J = J.plus_diagonal(jnp.concatenate([jnp.where(alone, -largest * mass, 0), jnp.zeros(J.shape[0] - n)]).astype(mass.dtype))
+    dust = eps**0.625 * largest
+    within = jnp.maximum(dust, jnp.nan_to_num(eigenvalues_below(J, mass, dust)[1], nan=jnp.inf))
+    (falling, error), (not_rising, error_too) = (eigenvalues_below(J, mass, bound) for bound in (-within, within))
+    seen = (within == dust) | (falling > 0) | (not_rising == 0)
+    symmetric = difference <= eps**0.5 * jnp.max(jnp.abs(J.values))
+    return Curvature(falling, not_rising + jnp.sum(alone), seen & (jnp.maximum(error, error_too) <= within), symmetric, alone)

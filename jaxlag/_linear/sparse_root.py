@@ -1,0 +1,91 @@
+"""Roots of many equations, each of a few unknowns: Newton's method with a sparse matrix from a few directional derivatives."""
+
+import dataclasses
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import scipy.sparse
+from jaxtyping import Array, Bool, Float
+
+from .._program.array_dependence import dependence
+from .._program.block_tridiagonal_lu import Factors, factorised, solution
+from .._program.expressions import TooLong
+from .._program.implicit import implicit_root
+from .._program.sparse_jacobian import entries
+from .._program.sparse_matrix import Places, SparseMatrix, colors
+from .._program.sparse_newton import linear_solution, sparse_places
+from .newton import Residual, Root, is_root, newton
+
+GROWTH = 0.85  # exponent of 1/eps: what J⁻¹ makes of a number where J is singular
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class SparseEquations:
+    """R(args, w) = 0, as many equations as unknowns, with the places of J = ∂R/∂w; `alone`: 1 for unknowns on which no equation depends
+    and whose equation depends on none, which stay as they are.
+    """
+
+    residual: Residual
+    places: Places
+    alone: np.ndarray
+
+    @classmethod
+    def of(cls, residual: Residual, args: Any, w: Float[Array, " u"], last: int) -> "SparseEquations | None":
+        """None where a dense matrix serves better; the unknowns from `last` on are multipliers."""
+        try:
+            pattern = dependence(lambda w: residual(args, w), w)
+        except TooLong:
+            return None
+        coupled = (np.diff(pattern.indptr) > 0) | (np.diff(scipy.sparse.csc_matrix(pattern).indptr) > 0)
+        places = sparse_places(pattern, last)
+        return None if places is None else cls(residual, places, (~coupled).astype(float))
+
+    def jacobian(self, args: Any, w: Float[Array, " u"]) -> SparseMatrix:
+        """J, with zeros for what is alone."""
+        _, push = jax.linearize(lambda w: self.residual(args, w), w)
+        pattern = self.places.pattern()
+        return SparseMatrix(entries(push, colors(pattern), pattern, w).values, self.places)
+
+    def invertible(self, J: SparseMatrix) -> SparseMatrix:
+        """J, with ones for what is alone."""
+        return J.plus_diagonal(jnp.asarray(self.alone, J.values.dtype))
+
+    def change(self, args: Any, w: Float[Array, " u"], R: Float[Array, " u"]) -> Float[Array, " u"]:
+        """−J⁻¹ R, to be differentiated."""
+        _, push = jax.linearize(lambda w: self.residual(args, w), w)
+        return -linear_solution(lambda x: push(x) + jnp.asarray(self.alone, x.dtype) * x, self.places, R)
+
+    def differentiable_root(self, args: Any, w: Float[Array, " u"]) -> Float[Array, " u"]:
+        """w, which depends on args as R(args, w) = 0 says."""
+        return implicit_root(self.residual, self.change, args, w)
+
+
+def refined(A: SparseMatrix, factors: Factors, b: Float[Array, " u"]) -> Float[Array, " u"]:
+    """A⁻¹ b, what is left put right once."""
+    x = solution(A.places, factors, b)
+    return x + solution(A.places, factors, b - A @ x)
+
+
+def sparse_root_near(equations: SparseEquations, args: Any, guess: Float[Array, " u"]) -> Root:
+    """The root that Newton's method finds from a guess; found only where J is regular there, so that it is the only one near."""
+    fixed = jax.lax.stop_gradient(args)
+
+    def changes(w):
+        A = equations.invertible(equations.jacobian(fixed, w))
+        factors = factorised(A)
+        return lambda w: -refined(A, factors, equations.residual(fixed, w))
+
+    w = newton(changes, jax.lax.stop_gradient(guess))
+    J, R = equations.jacobian(fixed, w), equations.residual(fixed, w)
+    return Root(w, is_root(J, R, w) & is_regular(equations.invertible(J)))
+
+
+def is_regular(A: SparseMatrix) -> Bool[Array, ""]:
+    """Whether A⁻¹ makes no huge numbers of numbers at random, and solves with them."""
+    size, eps = abs(A), jnp.finfo(A.values.dtype).eps
+    signs = jnp.asarray(np.random.default_rng(0).choice([-1.0, 1.0], A.shape[0]), A.values.dtype)
+    b = signs * (size @ jnp.ones_like(signs))
+    x = refined(A, factorised(A), b)
+    return (jnp.max(jnp.abs(x)) < eps**-GROWTH) & jnp.all(jnp.abs(A @ x - b) <= eps**0.5 * (size @ jnp.abs(x)))
