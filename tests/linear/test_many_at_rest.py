@@ -72,6 +72,7 @@ def test_a_chain_between_two_hooks_and_the_arch_that_it_makes(sign, stability):
     assert at.stability == stability and at.stiffness is None and at.undecided == ()
 
 
+@pytest.mark.slow
 def test_derivatives_of_the_sag():
     sag = lambda l: rods_at_rest(l).q[LINKS // 2, 1]
     expected = lambda l: hanging(LINKS, 1.3, lambda tension: np.full_like(tension, l))[LINKS // 2, 1]
@@ -120,6 +121,7 @@ def row_of_springs(q, qdot, m, g, c):
     return jnp.sum(0.5 * m * qdot**2 + m * g * q - 0.5 * c * (jnp.diff(q, prepend=0) - 1) ** 2)
 
 
+@pytest.mark.slow
 def test_a_row_of_springs_and_a_bead_without_anything():
     """Each is stretched by the weight below; the bead stays, and says so."""
     rng = np.random.default_rng(0)
