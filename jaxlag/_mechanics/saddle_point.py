@@ -149,7 +149,8 @@ def _factorised(M, G, f, c, reach) -> Factors:
         by_root = lambda B: jax.scipy.linalg.solve_triangular(cholesky, B, lower=True)
 
     def request():
-        length = None if reach is None else jnp.sqrt(reach @ (M.mv(reach) if isinstance(M, StructuredInertia) else M.as_matrix() @ reach))
+        size = lambda x: x @ M.mv(x) if isinstance(M, StructuredInertia) else x @ M.as_matrix() @ x
+        length = None if reach is None else jnp.sqrt(size(reach))
         return Request(by_root(G.T).T, c, by_root(_load(G, W, f, c)), length)
 
     S = G @ _by_inertia(M, G, W, cholesky)(G.T)
