@@ -10,7 +10,7 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float, PyTree
 
-from .._mechanics.consistent_state import off_constraints
+from .._mechanics.constraint_residuals import off_constraints
 from .._mechanics.contact import in_current_mode
 from .._mechanics.lagrange import applied_force, constraint_rows, inertia
 from .._mechanics.massless import first_order, with_masses

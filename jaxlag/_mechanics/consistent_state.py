@@ -16,12 +16,13 @@ from .._model.validation import at_state, coordinates
 from .._program.implicit import undifferentiated
 from .._program.jit import is_concrete
 from .._program.scalarise import scalarised
-from .._program.sparse_jacobian import MANY, jacobian
+from .._program.sparse_jacobian import MANY
 from .._program.sparse_matrix import SparseMatrix, dense, row_sums
 from .constrained_root import Linear, is_without_curvature, root_of
+from .constraint_residuals import off, off_constraints
 from .contact import in_contact
 from .friction_elements import find_elements, with_all_masses
-from .lagrange import inertia, position_rows, rows_of, velocity_residual, velocity_rows
+from .lagrange import inertia, position_rows, velocity_residual, velocity_rows
 from .massless import completed, inertial_part
 from .projection import metric_of_positions
 from .saddle_point import NO_INERTIA, Rows, is_determined, reach_of
@@ -46,36 +47,32 @@ class Consistent(NamedTuple):
     defined: Bool[Array, ""]
 
 
-def nearest_state(flat: Flat, t, q0, v0, free: Sequence[int] | None = None) -> Consistent:
-    """The state on the constraints nearest to (q0, v0), in which only the `free` coordinates move.
+def nearest_state(flat: Flat, t, q0, v0, free: Sequence[int] | None = None, *, found: bool = False) -> Consistent:
+    """The state on the constraints nearest to (q0, v0), in which only the `free` coordinates move; where it is `found`, itself.
 
     M (q − q0) = Gᵀλ,  g(t, q) = 0  by Newton's method, with M = M(q0); then  M (v − v0) = Gᵀμ,  ψ(t, q, v) = 0  with M = M(q).
     Derivatives are those that these equations imply.
     """
     moving = np.arange(q0.size) if free is None else np.asarray(free, int)
+    yes = jnp.array(True)
     stated, flat = flat, with_all_masses(flat, t, q0, v0)
     full = inertia(flat, t, q0, v0)[0]
     M = _part(full, moving)
     given = jnp.concatenate([flat.holonomic(t, q0), velocity_residual(flat, t, q0, v0)])
     positions = flat.holonomic(t, q0).size
     if given.size == 0:  # nothing to satisfy: saves the compilation of the search
-        yes = jnp.array(True)
-        return Consistent(
-            q0,
-            _with_decided_rates(stated, t, q0, v0),
-            yes,
-            is_determined(M, jnp.zeros((0, moving.size), q0.dtype)),
-            yes,
-            _is_finite(M),
-        )
+        determined = is_determined(M, jnp.zeros((0, moving.size), q0.dtype))
+        return Consistent(q0, _with_decided_rates(stated, t, q0, v0), yes, determined, yes, _is_finite(M))
     q = q0
     if positions:
         if given.size > 2 * positions:  # velocity constraints may be all that holds a coordinate
             held = is_determined(M, _columns(position_rows(flat, t, q0)[1], moving))
             metric = _part(metric_of_positions(flat, full, t, q0, v0), moving).as_matrix()
             M = lx.MatrixLinearOperator(jnp.where(held, M.as_matrix(), metric))
-        q = _nearest_position(flat, moving, t, q0, M)
-    v, determined = _nearest_velocity(inertial_part(flat, t, q, v0), moving, t, q, v0)
+        q = _nearest_position(flat, moving, t, q0, M, found)
+    v, determined = _nearest_velocity(inertial_part(flat, t, q, v0), moving, t, q, v0, found)
+    if found:
+        return Consistent(q, v, yes, determined, yes, yes)
     v = _with_decided_rates(stated, t, q, v)
 
     @undifferentiated
@@ -114,7 +111,7 @@ def _with_decided_rates(flat: Flat, t, q, v) -> Float[Array, " n"]:
     return completed(mode, t, q, v).v
 
 
-def _nearest_position(flat: Flat, moving, t, q0, M) -> Float[Array, " n"]:
+def _nearest_position(flat: Flat, moving, t, q0, M, found: bool) -> Float[Array, " n"]:
     """That on the constraints, where only the coordinates `moving` move."""
     free = moving.size
     unpacked = lambda q0, w: (q0.at[moving].set(w[:free]), w[free:])
@@ -130,7 +127,7 @@ def _nearest_position(flat: Flat, moving, t, q0, M) -> Float[Array, " n"]:
     def linear(args, w):
         (t, q0, M), (q, multipliers) = args, unpacked(args[1], w)
         g, G = position_rows(flat, t, q)
-        reach = reach_of(q[moving], _off(g, row_sums(G), q) > _small(q))
+        reach = reach_of(q[moving], off(g, row_sums(G), q) > _small(q))
         metric, G = M, _columns(G, moving)
         if not is_without_curvature(M, G):
             G, straight = dense(G), M.as_matrix()
@@ -138,8 +135,10 @@ def _nearest_position(flat: Flat, moving, t, q0, M) -> Float[Array, " n"]:
             metric = lx.MatrixLinearOperator(jnp.where(is_determined(lx.MatrixLinearOperator(curved), G), curved, straight))
         return Linear(metric, G, M.mv((q0 - q)[moving]), -g, reach)
 
-    def search(linear, args):
-        eps, size = jnp.finfo(like.dtype).eps, like.size - free
+    there = lambda args: jnp.concatenate([args[1][moving], jnp.zeros(like.size - free, like.dtype)])
+
+    def by_newton(linear, args):
+        eps, start = jnp.finfo(like.dtype).eps, there(args)
 
         def newton(carry):
             w, _, i = carry
@@ -147,17 +146,17 @@ def _nearest_position(flat: Flat, moving, t, q0, M) -> Float[Array, " n"]:
             moved = jnp.max(jnp.abs(found.x), initial=0.0) > 4 * eps * jnp.max(jnp.abs(w[:free]), initial=0.0)
             return jnp.concatenate([w[:free] + found.x, found.multipliers]), moved, i + 1
 
-        start = jnp.concatenate([args[1][moving], jnp.zeros(size, like.dtype)])
         step = jax.eval_shape(linear, args, start)
         most = WITHOUT_CURVATURE if is_without_curvature(step.M, step.G) else ITERATIONS
         going_on = lambda carry: carry[1] & (carry[2] < most)
         return jax.lax.while_loop(going_on, newton, (start, jnp.array(True), jnp.array(0)))[0], None
 
-    w, _ = root_of(residual, linear, search, (t, q0, M), like)
+    find = (lambda _, args: (there(args), None)) if found else by_newton
+    w, _ = root_of(residual, linear, find, (t, q0, M), like)
     return unpacked(q0, w)[0]
 
 
-def _nearest_velocity(flat: Flat, moving, t, q, v0) -> tuple[Float[Array, " n"], Bool[Array, ""]]:
+def _nearest_velocity(flat: Flat, moving, t, q, v0, found: bool) -> tuple[Float[Array, " n"], Bool[Array, ""]]:
     """That on the constraints, where only those of the coordinates `moving` move; and whether M leaves no direction without inertia."""
     free = moving.size
     like = jnp.concatenate([v0[moving], velocity_residual(flat, t, q, v0)])
@@ -174,34 +173,24 @@ def _nearest_velocity(flat: Flat, moving, t, q, v0) -> tuple[Float[Array, " n"],
     def linear(args, w):
         t, q, v0 = args
         psi, G, _ = velocity_rows(flat, t, q, v0)
-        reach = reach_of(v0[moving], _off(psi, row_sums(G), v0) > _small(q))
+        reach = reach_of(v0[moving], off(psi, row_sums(G), v0) > _small(q))
         return Linear(_part(inertia(flat, t, q, v0)[0], moving), _columns(G, moving), jnp.zeros_like(v0[moving]), -psi, reach)
 
-    def search(linear, args):
+    def by_one_step(linear, args):
         found = linear(args, like).solution()
         return jnp.concatenate([args[2][moving] + found.x, found.multipliers]), found.sound.determined
 
-    w, determined = root_of(residual, linear, search, (t, q, v0), like)
+    def there(linear, args):
+        step = linear(args, like)
+        return jnp.concatenate([args[2][moving], jnp.zeros_like(step.c)]), scalarised(is_determined)(step.M, step.G)
+
+    w, determined = root_of(residual, linear, there if found else by_one_step, (t, q, v0), like)
     return v0.at[moving].set(w[:free]), determined
 
 
 def _small(q):
     """The residual of a constraint, in the units of its row, from which on a state is off it."""
     return jnp.finfo(q.dtype).eps ** 0.5
-
-
-def off_constraints(flat: Flat, t, q, v) -> Float[Array, ""]:
-    """Largest residual of g and ψ, in the units of its row."""
-    slope = (lambda function, x: jax.jacfwd(function)(x)) if q.size < MANY else lambda function, x: rows_of(jacobian(function, x)[1])
-    of_positions = row_sums(slope(lambda q: flat.holonomic(t, q), q))
-    of_velocities = jnp.concatenate([of_positions, row_sums(slope(lambda v: flat.nonholonomic(t, q, v), v))])
-    return jnp.maximum(_off(flat.holonomic(t, q), of_positions, q), _off(velocity_residual(flat, t, q, v), of_velocities, v))
-
-
-def _off(residual, rows, x):
-    """Largest residual, in the units of its row, by the sums of them: rounding makes some eps of it."""
-    size = rows * (1 + jnp.max(jnp.abs(x)))
-    return jnp.max(jnp.abs(residual) / jnp.where(size > 0, size, 1), initial=0.0)
 
 
 def consistent_state(

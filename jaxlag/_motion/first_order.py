@@ -33,7 +33,6 @@ from .protocol import Arguments
 from .state_vector import Parts
 
 PROJECTION = "projection"  # name of the work that projection does
-NEGLIGIBLE = 1e7  # times the tolerance, compared with which a slip of a thousand tolerances is negligible
 
 
 class Formulation(NamedTuple):
@@ -192,12 +191,18 @@ class EquationsOfMotion:
         feedback = self.formulation.stabilisation.feedback()
         return scalarised(lambda t, q, v: constrained_acceleration(mode, t, q, v, feedback))(t, q, v)
 
+    def accelerated(self, t, parts: Parts, args: Arguments, is_free: bool = False) -> SaddlePoint:
+        """q̈ and λ in the mode of `parts`, or of the system `is_free` of its contacts: traced once, however often it is asked for."""
+        return _accelerated(self, t, parts, self._without_scales(args), is_free)
+
+    def _without_scales(self, args):
+        """Scales are for slips that may turn."""
+        return args._replace(scales=None) if self.rows == self.elements else args
+
     def friction(self, t, parts: Parts, args: Arguments, stabilised: bool = False) -> Friction:
         """Friction in the mode of `parts`, without or with the feedback of a stabilisation: traced once, however often it is asked for."""
-        if self.rows == self.elements:  # scales are for what may turn
-            args = args._replace(scales=None)
         stabilised &= self.formulation.stabilisation.feedback() is not None
-        return _friction(self, t, parts, args, stabilised)
+        return _friction(self, t, parts, self._without_scales(args), stabilised)
 
     def where_closed(self, parts: Parts, function: Callable, otherwise: Callable) -> Any:
         """`function()`, or `otherwise()` where there are contacts, but no friction, and all of them are open: at less cost."""
@@ -233,8 +238,8 @@ def _rates(equations: EquationsOfMotion, t, y, args):
     parts = equations.decided(t, equations.parts(y), args)
     q, v, works, sigma, held = parts.q, parts.v, parts.works, parts.sigma, parts.held
     flat, mode, elements = equations.mode(t, parts, args)
-    of = lambda flat: lambda: equations.acceleration(flat, t, q, v).x
-    qddot = equations.where_closed(parts, of(mode), of(free(mode)))
+    of = lambda is_free: lambda: equations.accelerated(t, parts, args, is_free).x
+    qddot = equations.where_closed(parts, of(False), of(True))
     if equations.light:  # what follows from the rest has no rate of its own
         qddot = qddot.at[first_order(mode, t, q, v).coordinates].set(0)
     rates = ravelled(flat.state_rates(t, q, v), y.dtype)
@@ -242,6 +247,12 @@ def _rates(equations: EquationsOfMotion, t, y, args):
     stuck = parts.time_stuck if elements is None else jnp.maximum(sticking(elements, sigma).astype(y.dtype), held)
     resting = Parts(*(jnp.zeros_like(part) for part in parts))
     return resting._replace(q=v, v=qddot, z=rates, works=powers, time_stuck=stuck).y
+
+
+@jitted
+def _accelerated(equations: EquationsOfMotion, t, parts: Parts, args, is_free) -> SaddlePoint:
+    _, mode, _ = equations.mode(t, parts, args)
+    return equations.acceleration(free(mode) if is_free else mode, t, parts.q, parts.v)
 
 
 @jitted

@@ -4,12 +4,9 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, PyTree
+from jaxtyping import Array, Bool, Float
 
-from .._mechanics.consistent_state import off_constraints
-from .._program.implicit import undifferentiated
 from .first_order import EquationsOfMotion
-from .protocol import Arguments
 from .results import RESULTS
 from .sample import Evidence, Sample
 
@@ -19,7 +16,6 @@ def verified(
     ts: Float[Array, " T1"],
     ys: Float[Array, "T1 y"],
     samples: tuple[Sample, Evidence],
-    params: PyTree,
     result: RESULTS,
     tolerances: tuple[Array, Array],
 ) -> tuple[Sample, RESULTS, Float[Array, ""]]:
@@ -31,7 +27,7 @@ def verified(
     result = RESULTS.where((result == RESULTS.dt_min_reached) & _locks(equations, ts, samples[0]), RESULTS.beyond_reach, result)
     ts, ys, (sample, evidence) = jax.tree.map(lambda leaf: leaf[:-1], (ts, ys, samples))
     there = jnp.all(jnp.isfinite(ys), axis=1)
-    for projected, reason in _guarantees(equations, ts, ys, sample, evidence, params, tolerances):
+    for projected, reason in _guarantees(equations, ts, sample, evidence, tolerances):
         broken = there & ~projected
         first = jnp.argmax(broken)
         there = there & (jnp.cumsum(broken) == 0)
@@ -44,9 +40,7 @@ def verified(
     return jax.tree.map(masked, sample), result, reached
 
 
-def _guarantees(
-    equations: EquationsOfMotion, ts, ys, sample: Sample, evidence: Evidence, params, tolerances
-) -> list[tuple[Bool[Array, " T"], Any]]:
+def _guarantees(equations: EquationsOfMotion, ts, sample: Sample, evidence: Evidence, tolerances) -> list[tuple[Bool[Array, " T"], Any]]:
     """Which samples keep each guarantee, and the reason that a motion ended where one does not."""
     numbers = jax.tree.leaves((sample.qddot, sample.multipliers))
     finite = jnp.all(jnp.stack([jnp.all(jnp.isfinite(leaf.reshape(len(ts), -1)), axis=1) for leaf in numbers]), axis=0)
@@ -56,17 +50,11 @@ def _guarantees(
         within = excess <= LITTLE * scale + LITTLE**1.5 * jnp.max(jnp.where(jnp.isfinite(scale), scale, 0), axis=0, keepdims=True)
         guarantees.append((jnp.all(within, axis=1), RESULTS.missed))
     if equations.projection is not None:
-        off = undifferentiated(jax.vmap(lambda t, y: _off(equations, t, y, params)))(ts, ys)
-        guarantees += [(off <= _residual_bound(tolerances), RESULTS.contradictory), (evidence.sound.satisfied, RESULTS.contradictory)]
+        kept = (evidence.off <= _residual_bound(tolerances)) & evidence.sound.satisfied
+        guarantees.append((kept, RESULTS.contradictory))
     elif equations.system.constraints:  # what drifts contradicts itself in time
         guarantees.append((evidence.sound.satisfied | (jnp.arange(len(ts)) > 0), RESULTS.contradictory))
     return guarantees
-
-
-def _off(equations, t, y, params):
-    parts = equations.parts(y)
-    _, mode, _ = equations.mode(t, parts, Arguments(params))
-    return off_constraints(mode, t, parts.q, parts.v)
 
 
 def _residual_bound(tolerances):

@@ -13,11 +13,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, PyTree
 
-from .._mechanics.consistent_state import nearest_state
+from .._mechanics.consistent_state import Consistent, nearest_state
 from .._mechanics.contact import outside
 from .._mechanics.friction_treatment import Regularised, StickSlip
 from .._mechanics.projection import Baumgarte, NoStabilisation, Projection
-from .._model.flat import StatesAt
+from .._model.flat import Flat, StatesAt
 from .._model.numbers import count, number
 from .._model.signal import broken_signals, moves_smoothly
 from .._program.single_kernel import in_one_kernel
@@ -29,6 +29,7 @@ from .progress import Bar
 from .protocol import Arguments, FirstOrderSystem, Scales
 from .results import RESULTS, from_diffrax
 from .runge_kutta import Dop853, ExplicitRungeKutta, is_explicit
+from .search_for_start import Search
 from .sparse_implicit import in_structure
 from .step_size import GuardedController
 from .stick_slip_solver import StickSlipSolver
@@ -102,11 +103,11 @@ class Initial(NamedTuple):
     conditions: tuple[tuple[Bool[Array, ""], Any], ...]
 
 
-def initialised(equations: EquationsOfMotion, at: StatesAt, params, scales: Scales | None = None) -> Initial:
+def initialised(equations: EquationsOfMotion, at: StatesAt, params, scales: Scales | None = None, search: Search = Search.ALL) -> Initial:
     """The start, put on the constraints; `scales` are needed where there are events."""
     _, t0, q, v = at
     flat = equations.flat_at(params, at)
-    nearest = nearest_state(flat._replace(holonomic=flat.bilateral), t0, outside(flat, t0, q, v), v)
+    nearest = _nearest(equations, flat, at, params, search)
     start = started(equations, at._replace(q=nearest.q, v=nearest.v), params)
     moved = jax.lax.stop_gradient(jnp.max(jnp.abs(jnp.concatenate([nearest.q - q, nearest.v - v]))))
     conditions = (
@@ -128,6 +129,17 @@ def initialised(equations: EquationsOfMotion, at: StatesAt, params, scales: Scal
     if equations.works:  # counted from behind an impact and events at the start
         y = equations.parts(y)._replace(works=jnp.zeros(len(equations.works), y.dtype)).y
     return Initial(y, moved, conditions)
+
+
+def _nearest(equations: EquationsOfMotion, flat: Flat, at: StatesAt, params, search: Search) -> Consistent:
+    """The start on the constraints; where it is that itself, the solve of the motion says whether inertia is missing."""
+    _, t0, q, v = at
+    if search is not Search.NOTHING or equations.elements:
+        flat, found = flat._replace(holonomic=flat.bilateral), search is not Search.ALL
+        return nearest_state(flat, t0, outside(flat, t0, q, v), v, found=found)
+    yes = jnp.array(True)
+    determined = equations.accelerated(t0, equations.at_start(at, params), Arguments(params)).sound.determined
+    return Consistent(q, v, reached=yes, determined=determined, affine=yes, defined=yes)
 
 
 def with_status(ys, result, conditions, inputs) -> tuple[Array, RESULTS]:

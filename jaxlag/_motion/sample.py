@@ -6,9 +6,12 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PyTree
 
+from .._mechanics.constraint_residuals import off_constraints
 from .._mechanics.contact import contact_rows, gap_scales, idle
 from .._mechanics.saddle_point import Sound
 from .._mechanics.stick_slip import friction_by_term, slip_of, sticking
+from .._program.implicit import undifferentiated
+from .._program.scalarise import scalarised
 from .first_order import EquationsOfMotion
 from .protocol import Arguments
 
@@ -45,6 +48,7 @@ class Evidence(NamedTuple):
     """What tells whether a sample keeps the guarantees of a motion."""
 
     sound: Sound
+    off: Float[Array, ""]  # the constraints, in the units of their rows
     violation: Violation
 
 
@@ -57,7 +61,7 @@ def sample_at(equations: EquationsOfMotion, t, y, params, tolerances) -> tuple[S
     states = equations.states_of(t, parts).values
     friction_states, counts, violation = {}, {}, Violation(jnp.zeros(0), jnp.zeros(0))
     if elements is None:
-        qddot, multipliers, sound = equations.acceleration(mode, t, q, v)
+        qddot, multipliers, sound = equations.accelerated(t, parts, Arguments(params))
     else:
         found = equations.friction(t, parts, Arguments(params), stabilised=True)
         qddot, multipliers, sound = found.qddot, found.multipliers, Sound(jnp.array(True), jnp.array(True))
@@ -67,6 +71,7 @@ def sample_at(equations: EquationsOfMotion, t, y, params, tolerances) -> tuple[S
         excess = jnp.where((held > 0) | idle(flat, elements, sigma, found.bound), 0, -found.margin)
         violation = Violation(jnp.concatenate([excess, -found.bound]), jnp.concatenate([scale, jnp.abs(found.bound)]))
         counts = {"transitions": parts.transitions[0], "time_stuck": parts.time_stuck}
+    off = undifferentiated(scalarised(lambda t, q, v: off_constraints(mode, t, q, v)))(t, q, v)
     named = dict(zip(equations.works, works, strict=True)) if equations.works else None
     if equations.contacts:
         violation = violation.beside(*_contact_violation(flat, t, parts, multipliers, rtol, atol))
@@ -75,7 +80,7 @@ def sample_at(equations: EquationsOfMotion, t, y, params, tolerances) -> tuple[S
     events = dict(zip(dict(equations.system.events), parts.happened, strict=True))
     unraveled = flat.unravel(q), flat.unravel(v), flat.unravel(qddot), flat.unravel_multipliers(multipliers)
     sample = Sample(*unraveled, dict(states), named, friction_states, contacts, events, counts)
-    return sample, Evidence(sound, jax.lax.stop_gradient(violation))
+    return sample, Evidence(sound, off, jax.lax.stop_gradient(violation))
 
 
 def _contact_violation(flat, t, parts, multipliers, rtol, atol):

@@ -21,6 +21,7 @@ from .first_order import Formulation
 from .integrate import SolverOptions, tolerances_of
 from .padding import padded_signals, padded_times, without_padding
 from .progress import compiling
+from .search_for_start import search_for
 from .solution_map import Inputs, SolutionMap, trajectory_of
 from .table import Table
 from .trajectory import Trajectory
@@ -98,13 +99,15 @@ def simulate(
     padded = padded_signals(given)
     with compiling("the motion", progress):
         if adjoint is not None or is_concrete(given.others, tolerances, states, ts):
-            table = _trajectory(system, options, padded, tolerances, states, ts)
+            search = search_for(system, padded, states, ts, is_varied=adjoint is not None)
+            table = _trajectory(system, options, padded, tolerances, states, ts, search)
             q0, qdot0, params = given.trees
             trajectory = table.trajectory(length, params)
         else:
             q0, qdot0, params = given.trees
             inputs = Inputs(ts[0], q0, qdot0, padded.trees[2], tolerances, states)
-            solution = differentiable(SolutionMap(system, options))(inputs, ts)
+            search = search_for(system, padded, states, ts, is_varied=True)
+            solution = differentiable(SolutionMap(system, options, search))(inputs, ts)
             trajectory = trajectory_of(system, options, params, jnp.asarray(ts), *solution)
             trajectory = without_padding(trajectory, length) if ts.size > length else trajectory
     if throw:
@@ -113,8 +116,8 @@ def simulate(
 
 
 @compiled
-def _trajectory(system, options, given, tolerances, states, ts):
+def _trajectory(system, options, given, tolerances, states, ts, search):
     """The motion and its `Trajectory` in one program: to build that in Python takes as long as some ten steps of a vehicle."""
     q0, qdot0, params = given.trees
-    solution = SolutionMap(system, options).solve(Inputs(None, q0, qdot0, params, tolerances, states), ts)
+    solution = SolutionMap(system, options, search).solve(Inputs(None, q0, qdot0, params, tolerances, states), ts)
     return Table.of(trajectory_of(system, options, params, ts, *solution))

@@ -24,6 +24,7 @@ from .moments import ContactState, EventState, FrictionState
 from .protocol import Arguments, Scales
 from .provenance import Provenance
 from .sample import Sample, sample_at
+from .search_for_start import Search
 from .trajectory import Trajectory
 from .variational import derived, pushforward, split_varying
 
@@ -64,6 +65,7 @@ class SolutionMap:
 
     system: System = dataclasses.field(metadata={"static": True})
     options: SolverOptions
+    search: Search = dataclasses.field(default=Search.ALL, metadata={"static": True})  # for a start on the constraints
 
     def solve(self, inputs: Inputs, ts: Array) -> tuple[Samples, Unchanging]:
         """The samples; unless the user has chosen an adjoint, with forward-mode derivatives."""
@@ -78,7 +80,7 @@ class SolutionMap:
         params, tolerances = inputs.params, inputs.tolerances
         smooth = with_second_derivatives(params)
         args = Arguments(smooth, Scales.of(tolerances, ts, smooth))
-        start = initialised(equations, at, smooth, args.scales)
+        start = initialised(equations, at, smooth, args.scales, self.search)
         ys, result, stats = states_at(equations, self.options, adjoint, at.t, start.y, ts, args, tolerances)
         ys, result = with_status(ys, result, start.conditions, (inputs, ts))
         return samples_at(equations, ts, ys, params, result, stats | {"start_moved": start.moved}, tolerances)
@@ -92,7 +94,7 @@ class SolutionMap:
 
         def initial(inputs):
             params = with_second_derivatives(inputs.params)
-            start = initialised(equations, self._at(inputs, ts), params, Scales.of(inputs.tolerances, ts, params))
+            start = initialised(equations, self._at(inputs, ts), params, Scales.of(inputs.tolerances, ts, params), self.search)
             return start.y, start
 
         arguments = lambda inputs: (_first_time(inputs, ts), Arguments(with_second_derivatives(inputs.params)))
@@ -178,7 +180,7 @@ def samples_at(equations: EquationsOfMotion, ts, ys, params, result, stats, tole
     samples = jax.vmap(lambda t, y: sample_at(equations, t, y, params, tolerances))(times, states)
     if equations.events:  # behind the end of a motion there is none
         states = jnp.where(states[:, -1:] > 0, jnp.nan, states)
-    shown, result, reached = verified(equations, times, states, samples, params, result, tolerances)
+    shown, result, reached = verified(equations, times, states, samples, result, tolerances)
     counts = {name: count for name, count in stats.items() if name != "last"} | {"reached": jax.lax.stop_gradient(reached)}
     changing, rest = eqx.partition(shown, eqx.is_inexact_array)
     return Samples(ys, changing, events), Unchanging(result, counts, rest)

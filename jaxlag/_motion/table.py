@@ -4,7 +4,6 @@ What Python knows already, the params, does not come back at all.
 """
 
 import dataclasses
-import functools
 from typing import Any
 
 import equinox as eqx
@@ -13,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PyTree
 
+from .._program.jit import compiled
 from .padding import EXACT
 from .trajectory import Trajectory, of_samples
 
@@ -50,7 +50,7 @@ class Table:
         return jax.tree.unflatten(self.structure, [leaves[i] for i in self.order])
 
 
-@functools.partial(jax.jit, static_argnums=2)
+@compiled
 def _first(rows, columns, length):
     """The rows one by one, and the columns, both cut to length."""
     return [row[:length] for row in rows], [column[:length] for column in columns]

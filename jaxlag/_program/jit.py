@@ -144,6 +144,13 @@ def seen(tree: PyTree) -> PyTree | None:
     return None if _has_tracers(leaves) else jax.tree.unflatten(structure, leaves)
 
 
+def values(tree: PyTree) -> PyTree | None:
+    """The values as Python may look at them, of what is differentiated too; None where `jit` hides them, or there is a batch of them."""
+    leaves, structure = jax.tree.flatten(tree)
+    leaves = [jax.lax.stop_gradient(leaf) if isinstance(leaf, jax.core.Tracer) else leaf for leaf in leaves]
+    return None if _has_tracers(leaves) else jax.tree.unflatten(structure, leaves)
+
+
 def _seen(leaf):
     leaf = jax.lax.stop_gradient(leaf)
     while isinstance(leaf, jax.core.Tracer) and hasattr(leaf, "batch_dim"):
