@@ -103,7 +103,7 @@ class Initial(NamedTuple):
     conditions: tuple[tuple[Bool[Array, ""], Any], ...]
 
 
-def initialised(equations: EquationsOfMotion, at: StatesAt, params, scales: Scales | None = None, search: Search = Search.ALL) -> Initial:
+def initialised(equations: EquationsOfMotion, at: StatesAt, params, scales: Scales | None = None, search: Search = "all") -> Initial:
     """The start, put on the constraints; `scales` are needed where there are events."""
     _, t0, q, v = at
     flat = equations.flat_at(params, at)
@@ -134,8 +134,8 @@ def initialised(equations: EquationsOfMotion, at: StatesAt, params, scales: Scal
 def _nearest(equations: EquationsOfMotion, flat: Flat, at: StatesAt, params, search: Search) -> Consistent:
     """The start on the constraints; where it is that itself, the solve of the motion says whether inertia is missing."""
     _, t0, q, v = at
-    if search is not Search.NOTHING or equations.elements:
-        flat, found = flat._replace(holonomic=flat.bilateral), search is not Search.ALL
+    if search != "nothing" or equations.elements:
+        flat, found = flat._replace(holonomic=flat.bilateral), search != "all"
         return nearest_state(flat, t0, outside(flat, t0, q, v), v, found=found)
     yes = jnp.array(True)
     determined = equations.accelerated(t0, equations.at_start(at, params), Arguments(params)).sound.determined

@@ -65,7 +65,7 @@ class SolutionMap:
 
     system: System = dataclasses.field(metadata={"static": True})
     options: SolverOptions
-    search: Search = dataclasses.field(default=Search.ALL, metadata={"static": True})  # for a start on the constraints
+    search: Search = dataclasses.field(default="all", metadata={"static": True})  # for a start on the constraints
 
     def solve(self, inputs: Inputs, ts: Array) -> tuple[Samples, Unchanging]:
         """The samples; unless the user has chosen an adjoint, with forward-mode derivatives."""
