@@ -48,13 +48,10 @@ class Equilibrium(eqx.Module):
     def __repr__(self) -> str:
         if not is_concrete(self):
             return "Equilibrium(traced)"
-        value = lambda tree: ", ".join(
-            f"{name} = {x:.6g}" for name, x in zip(entry_names(tree, "q"), without_dust(np.asarray(ravel_pytree(tree)[0])), strict=True)
-        )
-        rows = [("at", value(self.q))]
+        rows = [("at", _listed(self.q))]
         if np.any(ravel_pytree(self.qdot)[0]):
-            rows.append(("moving with", value(self.qdot)))
-        rows += [(name, value(tree)) for name, tree in (("states", self.states), ("multipliers", self.multipliers)) if tree]
+            rows.append(("moving with", _listed(self.qdot)))
+        rows += [(name, _listed(tree)) for name, tree in (("states", self.states), ("multipliers", self.multipliers)) if tree]
         for name, (force, bound) in self.friction.items():
             *_, largest = without_dust(np.asarray([*bound, np.max(np.abs(force), initial=0.0)]))
             rows.append(("friction", f"{name}: {largest:.4g} of {np.min(bound):.4g} that it can hold"))
@@ -64,6 +61,15 @@ class Equilibrium(eqx.Module):
         return "\n".join(
             ["Equilibrium" if not np.any(ravel_pytree(self.qdot)[0]) else "Steady motion", *(f"  {n:<13}{v}" for n, v in rows)]
         )
+
+
+def _listed(tree: PyTree) -> str:
+    """The numbers by name: of many the first."""
+    numbers = [f"{name} = {x:.6g}" for name, x in zip(entry_names(tree, "q"), without_dust(np.asarray(ravel_pytree(tree)[0])), strict=True)]
+    return ", ".join(numbers if len(numbers) <= MOST_LISTED else [*numbers[: MOST_LISTED // 2], f"… ({len(numbers)} in all)"])
+
+
+MOST_LISTED = 24
 
 
 def without_dust(x: np.ndarray) -> np.ndarray:

@@ -18,6 +18,7 @@ from .._program.sparse_matrix import Places, SparseMatrix, colors
 from .._program.sparse_newton import linear_solution, sparse_places
 from .newton import Residual, Root, is_root, newton
 
+BY_VALUES = 2  # as sparse as is of use: the dense search finds singular values of all by all, at twenty times the cost of factors
 GROWTH = 0.85  # exponent of 1/eps: what J⁻¹ makes of a number where J is singular
 
 
@@ -39,7 +40,7 @@ class SparseEquations:
         except TooLong:
             return None
         coupled = (np.diff(pattern.indptr) > 0) | (np.diff(scipy.sparse.csc_matrix(pattern).indptr) > 0)
-        places = sparse_places(pattern, last)
+        places = sparse_places(pattern, last, BY_VALUES)
         return None if places is None else cls(residual, places, (~coupled).astype(float))
 
     def jacobian(self, args: Any, w: Float[Array, " u"]) -> SparseMatrix:

@@ -23,7 +23,11 @@ def search_for(system: System, given: Given, states: dict, ts, is_varied: bool) 
     if not system.constraints or system.unilateral:
         return "all"
     known = values((given, states, ts))
-    if known is None or not is_called_by_python((known[0].numbers, *known[0].others)) or not _needs_none(system, *known):
+    if known is None or not is_called_by_python((known[0].numbers, *known[0].others)):
+        return "all"
+    given, states, ts = known
+    given = Given.of(given.trees) if given.others else given  # so that a derivative asks the program that its motion has asked
+    if not _needs_none(system, given, states, ts):
         return "all"
     return "derivative" if is_varied else "nothing"
 

@@ -4,6 +4,7 @@ What Python knows already, the params, does not come back at all.
 """
 
 import dataclasses
+import functools
 from typing import Any
 
 import equinox as eqx
@@ -12,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PyTree
 
-from .._program.jit import compiled
+from .._program.jit import options
 from .padding import EXACT
 from .trajectory import Trajectory, of_samples
 
@@ -44,13 +45,18 @@ class Table:
 
     def trajectory(self, length: int, params: PyTree) -> Trajectory:
         """The first samples of the motion, which was computed from these params."""
-        rows, columns = _first(self.rows, self.columns, length) if len(self.rows) else (self.rows, self.columns)
+        rows, columns = _cut()(self.rows, self.columns, length) if len(self.rows) else (self.rows, self.columns)
         known = [leaf for leaf in jax.tree.leaves(params) if eqx.is_array(leaf)]
         leaves = [*rows, *columns, *self.others, *known]
         return jax.tree.unflatten(self.structure, [leaves[i] for i in self.order])
 
 
-@compiled
+@functools.cache
+def _cut():
+    """`_first`, compiled when it is needed: then XLA may be asked which options it knows."""
+    return jax.jit(_first, static_argnums=2, compiler_options=options())
+
+
 def _first(rows, columns, length):
     """The rows one by one, and the columns, both cut to length."""
     return [row[:length] for row in rows], [column[:length] for column in columns]

@@ -119,12 +119,14 @@ def _nothing():
 
 @functools.cache
 def _program_with_options(function):
-    return _program(function, compiler_options=_options())
+    return _program(function, compiler_options=options())
 
 
 @functools.cache
-def _options() -> dict[str, bool]:
-    """The options that this version of XLA knows: it refuses those that it does not."""
+def options() -> dict[str, bool]:
+    """Those for programs that Python calls on a CPU, as far as this version of XLA knows them: it refuses others."""
+    if jax.default_backend() != "cpu":
+        return {}
     try:
         jax.jit(lambda: 0, compiler_options=OLD_EMITTERS)()
     except jax.errors.JaxRuntimeError:

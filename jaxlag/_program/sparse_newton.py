@@ -28,14 +28,16 @@ def newton_places(function: Callable, x: Float[Array, " k"], n: int) -> Places |
     return sparse_places(found[:, :n] + found[:, n : 2 * n])
 
 
-def sparse_places(pattern: scipy.sparse.csr_matrix, last: int | None = None) -> Places | None:
-    """Those of a square matrix and its diagonal; None where a dense matrix serves better."""
+def sparse_places(pattern: scipy.sparse.csr_matrix, last: int | None = None, sparse: int = SPARSE) -> Places | None:
+    """Those of a square matrix and its diagonal; None where a dense matrix serves better, which has not `sparse` times as many rows as
+    there are entries in one, directions, and rows in a block.
+    """
     n = pattern.shape[0]
     pattern = scipy.sparse.identity(n, bool, "csr") + pattern
-    if SPARSE * np.diff(pattern.indptr).max() > n or SPARSE * (max(colors(pattern)) + 1) > n:
+    if sparse * np.diff(pattern.indptr).max() > n or sparse * (max(colors(pattern)) + 1) > n:
         return None
     places = Places.of(pattern, last)
-    return places if SPARSE * order(places).size <= n else None
+    return places if sparse * order(places).size <= n else None
 
 
 def factors_along(push: Callable, places: Places, like: Float[Array, "n *b"]) -> Factors:  # noqa: F821

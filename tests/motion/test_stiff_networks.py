@@ -5,6 +5,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from program_size import largest_array_and_count
 from scipy.integrate import solve_ivp
 from scipy.sparse import bmat, diags, eye, kron
 
@@ -100,18 +101,9 @@ def test_derivatives_in_the_stiffness_of_each_spring():
 
 
 def biggest_and_count(n):
-    """Of the program of a motion: the most numbers of an array, and how many equations it has."""
-    q = start(n)
+    """Of the program of a motion, and how many coordinates it has."""
     program = jax.make_jaxpr(lambda k: simulated(n, TS, PARAMS | {"k": k}, throw=False).q)(1e5)
-    sizes, count = [], 0
-    programs = [program.jaxpr]
-    while programs:
-        for equation in programs.pop().eqns:
-            count += 1
-            sizes += [getattr(v.aval, "size", 0) for v in equation.outvars]
-            inner = [part for value in equation.params.values() for part in (value if isinstance(value, (tuple, list)) else [value])]
-            programs += [getattr(part, "jaxpr", part) for part in inner if hasattr(getattr(part, "jaxpr", part), "eqns")]
-    return max(sizes), count, q.size
+    return *largest_array_and_count(program), start(n).size
 
 
 @pytest.mark.slow
