@@ -88,3 +88,34 @@ def held_by_hand(q, v, given):
     G, gamma = np.stack([l * np.cos(q), l * np.sin(q)]), np.stack([-l * np.sin(q), l * np.cos(q)]) @ v**2
     pulled = np.linalg.solve(M, G.T)
     return free - pulled @ np.linalg.solve(G @ pulled, gamma + G @ free)
+
+
+@pytest.mark.slow
+def test_several_chains_at_once(motion):
+    dampings = np.array([0.1, PARAMS["b"], 0.9])
+    found = jl.simulate_many(CHAIN, START, np.zeros(LINKS), TS, PARAMS | {"b": dampings}, over=("b",), rtol=1e-9, atol=1e-9)
+    np.testing.assert_allclose(found.q[1], motion.q, atol=1e-8)
+    alone = jl.simulate(CHAIN, START, np.zeros(LINKS), TS, PARAMS | {"b": 0.9}, rtol=1e-9, atol=1e-9)
+    np.testing.assert_allclose(found.q[2], alone.q, atol=1e-8)
+
+
+@pytest.mark.slow
+def test_what_is_identified_from_three_links():
+    """From a motion by hand with noise: within four standard errors, those of differences between motions."""
+    ts, seen, noise = np.linspace(0, 1, 21), np.array([9, 39, 79]), 1e-3
+    field = lambda t, y: np.append(y[LINKS:], by_hand(y[:LINKS], y[LINKS:], PARAMS))
+    y = solve_ivp(field, (0, 1), np.append(START, np.zeros(LINKS)), "DOP853", ts, rtol=1e-9, atol=1e-9).y[seen].T
+    measured = y + noise * np.random.default_rng(6).normal(size=y.shape)
+    record = jl.Experiment(ts, {"angles": measured}, START, np.zeros(LINKS), sigma={"angles": noise}, observe=lambda q: {"angles": q[seen]})
+    fit = jl.fit(CHAIN, record, PARAMS | {"b": 0.8, "g": 9.0}, free=("b", "g"))
+    errors = np.sqrt(np.diag(fit.covariance))
+    best = np.array([fit.params["b"], fit.params["g"]])
+    assert np.all(np.abs(best - [PARAMS["b"], GRAVITY]) < 4 * errors)
+
+    def angles(x):
+        motion = jl.simulate(CHAIN, START, np.zeros(LINKS), ts, PARAMS | {"b": x[0], "g": x[1]})
+        return np.asarray(motion.q)[:, seen].ravel()
+
+    steps = 1e-3 * best
+    J = np.stack([(angles(best + h) - angles(best - h)) / (2 * np.max(h)) for h in np.diag(steps)], axis=1)
+    np.testing.assert_allclose(fit.covariance, noise**2 * np.linalg.inv(J.T @ J), rtol=1e-3)
