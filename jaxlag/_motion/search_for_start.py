@@ -2,8 +2,11 @@
 
 from typing import Literal
 
+import jax
+
 from .._mechanics.constraint_residuals import is_on_constraints
 from .._model.given import Given
+from .._model.signal import is_signal
 from .._model.system import System
 from .._model.validation import checked
 from .._program.jit import compiled, is_called_by_python, values
@@ -16,11 +19,12 @@ the start given is on them already, it is the derivative, how it changes with wh
 
 
 def search_for(system: System, given: Given, states: dict, ts, is_varied: bool) -> Search:
-    """What is left of the search: all of it where the numbers are not known, and where contacts have to start outside of obstacles.
+    """What is left of the search: all of it where the numbers are not known, where contacts have to start outside of obstacles, and beside
+    signals, which may bend at the start.
 
     What tells is a program of its own, compiled in a fifth of the time that this saves.
     """
-    if not system.constraints or system.unilateral:
+    if not system.constraints or system.unilateral or (given.others and _has_signals(given)):
         return "all"
     known = values((given, states, ts))
     if known is None or not is_called_by_python((known[0].numbers, *known[0].others)):
@@ -30,6 +34,10 @@ def search_for(system: System, given: Given, states: dict, ts, is_varied: bool) 
     if not _needs_none(system, given, states, ts):
         return "all"
     return "derivative" if is_varied else "nothing"
+
+
+def _has_signals(given: Given) -> bool:
+    return any(map(is_signal, jax.tree.leaves(given.trees, is_leaf=is_signal)))
 
 
 @compiled
