@@ -111,6 +111,11 @@ def _with_decided_rates(flat: Flat, t, q, v) -> Float[Array, " n"]:
     return completed(mode, t, q, v).v
 
 
+def has_inertia(flat: Flat, t, q, v) -> Bool[Array, ""]:
+    """Whether M leaves no direction without inertia that the constraints allow."""
+    return scalarised(lambda t, q, v: is_determined(inertia(flat, t, q, v)[0], velocity_rows(flat, t, q, v)[1]))(t, q, v)
+
+
 def _nearest_position(flat: Flat, moving, t, q0, M, found: bool) -> Float[Array, " n"]:
     """That on the constraints, where only the coordinates `moving` move."""
     free = moving.size

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, PyTree
 
-from .._mechanics.consistent_state import Consistent, nearest_state
+from .._mechanics.consistent_state import Consistent, has_inertia, nearest_state
 from .._mechanics.contact import outside
 from .._mechanics.friction_treatment import Regularised, StickSlip
 from .._mechanics.projection import Baumgarte, NoStabilisation, Projection
@@ -132,13 +132,16 @@ def initialised(equations: EquationsOfMotion, at: StatesAt, params, scales: Scal
 
 
 def _nearest(equations: EquationsOfMotion, flat: Flat, at: StatesAt, params, search: Search) -> Consistent:
-    """The start on the constraints; where it is that itself, the solve of the motion says whether inertia is missing."""
+    """The start on the constraints; where it is that itself, only whether inertia is missing remains to be said."""
     _, t0, q, v = at
-    if search != "nothing" or equations.elements:
-        flat, found = flat._replace(holonomic=flat.bilateral), search != "all"
-        return nearest_state(flat, t0, outside(flat, t0, q, v), v, found=found)
+    if search != "nothing":
+        flat = flat._replace(holonomic=flat.bilateral)
+        return nearest_state(flat, t0, outside(flat, t0, q, v), v, found=search == "derivative")
     yes = jnp.array(True)
-    determined = equations.accelerated(t0, equations.at_start(at, params), Arguments(params)).sound.determined
+    if equations.elements:  # what sticks would hold directions, too
+        determined = has_inertia(flat, t0, q, v)
+    else:
+        determined = equations.accelerated(t0, equations.at_start(at, params), Arguments(params)).sound.determined
     return Consistent(q, v, reached=yes, determined=determined, affine=yes, defined=yes)
 
 
