@@ -40,7 +40,7 @@ def test_it_may_be_called_from_anywhere(known, monkeypatch):
     """From Python, under transformations, within other programs, and where XLA does not know the options."""
     if not known:
         monkeypatch.setattr(jit, "OLD_EMITTERS", {"xla_cpu_no_such_option": False})
-    for cached in (jit._program_with_options, jit._options):
+    for cached in (jit._program_with_options, jit.options):
         cached.cache_clear()
     traced = []
 
@@ -58,14 +58,14 @@ def test_it_may_be_called_from_anywhere(known, monkeypatch):
     np.testing.assert_array_equal(jax.vmap(jax.grad(lambda x: program(x, "cube")))(x), 3 * x**2)
     assert jax.grad(lambda y: y * program(2.0, "cube"))(1.0) == 8.0
     assert jax.eval_shape(lambda: program(x, "square")).shape == (3,)
-    for cached in (jit._program_with_options, jit._options):
+    for cached in (jit._program_with_options, jit.options):
         cached.cache_clear()
 
 
 @pytest.mark.skipif(jax.default_backend() != "cpu", reason="the option is for CPUs")
 def test_the_options_reach_the_compiler_only_in_calls_from_python(monkeypatch):
     """XLA refuses an option that it does not know."""
-    monkeypatch.setattr(jit, "_options", lambda: {"xla_cpu_no_such_option": False})
+    monkeypatch.setattr(jit, "options", lambda: {"xla_cpu_no_such_option": False})
     program = jit.compiled(lambda x: 2 * x)
     with pytest.raises(jax.errors.JaxRuntimeError, match="xla_cpu_no_such_option"):
         program(1.0)
