@@ -4,12 +4,12 @@ from typing import Literal
 
 import jax
 
-from .._mechanics.constraint_residuals import is_on_constraints
+from .._mechanics.constraint_residuals import is_on_constraints, off_constraints
 from .._model.given import Given
 from .._model.signal import is_signal
 from .._model.system import System
 from .._model.validation import checked
-from .._program.jit import compiled, is_called_by_python, values
+from .._program.jit import compiled, is_called_by_python, is_concrete, values
 from .._program.scalarise import scalarised
 
 Search = Literal["all", "derivative", "nothing"]
@@ -31,7 +31,8 @@ def search_for(system: System, given: Given, states: dict, ts, is_varied: bool) 
         return "all"
     given, states, ts = known
     given = Given.of(given.trees) if given.others else given  # so that a derivative asks the program that its motion has asked
-    if not _needs_none(system, given, states, ts):
+    needs_none, off = _needs_none(system, given, states, ts)
+    if not is_concrete(needs_none, off) or not needs_none:  # a constraint may close over what is differentiated, or a batch
         return "all"
     return "derivative" if is_varied else "nothing"
 
@@ -44,4 +45,5 @@ def _has_signals(given: Given) -> bool:
 def _needs_none(system, given, states, ts):
     q0, qdot0, params = given.trees
     flat, *state = checked(system, ts[0], q0, qdot0, params, states)
-    return scalarised(lambda t, q, v: is_on_constraints(flat, t, q, v))(*state)
+    of_state = lambda t, q, v: (is_on_constraints(flat, t, q, v), off_constraints(flat, t, q, v))
+    return scalarised(of_state)(*state)

@@ -101,6 +101,21 @@ def test_a_batch_is_put_on_the_constraints_member_by_member(searched):
     np.testing.assert_allclose(moved, [0, 1], atol=ROUNDING)
 
 
+def test_a_constraint_that_closes_over_what_is_differentiated_or_a_batch(searched):
+    """Not seen among the arguments: the start moves along with the length all the same."""
+
+    def closed_over(l):
+        rod = jl.System(lambda q, qdot: 0.5 * (qdot @ qdot) - 9.81 * q[1], holonomic=lambda q: jnp.hypot(q[0], q[1]) - l)
+        return jl.simulate(rod, np.array([0.6, 0.8]), np.zeros(2), TS).q[-1, 0]
+
+    rod = jl.System(lambda q, qdot: 0.5 * (qdot @ qdot) - 9.81 * q[1], holonomic=lambda q, l: jnp.hypot(q[0], q[1]) - l)
+    stated = lambda l: jl.simulate(rod, np.array([0.6, 0.8]), np.zeros(2), TS, {"l": l}).q[-1, 0]
+    _, slope = jax.jvp(closed_over, (1.0,), (1.0,))
+    assert searched == ["all"]
+    np.testing.assert_allclose(slope, jax.jacfwd(stated)(1.0), rtol=1e-7)
+    np.testing.assert_allclose(jax.vmap(closed_over)(jnp.array([1.0, 1.2])), [stated(1.0), stated(1.2)], rtol=1e-8)
+
+
 @pytest.mark.parametrize("rate, search", [(0.7, "nothing"), (0.0, "all")])
 def test_a_support_that_moves_takes_a_start_at_rest_along(rate, search, searched):
     lift = jl.System(lambda qdot: 0.5 * qdot @ qdot, holonomic=lambda t, q: q[1] - 0.7 * t)
