@@ -26,8 +26,8 @@ REFERENCE = {
     "Residual consistent_state examine Examination",
     "Motions": "simulate simulate_many Trajectory FrictionState ContactState EventState RESULTS Instant Interpolated load Dop853 Dopri5 "
     "Projection Baumgarte NoStabilisation StickSlip Regularised keep_compiled",
-    "Near a steady state": "equilibrium steady Equilibrium linearise LinearSystem Modes root_locus RootLocus Crossing periodic "
-    "PeriodicOrbit stability_map StabilityMap",
+    "Near a steady state": "equilibrium steady Equilibrium linearise LinearSystem Modes lowest_modes root_locus RootLocus Crossing "
+    "periodic PeriodicOrbit stability_map StabilityMap",
     "Identification": "Experiment ModalTest FrequencyResponseTest fit fit_each Fit Channel Interval Prediction regress Regression Regress "
     "validate Validation compare Comparison information Information Huber learnt.ConvexDissipation learnt.PassiveDissipation "
     "learnt.Potential learnt.ConvexPotential",

@@ -35,6 +35,7 @@ from ._linear.equilibrium import Equilibrium as Equilibrium, equilibrium as equi
 from ._linear.linear_system import LinearSystem as LinearSystem
 from ._linear.linearise import linearise as linearise
 from ._linear.root_locus import Crossing as Crossing, RootLocus as RootLocus, root_locus as root_locus
+from ._linear.lowest_modes import lowest_modes as lowest_modes
 from ._linear.modes import Modes as Modes
 from ._linear.periodic import PeriodicOrbit as PeriodicOrbit, periodic as periodic
 from ._linear.stability_map import StabilityMap as StabilityMap, stability_map as stability_map

@@ -1,0 +1,162 @@
+"""The lowest modes of many coordinates, each coupled to a few: no array of all by all."""
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Complex, PyTree
+
+from .._model.flat import StatesAt, bind
+from .._model.numbers import count as whole
+from .._model.numbers import number
+from .._model.paths import entry_names
+from .._model.system import System
+from .._model.validation import coordinates, parameters, without_contacts
+from .._program.jit import is_concrete
+from .._program.jit import values as seen_values
+from .equilibrium import Equilibrium
+from .modes import Modes, damping_ratios, normalised
+from .not_differentiated import without_derivative
+from .origin import Origin
+from .pencil import CURE, along_modes, left_over, pencil
+from .sparse_modes import Found, Matrices, modes_near
+
+STILL = 0.375  # the same of forces that are left at rest, in parts of their terms
+
+
+def lowest_modes(system: System, q: Any, params: PyTree = None, *, count: int = 10, shift: float = 0.0, t: Any = 0.0) -> Modes:
+    r"""The lowest natural frequencies and modes of a system at rest, of many coordinates that are each coupled to a few.
+
+    $$ (\lambda^2 M + \lambda C + K)\,\hat q = G^T \hat\mu, \qquad G \hat q = 0 $$
+
+    M, C, K and G are read from L, D and g as sparse matrices, the matrix at `shift` is factorised once, and Arnoldi's method finds the λ
+    nearest to it: time and memory grow with the number of coordinates. `linearise(…).modes()` finds all modes, by matrices of all by all.
+
+    **Arguments:** `q`: where the system rests, or what `equilibrium` found; `params`, `t` as for `acceleration`; `count`: how many modes,
+    less than half as many as there are degrees of freedom; `shift`: a real number in 1/time, some part of the lowest frequency, needed
+    where a body is free to move or K is singular for another reason. Any consistent units.
+
+    **Returns:** `Modes`, the lowest first; without damping it is checked by the inertia of the matrices that none was left out (a warning
+    says so where that is not certain). The eigenvalues are differentiable once, in `params` and `q`, those of repeated ones as their mean
+    without damping; derivatives of shapes, and of repeated eigenvalues with damping, are NaN.
+
+    **Raises:** `ValueError` where q is not at rest, where the matrix is singular, where modes were not found, and under `jit` and `vmap`,
+    which hide the numbers; for systems with dry friction, nonholonomic constraints, contacts, events or states beside q.
+
+    **Source:** Lehoucq, Sorensen & Yang, ARPACK Users' Guide, SIAM 1998, section 3.2; Tisseur & Meerbergen, SIAM Review 43 (2001) 235.
+
+    ```python
+    import jax.numpy as jnp
+    import jaxlag as jl
+    chain = jl.System(lambda q, qdot, m, c: 0.5 * m * qdot @ qdot - 0.5 * c * jnp.sum(jnp.diff(q, prepend=0.0, append=0.0) ** 2))
+    modes = jl.lowest_modes(chain, jnp.zeros(2000), {"m": 1.0, "c": 4.0}, count=3)
+    modes.angular_frequency  # 4 sin(k π/4002) = 0.00314, 0.00628, 0.00942
+    ```
+    """
+    if isinstance(q, Equilibrium):
+        q, t = q.q, q.t
+    q = coordinates(q, "q")
+    dtype = jax.tree.leaves(q)[0].dtype
+    t, params = number(t, "`t`", dtype, cure="Pass one time."), parameters(params, q)
+    count = whole(count, "`count`", cure="Ask for one mode or more.")
+    shift = float(number(shift, "`shift`", dtype, cure="Pass a real number, in 1/time."))
+    _refuse(system)
+    given = (t, q, params)
+    known = seen_values(given)
+    if known is None:
+        raise ValueError(f"`lowest_modes` must see the numbers, but `jit` or `vmap` hides them. Call it outside, or: {CURE}")
+    multipliers, matrices = _at_rest(system, known, entry_names(q, "q"))
+    found = modes_near(matrices, count, shift)
+    return _described(system, given, _Slopes(system, given, multipliers, matrices, found).values(), found)
+
+
+def _refuse(system: System) -> None:
+    """Raises where a system has more than forces and positions."""
+    without_contacts(system, "`lowest_modes`")
+    for what in ("nonholonomic", "states", "events"):
+        if getattr(system, what):
+            raise ValueError(f"`system` must have no `{what}` in `lowest_modes`, but has. {CURE}")
+
+
+def _at_rest(system: System, known: tuple, names: tuple[str, ...]) -> tuple[np.ndarray, Matrices]:
+    """λ, which balances the forces best, and the pencil with it; refused where forces are left."""
+    n, dtype = len(names), jax.tree.leaves(known[1])[0].dtype
+    of = lambda multipliers: Matrices.of(pencil(system, *known, multipliers), n)
+    loose = of(None)
+    if not np.all(np.isfinite(loose.pencil.left)):
+        raise ValueError("`q` must be a state at which all forces are finite, but is not. `examine` says which are not.")
+    f = -np.asarray(loose.pencil.left, float)[:, None]
+    multipliers = loose.nearest(f[:n], 0 * f[n:])[n:, 0].astype(dtype)
+    matrices = of(multipliers) if len(multipliers) else loose
+    left, flat = np.asarray(matrices.pencil.left), np.concatenate([*(np.ravel(x) for x in jax.tree.leaves(known[1])), multipliers])
+    allowed = np.finfo(dtype).eps ** STILL * (abs(matrices.K) @ (1 + np.abs(flat)))
+    if np.any(np.abs(left) > allowed):
+        i = int(np.argmax(np.abs(left) / np.where(allowed > 0, allowed, np.finfo(dtype).tiny)))
+        what = f"{names[i]!r} is pushed by {-left[i]:.4g}" if i < n else "is off its constraints"
+        raise ValueError(f"`q` must be at rest, but {what}. Look for the equilibrium by `equilibrium`.")
+    return multipliers, matrices
+
+
+class _Slopes(NamedTuple):
+    """The eigenvalues as functions of t, q and params; λ = λ(t, q, params) balances the forces."""
+
+    system: System
+    given: tuple
+    multipliers: np.ndarray
+    matrices: Matrices
+    found: Found
+
+    def values(self) -> Complex[Array, " k"]:
+        """Those of the modes, with derivatives where they are asked for."""
+        found, dtype = self.found, jnp.result_type(self.multipliers.dtype, self.matrices.pencil.left.dtype, jnp.complex64)
+        values = jnp.asarray(found.values, dtype)
+        if is_concrete(self.given):
+            return values
+        slopes = self._slopes(dtype) @ jnp.asarray(found.same / np.sum(found.same, axis=1), dtype)
+        if not found.conservative:
+            return _with_slopes(values, slopes * np.where(np.sum(found.same, axis=1) > 1, np.nan, 1.0))
+        squares = _with_slopes(values.imag**2 - values.real**2, -slopes.real)
+        there = squares != 0
+        omega = jnp.sqrt(jnp.where(there, jnp.abs(squares), 1)) * there
+        return jnp.where(squares < 0, omega, 1j * omega)
+
+    def _slopes(self, dtype: Any) -> Complex[Array, " k"]:
+        """−yᵀ P(λ) x, which has the derivatives of the eigenvalues; by λ, too: with c = ∂(yᵀ P x)/∂λ and G w = c it is c dλ = wᵀ dE."""
+        values, vectors, left = (jnp.asarray(x, dtype) for x in self.found[:3])
+        by = lambda multipliers, given: jnp.einsum("ik,ik->k", left, along_modes(self.system, *given, multipliers, values, vectors))
+        slopes = by(self.multipliers, self.given)
+        if self.multipliers.size:
+            known = seen_values(self.given)
+            n, w = self.matrices.n, 0
+            for part, one in ((jnp.real, 1), (jnp.imag, 1j)):
+                c = np.asarray(jax.jacrev(lambda m, part=part: part(by(m, known)))(self.multipliers), float)
+                w = w + one * self.matrices.nearest(np.zeros((n, len(c))), -c.T)[:n]
+            slopes += left_over(self.system, *self.given, self.multipliers)[:n] @ jnp.asarray(w, dtype)
+        return -slopes
+
+
+def _described(system: System, given: tuple, values: Array, found: Found) -> Modes:
+    """Modes with all that is said of them."""
+    t, q, params = given
+    flat_q = jnp.concatenate([jnp.ravel(x) for x in jax.tree.leaves(q)])
+    flat, n = bind(system, q, params, StatesAt({}, t, flat_q, jnp.zeros_like(flat_q))), flat_q.size
+    vectors = jnp.asarray(found.vectors, values.dtype)
+    vectors = normalised(vectors, vectors[:n], None)
+    vectors = without_derivative(vectors.real if found.conservative else vectors, (q, params))
+    shapes, multipliers = jax.vmap(flat.unravel, in_axes=1)(vectors[:n]), jax.vmap(flat.unravel_multipliers, in_axes=1)(vectors[n:])
+    stable, repeated = jnp.asarray(found.values.real <= 0), jnp.asarray(np.sum(found.same, axis=1) > 1)
+    origin = Origin.of(t, q, jax.tree.map(jnp.zeros_like, q), params)
+    return Modes(values, damping_ratios(values), stable, repeated, shapes, multipliers, {}, origin)
+
+
+@jax.custom_jvp
+def _with_slopes(values: Array, of: Array) -> Array:
+    """`values`, whose derivatives are those of something else; their own are not known: NaN."""
+    return values
+
+
+@_with_slopes.defjvp
+def _slopes_of_first_order(primals: Any, tangents: Any) -> Any:
+    (values, of), (_, slope) = primals, tangents
+    return _with_slopes(values, of), slope * without_derivative(jnp.ones((), jnp.real(values).dtype), of)

@@ -1,0 +1,172 @@
+"""Modes near a shift, by sparse matrices: Arnoldi's method, and the inertia of the matrices as the proof that none is left out.
+
+Source: Lehoucq, Sorensen & Yang, ARPACK Users' Guide, SIAM 1998, section 3.2; Tisseur & Meerbergen, SIAM Review 43 (2001) 235.
+"""
+
+import contextlib
+import warnings
+from collections.abc import Callable, Iterator
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+import scipy.sparse
+from jaxtyping import Complex, Float
+
+from .._program.sparse_matrix import SparseMatrix
+from .pencil import CURE, Pencil
+from .sparse_descent import eigenvalues_below
+
+EQUAL = 0.625  # exponent of eps: values that differ by less, in parts of their size, are one
+BESIDE = 4  # modes that are sought beside those asked for
+ATTEMPTS = 12  # to find the lowest modes, where some lie far below what is sought
+
+
+class Matrices(NamedTuple):
+    """A `Pencil`, also as matrices of SciPy, of n coordinates."""
+
+    pencil: Pencil
+    K: scipy.sparse.csc_matrix
+    C: scipy.sparse.csc_matrix
+    M: scipy.sparse.csc_matrix
+    n: int
+
+    @classmethod
+    def of(cls, given: Pencil, n: int) -> "Matrices":
+        of = lambda A: scipy.sparse.csc_matrix((np.asarray(A.values, float), (A.places.rows, A.places.columns)), A.shape)
+        return cls(given, of(given.stiffness), of(given.damping), of(given.mass), n)
+
+    @property
+    def freedoms(self) -> int:
+        """Degrees of freedom."""
+        return 2 * self.n - self.K.shape[0]
+
+    @property
+    def equal(self) -> float:
+        """The part of their size by which two values may differ and are one."""
+        return float(np.finfo(self.pencil.left.dtype).eps ** EQUAL)
+
+    def at(self, value: complex) -> scipy.sparse.csc_matrix:
+        """[P(λ) −Gᵀ; −G 0]."""
+        return (self.K + value * self.C + value**2 * self.M).tocsc()
+
+    def nearest(self, f: Float[np.ndarray, "n k"], c: Float[np.ndarray, "m k"]) -> Float[np.ndarray, "w k"]:
+        """(x, λ) with x = f + Gᵀλ and −G x = c."""
+        from scipy.sparse.linalg import splu  # imported here because that takes a while
+
+        one = scipy.sparse.diags(np.r_[np.ones(self.n), np.zeros(len(c))])
+        of_q = scipy.sparse.diags(np.r_[np.zeros(self.n), np.ones(len(c))])
+        with searching():
+            return splu((one + of_q @ self.K + self.K @ of_q).tocsc()).solve(np.concatenate([f, c]))
+
+
+class Found(NamedTuple):
+    """Eigenvalues λ; (x, μ) of each and, of the transposed pencil, y, scaled such that dλ = −yᵀ dP x (without damping dλ² = −yᵀ dP x);
+    which are the same; whether there is no damping.
+    """
+
+    values: Complex[np.ndarray, " k"]
+    vectors: Complex[np.ndarray, "w k"]
+    left: Complex[np.ndarray, "w k"]
+    same: np.ndarray
+    conservative: bool
+
+
+def modes_near(matrices: Matrices, count: int, shift: float) -> Found:
+    if 2 * count >= matrices.freedoms:
+        raise ValueError(f"`count` must be less than half the degrees of freedom, {matrices.freedoms}, but is {count}. {CURE}")
+    symmetric = bool(abs(matrices.K - matrices.K.T).max() <= matrices.equal * abs(matrices.K).max())
+    if symmetric and not matrices.C.count_nonzero():
+        return _undamped(matrices, count, shift)
+    return _damped(matrices, count, shift, symmetric and not (matrices.C - matrices.C.T).count_nonzero())
+
+
+@contextlib.contextmanager
+def searching() -> Iterator[None]:
+    """What SciPy cannot factorise or find is refused."""
+    try:
+        yield
+    except RuntimeError as error:
+        raise ValueError(
+            f"`shift` must make K + shift C + shift² M regular on the constraints, but modes were not found: {error}. "
+            "Give another one, such as a tenth of the lowest frequency, and state each constraint once."
+        ) from None
+
+
+def _undamped(matrices: Matrices, count: int, shift: float) -> Found:
+    """K x = ω² M x + Gᵀμ; as many as asked for, and those that lie lower still."""
+    from scipy.sparse.linalg import eigsh  # imported here because that takes a while
+
+    sigma, k, most = -(shift**2), count + BESIDE, matrices.freedoms - 1
+    for attempt in range(ATTEMPTS):
+        start = np.random.default_rng(attempt).normal(size=matrices.K.shape[0])
+        with searching():
+            squares, vectors = eigsh(matrices.K, min(k, most), matrices.M, sigma=sigma, v0=start)
+        order = np.argsort(squares, kind="stable")
+        squares, vectors = squares[order], vectors[:, order]
+        if not _left_out(matrices, squares, count):
+            break
+        sigma, k = min(sigma, 4 * squares[0]), k + 2  # what is left out lies far below, or was missed
+    else:
+        raise ValueError(f"`shift` must be such that the lowest modes are found, but from {shift} lower ones are left out. Give another.")
+    squares, vectors = squares[:count], vectors[:, :count]
+    squares = np.where(np.abs(squares) <= matrices.equal * shift**2, 0, squares)
+    size = np.einsum("ik,ik->k", vectors, matrices.M @ vectors)
+    same = np.abs(squares[:, None] - squares[None, :]) <= matrices.equal * np.abs(squares)[:, None]
+    omega = np.sqrt(np.abs(squares))
+    values = np.where(squares < 0, omega, 1j * omega)
+    return Found(values, vectors + 0j, (vectors / size) + 0j, same, True)
+
+
+def _left_out(matrices: Matrices, squares: np.ndarray, count: int) -> bool:
+    """Whether modes below the widest gap behind the first `count` of these are not among them, by Sylvester's law of inertia."""
+    gaps = np.diff(squares[count - 1 :])
+    i = count - 1 + int(np.argmax(gaps))
+    middle = (squares[i] + squares[i + 1]) / 2
+    given = matrices.pencil
+    shifted = given.stiffness.values - middle * given.mass.values
+    masses = np.asarray(matrices.M.diagonal()[: matrices.n])
+    scale = jnp.asarray(np.where(masses > 0, masses, 1), shifted.dtype)
+    below, within = eigenvalues_below(SparseMatrix(-shifted, given.stiffness.places), scale, jnp.zeros((), shifted.dtype))
+    if within > np.max(gaps) / 2:
+        warnings.warn("whether a lower mode was left out is not certain: factors of the matrix are too inexact", UserWarning, stacklevel=5)
+    return bool(within <= np.max(gaps) / 2 and below > i + 1)
+
+
+def _damped(matrices: Matrices, count: int, shift: float, symmetric: bool) -> Found:
+    """By the linear pencil of (x, λx, μ), twice as large: A z = λ B z; from two starts, which must find the same."""
+    from scipy.sparse.linalg import eigs, splu
+
+    (_, K, C, M, n), block = matrices, scipy.sparse.block_array
+    one, rows = scipy.sparse.identity(n), K.shape[0] - n
+    blocks: Any = [[None, one, None], [-K[:n, :n], -C[:n, :n], -K[:n, n:]], [-K[n:, :n], None, None]]
+    A: Any = block(blocks).tocsc()
+    B = scipy.sparse.block_diag([one, M[:n, :n], scipy.sparse.csc_matrix((rows, rows))]).tocsc()
+    of_modes, k = np.r_[:n, 2 * n : 2 * n + rows], min(2 * count + BESIDE, 2 * matrices.freedoms - 2)
+    found = []
+    for seed in range(2):
+        start = np.random.default_rng(seed).normal(size=A.shape[0])
+        with searching():
+            values, z = eigs(A, k, B, sigma=shift, v0=start)
+        upper = np.flatnonzero(values.imag >= -matrices.equal * np.abs(values))
+        order = upper[np.argsort(np.abs(values[upper] - shift), kind="stable")][:count]
+        found.append((values[order], z[np.ix_(of_modes, order)]))
+    (values, vectors), (others, _) = found
+    if len(values) < count or len(others) < count or np.any(np.abs(np.abs(values) - np.abs(others)) > 1e-6 * np.abs(values)):
+        raise ValueError(f"`count` must be a number of modes that lie apart from others, but two searches differ. Try {count + 2}.")
+    dust = np.abs(values.real) <= matrices.equal * np.abs(values)
+    values = np.where(dust, 1j * values.imag, values)
+    left = vectors if symmetric else np.stack([_left_vector(matrices, value, splu) for value in values], axis=1)
+    size = np.einsum("ik,ik->k", left, C @ vectors + 2 * values * (M @ vectors))
+    same = np.abs(values[:, None] - values[None, :]) <= matrices.equal * np.abs(values)[:, None]
+    return Found(values, vectors, left / size, same, False)
+
+
+def _left_vector(matrices: Matrices, value: complex, splu: Callable) -> Complex[np.ndarray, " w"]:
+    """y with yᵀ [P(λ) −Gᵀ; −G 0] = 0, by inverse iteration."""
+    near = splu(matrices.at(value * (1 + 1e-9)))
+    y = np.random.default_rng(0).normal(size=matrices.K.shape[0]) + 0j
+    for _ in range(3):
+        y = near.solve(y, trans="T")
+        y /= np.max(np.abs(y))
+    return y
