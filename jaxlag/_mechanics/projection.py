@@ -49,8 +49,10 @@ class Projection:
     def feedback(self) -> None:
         """None: the accelerations remain unchanged."""
 
-    def project(self, flat: Flat, t: Any, q: Float[Array, " n"], v: Float[Array, " n"]) -> tuple[Float[Array, " n"], Float[Array, " n"]]:
-        """The state on the constraints that is nearest to this one, which is near already."""
+    def project(
+        self, flat: Flat, t: Any, q: Float[Array, " n"], v: Float[Array, " n"], *, found: bool = False
+    ) -> tuple[Float[Array, " n"], Float[Array, " n"]]:
+        """The state on the constraints that is nearest to this one, which is near already; or has its positions `found` on them."""
         part = inertial_part(flat, t, q, v)
         M = inertia(part, t, q, v)[0]  # at the start serves throughout: corrections are small
 
@@ -64,7 +66,7 @@ class Projection:
             psi, G, _ = velocity_rows(part, t, q, v)
             return completed(flat, t, q, _corrected(v, saddle_point(M, G, jnp.zeros_like(v), -psi, reach_of(v)).x)).v
 
-        if flat.holonomic_names or flat.yielding:
+        if (flat.holonomic_names or flat.yielding) and not found:
             metric = metric_of_positions(flat, M, t, q, v)
             q, _ = jax.lax.scan(lambda q, _: (newton(t, q, metric), None), q, length=self.iterations)
         return q, on_velocities(t, q, v, M)

@@ -214,7 +214,11 @@ class EquationsOfMotion:
 
     def projected(self, t, y, args):
         """y, put back on the constraints."""
-        return _projected(self, t, y, args)
+        return _projected(self, t, y, args, False)
+
+    def in_new_mode(self, t, y, args):
+        """y, which kept the constraints of one mode of friction, put on those of another, which differ in the velocities alone."""
+        return _projected(self, t, y, args, not self.light)
 
     def error_norm(self, error):
         """The root mean square."""
@@ -273,14 +277,14 @@ def _updated(equations: EquationsOfMotion, t, y, args, due):
 
 
 @jitted
-def _projected(equations: EquationsOfMotion, t, y, args):
+def _projected(equations: EquationsOfMotion, t, y, args, found):
     parts = equations.parts(y)
     q, v, works, sigma = parts.q, parts.v, parts.works, parts.sigma
     flat, mode, elements = equations.mode(t, parts, args)
     assert equations.projection is not None  # asked where there is something to keep
     projection = equations.projection
-    of_none = (lambda: (q, v)) if flat.rows == equations.contacts else lambda: projection.project(free(mode), t, q, v)
-    on_q, on_v = equations.where_closed(parts, lambda: projection.project(mode, t, q, v), of_none)
+    of_none = (lambda: (q, v)) if flat.rows == equations.contacts else lambda: projection.project(free(mode), t, q, v, found=found)
+    on_q, on_v = equations.where_closed(parts, lambda: projection.project(mode, t, q, v, found=found), of_none)
     if equations.works:
         lift = energy_exchange(mode, t, on_q, on_v)[0] - energy_exchange(mode, t, q, v)[0]
         works = works.at[equations.works.index(PROJECTION)].add(lift)

@@ -50,4 +50,4 @@ def after_jump(equations: EquationsOfMotion, t, y0, y, before: Arguments, args: 
     breaking = elements.follows & ~sticking(elements, parts.sigma)
     mode, _ = select_mode(flat, elements, t, q, v, direction, at_rest, breaking)
     y = in_other_mode(elements, moved._replace(sigma=parts.sigma), mode).y
-    return equations.projected(t, y, args), mode.consistent
+    return equations.in_new_mode(t, y, args), mode.consistent
