@@ -31,9 +31,19 @@ with install_import_hook([".".join(file.parts) for file in FILES], "beartype.bea
     from jaxlag._program.kept_programs import KEPT
 
 
-def pytest_collection_modifyitems(items):
+def pytest_addoption(parser):
+    parser.addoption("--part", metavar="I/N", help="of the tests marked slow only every N-th, from the I-th on")
+
+
+def pytest_collection_modifyitems(config, items):
     """The files beside this one first: they hold the longest tests, for one of which a worker should not be left alone at the end."""
     items.sort(key=lambda item: item.path.parent != ROOT / "tests")
+    if config.getoption("--part"):
+        first, parts = map(int, config.getoption("--part").split("/"))
+        slow = [item for item in items if item.get_closest_marker("slow")]
+        left_out = {item for i, item in enumerate(slow) if i % parts != first % parts}
+        config.hook.pytest_deselected(items=[item for item in items if item in left_out])
+        items[:] = [item for item in items if item not in left_out]
 
 
 @pytest.fixture(autouse=True, scope="module")

@@ -6,11 +6,13 @@ import sys
 from pathlib import Path
 
 import numpy as np
+import pytest
 
 FIT = """
 import jax
 jax.config.update("jax_enable_x64", True)
 import numpy as np
+import pytest
 import oscillator as osc
 import jaxlag as jl
 records = [osc.record(seed, osc.TIMES[: 60 - seed], unknown=("qdot0",)) for seed in range(11)]
@@ -32,6 +34,7 @@ def fitted(devices):
     return values
 
 
+@pytest.mark.slow
 def test_a_fit_on_eight_devices_is_the_fit_on_one():
     """Eleven experiments of different lengths: the last devices have nothing of their own."""
     np.testing.assert_allclose(fitted(8), fitted(1), rtol=1e-6, atol=1e-9)

@@ -30,6 +30,7 @@ def recording(**more):
     return jl.Experiment(TS, {"q": height}, 0.65, 0.0, observe=lambda q: {"q": q}, events={"click": heard}, unknown=["q0"], **more), heard
 
 
+@pytest.mark.slow
 def test_restitution_from_the_sound_of_a_ball():
     """Estimates and standard errors are those of least squares on the closed form."""
     experiment, heard = recording(sigma={"q": 0.01, "click": SIGMA})

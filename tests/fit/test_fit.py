@@ -136,6 +136,7 @@ def test_progress_is_shown(capfd):
     assert re.fullmatch(r"step +\d+   cost \S+   \d+\.\d s", last)
 
 
+@pytest.mark.slow
 def test_a_second_fit_traces_nothing(monkeypatch):
     from jaxlag._motion import solution_map
 

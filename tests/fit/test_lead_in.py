@@ -102,6 +102,7 @@ def test_a_kink_ends_the_iteration_with_its_reason(start):
     assert "dry friction comes to stick" in REASONS[KINKED]
 
 
+@pytest.mark.slow
 def test_dry_friction_that_is_not_quite_coulombs():
     """Friction of 0.6 one way and 0.36 the other, cubic drag and a softening spring that the model lacks; eight random inputs.
 

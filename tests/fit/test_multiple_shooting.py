@@ -74,6 +74,7 @@ def record(*which):
     return jl.Experiment(ts, seen, guess, rest, unknown=("q0", "qdot0"), sigma=NOISE)
 
 
+@pytest.mark.slow
 def test_a_double_pendulum_from_its_markers():
     """Started a fifth to a factor of three off. The start is found on the rods."""
     e = record(3.0, 150, 1.0, 1)
@@ -89,6 +90,7 @@ def test_a_double_pendulum_from_its_markers():
     assert np.all(found.unknown_errors[0]["qdot0"]["lower"] > 0) and ts.size == 150
 
 
+@pytest.mark.slow
 def test_everything_free_leaves_the_common_factor_of_masses_and_damping():
     """Cameras see no forces."""
     weighed = jl.System(

@@ -145,6 +145,7 @@ def changed(x):
     return of._replace(K=of.K * (1 + x[0]), C=of.C * (1 + x[1]), J=J, W=of.W[:w], V=of.V[:w])
 
 
+@pytest.mark.slow
 def test_derivatives_of_random_eigenvalues():
     """Of all of them, forward, and in reverse of a sum over them; at two places at once by `vmap`; against differences of the pencil's."""
     places, h = np.array([[0.0, 0.0, 0.0], [0.3, -0.2, 0.1]]), 1e-4

@@ -36,6 +36,7 @@ def test_van_der_pol():
     np.testing.assert_allclose([motion.q[-1], motion.qdot[-1]], [motion.q[0], motion.qdot[0]], atol=1e-7)
 
 
+@pytest.mark.slow
 def test_derivatives_of_a_cycle():
     """By mu, forward and reverse, of the period, the amplitude and the multiplier; against differences of SciPy's."""
     numbers = lambda mu: (lambda orbit: jnp.stack([orbit.q, orbit.period, orbit.multipliers[0].real]))(cycle(mu))
@@ -65,6 +66,7 @@ ball = jl.System(
 )
 
 
+@pytest.mark.slow
 def test_ball_on_a_vibrating_table():
     """Once in a period: it hits with relative speed (1 + e)⁻¹ g T, where the table goes with speed (1 − e)/(1 + e) g T/2. The impact
     takes e² of areas in the plane of states: det = e², and the trace is that of the map of impacts.
@@ -87,6 +89,7 @@ def test_ball_on_a_vibrating_table():
     np.testing.assert_allclose(np.sum(orbit.multipliers).real, np.trace(impact @ flight), rtol=1e-6)
 
 
+@pytest.mark.slow
 def test_stick_slip():
     """A block on a belt: while it sticks it forgets how it came to, and nothing is left of a deviation. Period against SciPy's."""
     mu, v = 1.0, 0.2
@@ -119,6 +122,7 @@ def test_clear_errors(change, said):
         jl.periodic(van_der_pol, 1.0, 0.0, {"mu": 1.0}, **{"section": top, "longest": 20.0} | change)
 
 
+@pytest.mark.slow
 def test_what_depends_on_time_is_not_periodic_at_a_section():
     with pytest.raises(ValueError, match="where the system depends on t"):
         jl.periodic(forced, 1.0, 0.0, {"w": 1.3}, section=top, longest=20.0)

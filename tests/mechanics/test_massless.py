@@ -59,6 +59,7 @@ def by_hand(p, t, q, v):
     return xdd, zd, multipliers, (later - sooner)[3:6] / (2 * h)
 
 
+@pytest.mark.slow
 def test_random_networks_with_constraints_of_every_kind():
     solve = jax.vmap(lambda p, t, q, v: (jl.acceleration(NETWORK, q, v, p, t=t), jl.powers(NETWORK, q, v, p, t=t)))
     given = [(drawn(), RANDOM.uniform(0, 6), RANDOM.normal(size=6), RANDOM.normal(size=6)) for _ in range(100)]

@@ -332,6 +332,7 @@ def flat(tree):
 # All motions
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", CONSTRAINED)
 def test_constraints_are_kept(name):
     for residual in jax.tree.leaves(seen(name)["residual"]):

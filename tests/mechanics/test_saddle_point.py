@@ -310,6 +310,7 @@ ROWS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("rows", ROWS)
 def test_second_derivatives_of_an_acceleration_in_every_mode(rows):
     """Forward over reverse differentiates the linear maps of reverse mode, whose matrices move, too; by differences in forward mode."""

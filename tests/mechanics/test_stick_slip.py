@@ -120,6 +120,7 @@ def slide(system, start, alpha, ts, mu=0.4):
     return jl.simulate(system, start, 0 * start, ts, {"m": 2.0, "alpha": alpha, "mu": mu})
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("system, start", [(by_formula, np.array(0.0)), (by_multiplier, np.zeros(2))], ids=["formula", "multiplier"])
 def test_a_block_on_an_incline(system, start):
     stuck = slide(system, start, 0.3, [0, 1.0, 1e4])  # tan 0.3 = 0.31 < 0.4
@@ -145,6 +146,7 @@ def test_functions_of_a_state_know_friction():
     np.testing.assert_allclose(jl.powers(oscillator, 1.0, 2.0, p)["dry"], -0.6, rtol=1e-14)
 
 
+@pytest.mark.slow
 def test_a_bead_on_a_hoop():
     """N = |λ| = m v²/R on a horizontal hoop: v(θ) = v₀ e^{−μθ}."""
     hoop = jl.System(
@@ -157,6 +159,7 @@ def test_a_bead_on_a_hoop():
     np.testing.assert_allclose(np.hypot(*motion.qdot.T), 3 * np.exp(-0.3 * angle), atol=1e-8)
 
 
+@pytest.mark.slow
 def test_a_particle_leaves_a_rough_sphere():
     """v²' = 2gR(sin θ − μ cos θ) + 2μ v², linear in v²: closed form; it leaves where the multiplier changes sign."""
     mu, v0 = 0.1, 1.0
@@ -212,6 +215,7 @@ def test_stick_slip_with_a_sudden_drop():
     np.testing.assert_allclose(np.diff(at), 2 * np.pi - 2 * np.arctan(A / 0.3) + 2 * A / 0.3, rtol=2e-3)  # of the order of v_s/v
 
 
+@pytest.mark.slow
 def test_a_puck_stops_in_a_plane():
     """Straight: v₀²/2a; on a conveyor it turns to run along: the slip keeps its direction and shrinks by a t."""
     plane = jl.System(lambda qdot: 0.5 * qdot @ qdot, dissipation={"ice": lambda qdot, F, u: F * jnp.linalg.norm(qdot - u)})
@@ -229,6 +233,7 @@ def test_a_puck_stops_in_a_plane():
     np.testing.assert_allclose(slope, -25 * 0.6 / 0.5, rtol=1e-6)
 
 
+@pytest.mark.slow
 def test_two_blocks_on_a_shaken_floor():
     """One rubs on the floor, the other on it: against SciPy with the sign made very steep, and the energy balance of all."""
     blocks = jl.System(
@@ -326,6 +331,7 @@ def test_clear_errors():
         jl.simulate(bent, 1.0, 0.5, ts, {"c": 4.0, "F": 0.3})
 
 
+@pytest.mark.slow
 def test_painleve_has_a_name():
     """A rod pushed over a rough floor: for tan φ = 2 there is no solution beyond μ = 4/3."""
     tip = lambda q: q["y"] - jnp.sin(q["phi"])
@@ -349,6 +355,7 @@ def test_painleve_has_a_name():
     assert failures == 1  # pushed one way it jams; pulled the other it slides
 
 
+@pytest.mark.slow
 def test_second_derivatives_of_a_stopping_point():
     """A block that slides to a stop: x = v₀²/2F, all second derivatives in closed form."""
     block = jl.System(lambda qdot: 0.5 * qdot**2, dissipation=dry)

@@ -49,6 +49,7 @@ def test_a_gap_between_things_that_are_both_fixed(gap):
         jl.simulate(fixed, 1.0, 0.0, jnp.array([0.0, 1.0]), {"w": 0.3})
 
 
+@pytest.mark.slow
 def test_walls_that_close_in():
     """What lies between them can go nowhere, which is the reason, at the time when they touch it on both sides."""
     press = jl.System(fall, unilateral={"below": floor, "above": lambda t, q: 1.5 - 2 * t - q})
@@ -71,6 +72,7 @@ def test_a_start_inside_of_what_has_no_outside():
     assert motion.result == jl.RESULTS.inside_obstacle and np.all(np.isnan(motion.q))
 
 
+@pytest.mark.slow
 def test_friction_that_is_not_proportional_to_the_force():
     sled = jl.System(
         lambda q, qdot: 0.5 * (qdot @ qdot) - 9.81 * q[1],

@@ -24,6 +24,7 @@ def motion(way):
     return jl.simulate(getattr(vehicle, way), vehicle.q0, vehicle.qdot0, TS, vehicle.params, **SHARP)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("way", ["substituted", "first_kind"])
 def test_the_vehicle_three_ways_is_one_motion(way):
     reduced, other = motion("system"), motion(way)
@@ -50,6 +51,7 @@ def test_what_the_parts_of_the_vehicle_pass_to_each_other():
     np.testing.assert_allclose(found["rear axle"], p["m"] * ax - rear / p["r"], rtol=1e-8)
 
 
+@pytest.mark.slow
 def test_the_three_vehicles_have_the_same_gradients():
     ts = jnp.linspace(0, 1, 5)
 

@@ -77,6 +77,7 @@ def test_rest_after_infinitely_many_impacts():
     np.testing.assert_allclose(floor.impulse[-1], 0.7 * np.sqrt(2 * G * H) * (1 + E) / (1 - E), rtol=1e-8)  # Σ eⁿ
 
 
+@pytest.mark.slow
 def test_derivatives_of_the_end_of_bouncing():
     """By h, e, g; forward, reverse and of second order."""
     at, together = jnp.array([H, E, G]), lambda function: lambda at: function(*at)
@@ -89,6 +90,7 @@ def test_derivatives_of_the_end_of_bouncing():
         np.testing.assert_allclose(found, curvature, rtol=rtol, atol=1e-7)
 
 
+@pytest.mark.slow
 def test_derivatives_amid_the_impacts():
     """After 16 impacts: the place and the velocity, forward and reverse."""
     T = float(impact_time(H, E, G, 16.4))
@@ -106,6 +108,7 @@ def test_derivatives_amid_the_impacts():
     np.testing.assert_allclose(jax.jacrev(state, (0, 1))(H, E), expected, rtol=1e-8, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_many_balls():
     """Members of a batch hit at different times."""
     rng = np.random.default_rng(1)
@@ -127,6 +130,7 @@ def test_single_precision():
     np.testing.assert_allclose(motion.contacts["floor"].changed[-1], impact_time(H, E, G, n), rtol=1e-5)
 
 
+@pytest.mark.slow
 def test_a_fit_of_the_restitution_and_the_height():
     """From a recording with noise."""
     ts = jnp.linspace(0, 2.5, 251)
@@ -209,6 +213,7 @@ def test_a_mass_on_a_string():
     np.testing.assert_allclose(motion.multipliers["string"][held], rate**2 + 9.81 * np.cos(angle), rtol=1e-6)
 
 
+@pytest.mark.slow
 def test_a_particle_leaves_a_sphere():
     """At cos φ = 2/3, which is differentiated by how it began."""
     sphere = jl.System(lambda q, qdot: 0.5 * (qdot @ qdot) - q[1], unilateral={"sphere": lambda q: jnp.linalg.norm(q) - 1})
@@ -229,6 +234,7 @@ def test_a_particle_leaves_a_sphere():
     np.testing.assert_allclose(jax.jacfwd(leaves)(jnp.array(v)), difference, rtol=1e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("width", [0.3, 0.01, 3e-4])
 def test_a_post_narrower_than_a_step(width):
     """Nothing passes through it: the gap is bounded along the path, and not looked at here and there."""
@@ -263,6 +269,7 @@ def by_events(M, K, n, d, e, q, v, ts):
     return np.array(rows)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [0, 2, 3, 4, 5, 6, 7, 8, 10, 11, 12, 13])  # in 1 and 9 it rests before the first sample
 def test_random_walls(seed):
     """A mass on springs between slanted walls, in any units, against SciPy's events."""
@@ -283,6 +290,7 @@ def test_random_walls(seed):
     np.testing.assert_allclose(found, expected[:, :6], atol=2e-7 * np.max(np.abs(expected[:, :6])))
 
 
+@pytest.mark.slow
 def test_rest_on_floors_anywhere():
     """Where rounding of the coordinate is larger than the last flights are high, these are summed up before; differentiable in e."""
     rng = np.random.default_rng(0)
@@ -303,6 +311,7 @@ def test_rest_on_floors_anywhere():
         np.testing.assert_allclose(jax.jacfwd(end)(at), jax.grad(end_of_bouncing, 1)(H, at, G), rtol=1e-8)
 
 
+@pytest.mark.slow
 def test_a_held_force_lifts_it_off():
     """A force that jumps opens the contact at its time; and closes another flight with an impact."""
     lifted = jl.System(
