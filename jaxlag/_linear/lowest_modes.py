@@ -7,13 +7,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Complex, PyTree
 
-from .._model.flat import StatesAt, bind
+from .._model.flat import bind
 from .._model.numbers import count as whole
 from .._model.numbers import number
 from .._model.paths import entry_names
 from .._model.system import System
 from .._model.validation import coordinates, parameters, without_contacts
-from .._program.jit import is_concrete
+from .._program.jit import compiled, is_concrete
 from .._program.jit import values as seen_values
 from .equilibrium import Equilibrium
 from .modes import Modes, damping_ratios, normalised
@@ -83,7 +83,7 @@ def _at_rest(system: System, known: tuple, names: tuple[str, ...]) -> tuple[np.n
     """λ, which balances the forces best, and the pencil with it; refused where forces are left."""
     n, dtype = len(names), jax.tree.leaves(known[1])[0].dtype
     of = lambda multipliers: Matrices.of(pencil(system, *known, multipliers), n)
-    loose = of(None)
+    loose = of(np.zeros(bind(system, *known[1:]).rows, dtype))
     if not np.all(np.isfinite(loose.pencil.left)):
         raise ValueError("`q` must be a state at which all forces are finite, but is not. `examine` says which are not.")
     f = -np.asarray(loose.pencil.left, float)[:, None]
@@ -139,15 +139,19 @@ class _Slopes(NamedTuple):
 def _described(system: System, given: tuple, values: Array, found: Found) -> Modes:
     """Modes with all that is said of them."""
     t, q, params = given
-    flat_q = jnp.concatenate([jnp.ravel(x) for x in jax.tree.leaves(q)])
-    flat, n = bind(system, q, params, StatesAt({}, t, flat_q, jnp.zeros_like(flat_q))), flat_q.size
     vectors = jnp.asarray(found.vectors, values.dtype)
-    vectors = normalised(vectors, vectors[:n], None)
-    vectors = without_derivative(vectors.real if found.conservative else vectors, (q, params))
-    shapes, multipliers = jax.vmap(flat.unravel, in_axes=1)(vectors[:n]), jax.vmap(flat.unravel_multipliers, in_axes=1)(vectors[n:])
+    shapes, multipliers = _taken_apart(system, q, params, vectors.real if found.conservative else vectors)
     stable, repeated = jnp.asarray(found.values.real <= 0), jnp.asarray(np.sum(found.same, axis=1) > 1)
     origin = Origin.of(t, q, jax.tree.map(jnp.zeros_like, q), params)
     return Modes(values, damping_ratios(values), stable, repeated, shapes, multipliers, {}, origin)
+
+
+@compiled
+def _taken_apart(system: System, q: PyTree, params: PyTree, vectors: Array) -> tuple[PyTree, PyTree]:
+    """Shapes and constraint forces, scaled; their derivatives are not known: NaN."""
+    flat, n = bind(system, q, params), len(vectors) - bind(system, q, params).rows
+    vectors = without_derivative(normalised(vectors, vectors[:n], None), (q, params))
+    return jax.vmap(flat.unravel, in_axes=1)(vectors[:n]), jax.vmap(flat.unravel_multipliers, in_axes=1)(vectors[n:])
 
 
 @jax.custom_jvp

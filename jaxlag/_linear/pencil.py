@@ -42,18 +42,18 @@ def _deviation(flat: Flat, t: Any, q: Array, multipliers: Array, along: Array, r
     return jnp.concatenate([imbalance(flat, t, q + x, v, a, multipliers + mu)[0], -flat.holonomic(t, q + x)])
 
 
-def _deviates(system: System, t: Any, q: PyTree, params: PyTree, multipliers: Array | None) -> tuple[Callable, Array, int]:
+def _deviates(system: System, t: Any, q: PyTree, params: PyTree, multipliers: Array) -> tuple[Callable, Array, int]:
     """`_deviation` of a system at rest; a deviation of nothing; how many coordinates there are."""
     flat, t, q, v = checked(system, t, q, jax.tree.map(jnp.zeros_like, q), params, {})
     if find_elements(flat, t, q, v) is not None:
         raise ValueError(f"`dissipation` must have no dry friction in `lowest_modes`, but has. {CURE}")
-    of = lambda *given: _deviation(flat, t, q, jnp.zeros(flat.rows, q.dtype) if multipliers is None else multipliers, *given)
+    of = lambda *given: _deviation(flat, t, q, multipliers, *given)
     return of, jnp.zeros(q.size + flat.rows, q.dtype), q.size
 
 
 @compiled
-def pencil(system: System, t: Any, q: PyTree, params: PyTree, multipliers: Array | None = None) -> Pencil:
-    """The pencil at rest in q with constraint forces λ, or without any."""
+def pencil(system: System, t: Any, q: PyTree, params: PyTree, multipliers: Array) -> Pencil:
+    """The pencil at rest in q, with constraint forces λ."""
     of, nothing, n = _deviates(system, t, q, params, multipliers)
     pattern = _pattern(lambda w: of(w, w, w), nothing)
     color, places = colors(pattern), Places.of(pattern, n)

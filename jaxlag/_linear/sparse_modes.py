@@ -13,6 +13,7 @@ import numpy as np
 import scipy.sparse
 from jaxtyping import Complex, Float
 
+from .._program.jit import compiled
 from .._program.sparse_matrix import SparseMatrix
 from .pencil import CURE, Pencil
 from .sparse_descent import eigenvalues_below
@@ -127,7 +128,7 @@ def _left_out(matrices: Matrices, squares: np.ndarray, count: int) -> bool:
     shifted = given.stiffness.values - middle * given.mass.values
     masses = np.asarray(matrices.M.diagonal()[: matrices.n])
     scale = jnp.asarray(np.where(masses > 0, masses, 1), shifted.dtype)
-    below, within = eigenvalues_below(SparseMatrix(-shifted, given.stiffness.places), scale, jnp.zeros((), shifted.dtype))
+    below, within = compiled(eigenvalues_below)(SparseMatrix(-shifted, given.stiffness.places), scale, jnp.zeros((), shifted.dtype))
     if within > np.max(gaps) / 2:
         warnings.warn("whether a lower mode was left out is not certain: factors of the matrix are too inexact", UserWarning, stacklevel=5)
     return bool(within <= np.max(gaps) / 2 and below > i + 1)
