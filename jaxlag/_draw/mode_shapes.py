@@ -36,7 +36,7 @@ def mode_shapes(
 
     **Arguments:**
 
-    - `modes`: those of `linearise(...).modes()`, some of them, `modes[:3]`, or one.
+    - `modes`: those of `linearise(...).modes()` or `lowest_modes`, some of them, `modes[:3]`, or one.
     - `points`, `links`: as for `animate`: position maps by name, and pairs joined by a line.
     - `amplitude`: how far the point moves that moves most, in each mode. Default: 10 % of the size of the mechanism.
     - `units`: units of `"x"`, for both axes, and of `"t"`, for the title: with `"s"`, frequencies are in Hz.

@@ -4,9 +4,9 @@ python tests/benchmarks/bench_growth.py [most links]
 
 By hand: for the chain S has three diagonals, in one call of a tridiagonal solve; in angles, the articulated inertias link by link. Medians
 of 30 calls, each length in a process of its own; 1 s of motion of 200 links and of 1000, each of unit length and mass; and its
-gradient in the mass of each link; rest between two hooks, with the forces left. Beside the rods: the same chain, at rest, as a tree of
-hinges in MuJoCo, which nests no more than 1024 bodies; without the forces in the hinges. Its accelerations of the points are compared
-with those of the rods.
+gradient in the mass of each link; rest between two hooks, with the forces left; the lowest modes where it hangs. Beside the rods: the
+same chain, at rest, as a tree of hinges in MuJoCo, which nests no more than 1024 bodies; without the forces in the hinges. Its
+accelerations of the points are compared with those of the rods.
 """
 
 import subprocess
@@ -234,18 +234,47 @@ def rest(n, kind):
     )
 
 
+def modes(n, kind):
+    """The ten lowest of the chain where it hangs; beside ARPACK on matrices written by hand, across, where alone it swings."""
+    import jax
+    import jax.numpy as jnp
+    import numpy as np
+    import scipy.sparse as sparse
+    from scipy.sparse.linalg import eigsh
+
+    import jaxlag as jl
+
+    system, _, params = chain(n)
+    hanging = jnp.stack([jnp.zeros(n), -jnp.arange(1.0, n + 1)], axis=1)
+    first, each, found = timed(lambda params: jl.lowest_modes(system, hanging, params), params, times=5)
+    slope = jax.grad(lambda params: jnp.sum(jl.lowest_modes(system, hanging * params["l"], params).frequency))
+    _, gradient, _ = timed(slope, params, times=5)
+
+    def by_hand(params):
+        pull = params["g"] * np.arange(n, 0.0, -1) / params["l"]
+        return eigsh(sparse.diags([pull + np.append(pull[1:], 0), -pull[1:], -pull[1:]], [0, 1, -1], format="csc"), 10, sigma=0.0)[0]
+
+    _, hand, squares = timed(by_hand, params, times=5)
+    off = float(np.max(np.abs(found.angular_frequency / np.sqrt(np.sort(squares)) - 1)))
+    print(
+        f"{n:>7} links, ten lowest modes: {each:.3f} s, the first {first:.1f} s, with derivatives {gradient:.3f} s; "
+        f"ARPACK by hand {hand:.3f} s, difference {off:.1e}"
+    )
+
+
 def main():
     if len(sys.argv) == 4:
         import jax
 
         jax.config.update("jax_enable_x64", True)
-        kinds = {"acceleration": accelerations, "hinges": hinges, "motion": motion, "gradient": gradient, "rest": rest}
+        kinds = {"acceleration": accelerations, "hinges": hinges, "motion": motion, "gradient": gradient, "rest": rest, "modes": modes}
         return kinds[sys.argv[1]](int(sys.argv[2]), sys.argv[3])
     most = int(sys.argv[1]) if len(sys.argv) > 1 else LENGTHS[-1]
     print(f"{'links':>14}{'jaxlag ms':>12}{'by hand ms':>12}{'ratio':>8}{'first s':>9}{'by hand':>9}{'difference':>11}", flush=True)
-    for kind, lengths in (("acceleration", LENGTHS), ("hinges", HINGES), ("motion", MOTIONS), ("gradient", MOTIONS[:1]), ("rest", HANGING)):
+    parts = {"acceleration": LENGTHS, "hinges": HINGES, "motion": MOTIONS, "gradient": MOTIONS[:1], "rest": HANGING, "modes": HANGING}
+    for kind, lengths in parts.items():
         for n in lengths:
-            for coordinates in () if n > most else ("places",) if kind in ("hinges", "rest") else CHAINS:
+            for coordinates in () if n > most else ("places",) if kind in ("hinges", "rest", "modes") else CHAINS:
                 subprocess.run([sys.executable, __file__, kind, str(n), coordinates], check=True)
 
 

@@ -142,6 +142,13 @@ def string(q, qdot, m, c, s):
     return 0.5 * m * jnp.sum(qdot**2) - 0.5 * c * (squares[0] + (1 + s) * squares[1])
 
 
+def test_pictures_take_them():
+    modes = jl.lowest_modes(CHAIN, jnp.zeros(N), {"m": 1.0, "c": 4.0}, count=2)
+    points = {f"{i}": lambda q, i=i: jnp.stack([jnp.full((), 1.0 * i, q.dtype), q[i]]) for i in range(0, N, 30)}
+    assert len(np.ravel(jl.plot.mode_shapes(modes, points))) == 2
+    assert jl.animate(modes[1], points) is not None
+
+
 def test_repeated_modes():
     """Of two that are equal the mean is smooth: half of what one of them gains."""
     system, half = jl.System(string), N // 2
