@@ -27,6 +27,7 @@ REASONS = (
 FIRST_DAMPING = 1e-2
 DAMPING_LIMITS = 1e-14, 1e14
 NEWTON_LIKE = 0.5  # damping below which a step is close to that of Gauss and Newton
+CLOSE = 10  # tolerances; so short a step is trusted where the cost rises by no more than one of that length could lower it
 HOPELESS = 1e8  # damping from which on no step is expected to lower the cost
 SHORT = 0.3  # standard errors; the cost of so short a step is as expected, unless there is a kink
 SLIGHT = 0.1  # standard errors; a cost that falls less than by such a step has not fallen
@@ -165,13 +166,16 @@ def _update(now, trial, linearised, bounds, tolerance, freedom):
     expected = -trial.change @ now.residuals - 0.5 * trial.change @ trial.change
     newton_like, rounding = now.damping < NEWTON_LIKE, jnp.finfo(r.dtype).eps ** 0.5 * before
     better = after <= before
-    taken = better | (newton_like & (expected <= rounding) & (after - before <= rounding))
+    per_error = 2 * before / jnp.maximum(freedom, 1)  # σ̂²: the |J Δy|² of a step by one standard error
+    last = (CLOSE * tolerance) ** 2 * per_error  # within this, the cost changes with the steps of the motion too
+    trusted = (expected <= rounding) & (after - before <= rounding)
+    trusted |= (jnp.sum(trial.change**2) <= last) & (after - before <= last / 2)
+    taken = better | (newton_like & trusted)
     take = lambda new, old: jax.tree.map(lambda a, b: jnp.where(taken, a, b), new, old)
     as_expected = (before - after) > 0.25 * expected
     damping = now.damping * jnp.where(better, jnp.where(as_expected, 0.1, 1.0), 10.0)
     damping = jnp.clip(damping, *DAMPING_LIMITS)
     status = _status(now, trial, taken, newton_like, tolerance, freedom)
-    per_error = 2 * before / jnp.maximum(freedom, 1)  # σ̂²: the |J Δy|² of a step by one standard error
     short = (jnp.sum(trial.change**2) <= SHORT**2 * per_error) & jnp.isfinite(after)
     across = jnp.where(taken, jnp.where(short & ~as_expected, now.jacobian, J), jnp.where(short, J, now.across))
     fell = now.mark - jnp.where(taken, after, before) > SLIGHT**2 / 2 * per_error
