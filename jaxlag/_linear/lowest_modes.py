@@ -22,7 +22,7 @@ from .origin import Origin
 from .pencil import CURE, along_modes, left_over, pencil
 from .sparse_modes import Found, Matrices, modes_near
 
-STILL = 0.375  # the same of forces that are left at rest, in parts of their terms
+STILL = 0.375  # exponent of eps: forces that are left at rest, in parts of their terms
 
 
 def lowest_modes(system: System, q: Any, params: PyTree = None, *, count: int = 10, shift: float = 0.0, t: Any = 0.0) -> Modes:

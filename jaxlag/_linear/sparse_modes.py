@@ -47,6 +47,13 @@ class Matrices(NamedTuple):
         """The part of their size by which two values may differ and are one."""
         return float(np.finfo(self.pencil.left.dtype).eps ** EQUAL)
 
+    @property
+    def rounding(self) -> float:
+        """That of squares of natural frequencies, by the largest of them."""
+        masses = self.M.diagonal()[: self.n]
+        largest = np.max(np.asarray(abs(self.K[: self.n, : self.n]).sum(axis=1)).ravel()[masses > 0] / masses[masses > 0], initial=0.0)
+        return 10 * float(np.finfo(self.pencil.left.dtype).eps) * float(largest)
+
     def at(self, value: complex) -> scipy.sparse.csc_matrix:
         """[P(λ) −Gᵀ; −G 0]."""
         return (self.K + value * self.C + value**2 * self.M).tocsc()
@@ -111,7 +118,11 @@ def _undamped(matrices: Matrices, count: int, shift: float) -> Found:
     else:
         raise ValueError(f"`shift` must be such that the lowest modes are found, but from {shift} lower ones are left out. Give another.")
     squares, vectors = squares[:count], vectors[:, :count]
+    _refuse_unsolved(matrices.K @ vectors - matrices.M @ vectors * squares, abs(matrices.K) @ np.abs(vectors), matrices)
     squares = np.where(np.abs(squares) <= matrices.equal * shift**2, 0, squares)
+    with searching():
+        if np.any((squares != 0) & (np.abs(squares) <= matrices.rounding)):
+            raise RuntimeError("some are zero within rounding, and whether they are stable is not known")
     size = np.einsum("ik,ik->k", vectors, matrices.M @ vectors)
     same = np.abs(squares[:, None] - squares[None, :]) <= matrices.equal * np.abs(squares)[:, None]
     omega = np.sqrt(np.abs(squares))
@@ -129,9 +140,17 @@ def _left_out(matrices: Matrices, squares: np.ndarray, count: int) -> bool:
     masses = np.asarray(matrices.M.diagonal()[: matrices.n])
     scale = jnp.asarray(np.where(masses > 0, masses, 1), shifted.dtype)
     below, within = compiled(eigenvalues_below)(SparseMatrix(-shifted, given.stiffness.places), scale, jnp.zeros((), shifted.dtype))
-    if within > np.max(gaps) / 2:
+    is_certain = bool(within <= np.max(gaps) / 2)
+    if not is_certain:
         warnings.warn("whether a lower mode was left out is not certain: factors of the matrix are too inexact", UserWarning, stacklevel=5)
-    return bool(within <= np.max(gaps) / 2 and below > i + 1)
+    return is_certain and int(below) > i + 1
+
+
+def _refuse_unsolved(left: np.ndarray, terms: np.ndarray, matrices: Matrices) -> None:
+    """Raises where what is `left` of the equations of a mode is more than the rounding of their terms: of rows that follow from others."""
+    with searching():
+        if not np.all(np.max(np.abs(left), axis=0) <= matrices.equal * np.max(terms, axis=0)):
+            raise RuntimeError("they do not solve their equations")
 
 
 def _damped(matrices: Matrices, count: int, shift: float, symmetric: bool) -> Found:
@@ -157,7 +176,10 @@ def _damped(matrices: Matrices, count: int, shift: float, symmetric: bool) -> Fo
         raise ValueError(f"`count` must be a number of modes that lie apart from others, but two searches differ. Try {count + 2}.")
     dust = np.abs(values.real) <= matrices.equal * np.abs(values)
     values = np.where(dust, 1j * values.imag, values)
-    left = vectors if symmetric else np.stack([_left_vector(matrices, value, splu) for value in values], axis=1)
+    terms = abs(K) @ np.abs(vectors) + np.abs(values) * (abs(C) @ np.abs(vectors)) + np.abs(values) ** 2 * (abs(M) @ np.abs(vectors))
+    _refuse_unsolved(K @ vectors + values * (C @ vectors) + values**2 * (M @ vectors), terms, matrices)
+    with searching():
+        left = vectors if symmetric else np.stack([_left_vector(matrices, value, splu) for value in values], axis=1)
     size = np.einsum("ik,ik->k", left, C @ vectors + 2 * values * (M @ vectors))
     same = np.abs(values[:, None] - values[None, :]) <= matrices.equal * np.abs(values)[:, None]
     return Found(values, vectors, left / size, same, False)
