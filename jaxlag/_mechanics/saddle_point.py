@@ -12,10 +12,8 @@ from .._program.recursive_elimination import Factors as Articulated
 from .._program.scalarise import scalarised
 from .._program.sparse_jacobian import MANY
 from .._program.sparse_matrix import SparseMatrix, dense
+from . import block_saddle_point, sparse_saddle_point
 from .pseudo_inverse import Inverse, Request, applied, by_rows, everywhere, inverse_of
-from .sparse_saddle_point import factorised as sparsely_factorised
-from .sparse_saddle_point import is_satisfied
-from .sparse_saddle_point import solver as sparse_solver
 from .structured_inertia import StructuredInertia, by_inertia, is_positive, root_of_inverse
 from .structured_inertia import factorised as structure_factorised
 
@@ -61,10 +59,11 @@ def saddle_point(M: lx.AbstractLinearOperator, G: Rows, f, c, reach: Float[Array
     if f.ndim == 1:
         found = saddle_point(M, G, f[:, None], c[:, None], reach)
         return found._replace(x=found.x[:, 0], multipliers=found.multipliers[:, 0])
-    if not isinstance(M, lx.DiagonalLinearOperator):
-        return _saddle_point(_for_rows(M, G), dense(G), f, c, reach)
+    M, G = _for_rows(M, G)
     if isinstance(G, SparseMatrix):
         return _sparse_saddle_point(M, G, f, c)
+    if not isinstance(M, lx.DiagonalLinearOperator):
+        return _saddle_point(M, G, f, c, reach)
     if not c.size and f.shape[0] >= MANY:
         return _free(M, f, c)
     heavy = M.diagonal > jnp.finfo(f.dtype).eps ** 0.25 * jnp.max(jnp.abs(M.diagonal))
@@ -73,13 +72,15 @@ def saddle_point(M: lx.AbstractLinearOperator, G: Rows, f, c, reach: Float[Array
     return jax.lax.cond(everywhere(jnp.all(heavy)), lambda: divided, full)
 
 
-def _keeps_structure(M, G):
-    """Whether so few rows are to be solved for that M serves better by its structure than with all its numbers."""
-    return isinstance(M, StructuredInertia) and G.shape[0] <= FEW
-
-
 def _for_rows(M, G):
-    return M if _keeps_structure(M, G) or not isinstance(M, StructuredInertia) else lx.MatrixLinearOperator(M.as_matrix())
+    """M and G as they are solved with: with as many of their zeros as that needs."""
+    if isinstance(M, lx.DiagonalLinearOperator) or (isinstance(M, StructuredInertia) and G.shape[0] <= FEW):
+        return M, G if isinstance(M, lx.DiagonalLinearOperator) else dense(G)
+    if not isinstance(M, StructuredInertia):
+        return M, dense(G)
+    if isinstance(G, SparseMatrix) and not M.sums and block_saddle_point.whole(M.slopes.places, G.places) is not None:
+        return M.slopes, G
+    return lx.MatrixLinearOperator(M.as_matrix()), dense(G)
 
 
 def _free(M: lx.DiagonalLinearOperator, f, c) -> SaddlePoint:
@@ -97,19 +98,27 @@ def _saddle_point(M, G, f, c, reach) -> SaddlePoint:
 
 def _sparse_saddle_point(M, G, f, c) -> SaddlePoint:
     """Rows that follow from others are judged by what is left of G x = c."""
-    factors = sparsely_factorised(*jax.lax.stop_gradient((M, G)))
+    way = _way(M)
+    factors = way.factorised(*jax.lax.stop_gradient((M, G)))
     x, multipliers = _solution(M, G, f, c, factors)
-    satisfied = jax.lax.cond(factors.regular, lambda *_: jnp.array(True), is_satisfied, *jax.lax.stop_gradient((M, G, f, c, x)))
-    return SaddlePoint(x, multipliers, Sound(is_determined(M, G), satisfied))
+    judged = lambda f, c, x: sparse_saddle_point.is_satisfied(G, c, x, f / way.masses(M)[:, None])
+    satisfied = jax.lax.cond(factors.regular, lambda *_: jnp.array(True), judged, *jax.lax.stop_gradient((f, c, x)))
+    return SaddlePoint(x, multipliers, Sound(way.is_determined(M, factors), satisfied))
+
+
+def _way(M):
+    """How sparse rows are solved with."""
+    return sparse_saddle_point if isinstance(M, lx.DiagonalLinearOperator) else block_saddle_point
 
 
 def saddle_solver(M: lx.AbstractLinearOperator, G: Rows, f, c, reach: Float[Array, " n"] | None = None) -> Callable:
     """(f, c) ↦ (x, λ) as of `saddle_point`, for other vectors f and c; what G barely holds is held as it is for these."""
-    if isinstance(G, SparseMatrix) and isinstance(M, lx.DiagonalLinearOperator):
-        solve, _ = _solver(M, G, sparsely_factorised(*jax.lax.stop_gradient((M, G))))
+    M, G = _for_rows(M, G)
+    if isinstance(G, SparseMatrix):
+        factors = _way(M).factorised(*jax.lax.stop_gradient((M, G)))
     else:
-        M, G = _for_rows(M, G), dense(G)
-        solve, _ = _solver(M, G, _factorised(*jax.lax.stop_gradient((M, G, f[:, None], c[:, None], reach))))
+        factors = _factorised(*jax.lax.stop_gradient((M, G, f[:, None], c[:, None], reach)))
+    solve, _ = _solver(M, G, factors)
 
     def solution(f, c):
         x, multipliers = solve(f[:, None], c[:, None])
@@ -188,8 +197,10 @@ def _solution_jvp(primals, tangents):
     (M, G, f, c, factors), (dM, dG, df, dc, _) = primals, tangents
     x, multipliers = _solution(M, G, f, c, factors)
     solve, rotated = _solver(M, G, factors)
-    structured = isinstance(M, StructuredInertia)  # whose entries are factors of each other
-    turned = jax.jvp(lambda M: M.mv(x), (M,), (dM,))[1] if structured else jax.vmap(dM.mv, 1, 1)(x)
+    if isinstance(M, StructuredInertia):  # whose entries are factors of each other
+        turned = jax.jvp(lambda M: M.mv(x), (M,), (dM,))[1]
+    else:
+        turned = dM @ x if isinstance(M, SparseMatrix) else jax.vmap(dM.mv, 1, 1)(x)
     dx, d_multipliers = solve(df + dG.T @ multipliers - turned, dc - dG @ x)
     return (x, multipliers), (dx, d_multipliers + rotated(dG, multipliers))
 
@@ -197,7 +208,7 @@ def _solution_jvp(primals, tangents):
 def _solver(M, G, factors):
     """(f, c) ↦ (x, λ); and (dG, λ) ↦ how λ turns with the null space of Gᵀ to stay of least norm."""
     if isinstance(G, SparseMatrix):
-        return sparse_solver(M, G, factors)
+        return _way(M).solver(M, G, factors)
     by_inertia, inverse = _by_inertia(M, G, factors.W, factors.cholesky), factors.inverse
     mobility = by_inertia(G.T)
     S = G @ mobility
@@ -216,14 +227,14 @@ def _solver(M, G, factors):
 
 def is_determined(M: lx.AbstractLinearOperator, G: Rows) -> Bool[Array, ""]:
     """Whether M is positive definite on the null space of G; a diagonal one beside sparse rows, everywhere."""
-    if isinstance(G, SparseMatrix) and isinstance(M, lx.DiagonalLinearOperator):
-        return jnp.all(M.diagonal > jnp.finfo(M.diagonal.dtype).eps * jnp.max(M.diagonal))
-    if _keeps_structure(M, G):
-        M = jax.lax.stop_gradient(M)
+    M, G = jax.lax.stop_gradient(_for_rows(M, G))
+    if isinstance(G, SparseMatrix):
+        return _way(M).is_determined(M, _way(M).factorised(M, G))
+    if isinstance(M, StructuredInertia):
         return is_positive(M, structure_factorised(M))
-    if isinstance(M, lx.DiagonalLinearOperator) and not len(dense(G)) and M.diagonal.size >= MANY:
+    if isinstance(M, lx.DiagonalLinearOperator) and not len(G) and M.diagonal.size >= MANY:
         return jnp.all(M.diagonal > 0)
-    A = jax.lax.stop_gradient(augmented(M.as_matrix(), dense(G))[0])
+    A = augmented(M.as_matrix(), G)[0]
     return _is_positive(jnp.linalg.cholesky(A), A)
 
 

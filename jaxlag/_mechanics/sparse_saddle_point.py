@@ -94,8 +94,19 @@ def solver(M: lx.DiagonalLinearOperator, G: SparseMatrix, factors: Factors) -> t
     return solve, rotated
 
 
-def is_satisfied(M: lx.DiagonalLinearOperator, G: SparseMatrix, f, c, x) -> Bool[Array, ""]:
-    """Whether G x = c, as far as rounding lets it be: what rows that follow from others ask for follows too."""
-    size = SparseMatrix(jnp.abs(G.values), G.places)
-    scale = jnp.abs(c) + size @ (jnp.abs(x) + jnp.abs(f / M.diagonal[:, None]))
+def is_determined(M: lx.DiagonalLinearOperator, _: Factors) -> Bool[Array, ""]:
+    """Whether no mass is (next to) nothing beside the largest."""
+    return jnp.all(M.diagonal > jnp.finfo(M.diagonal.dtype).eps * jnp.max(M.diagonal))
+
+
+def masses(M: lx.DiagonalLinearOperator) -> Float[Array, " n"]:
+    """The diagonal of M."""
+    return M.diagonal
+
+
+def is_satisfied(G: SparseMatrix, c, x, free) -> Bool[Array, ""]:
+    """Whether G x = c, as far as rounding lets it be, beside the motion without constraints: what rows that follow from others ask for
+    follows too.
+    """
+    scale = jnp.abs(c) + abs(G) @ (jnp.abs(x) + jnp.abs(free))
     return jnp.all(jnp.abs(G @ x - c) <= jnp.finfo(x.dtype).eps ** FOLLOWS * jnp.max(scale, axis=0, initial=0.0, keepdims=True))

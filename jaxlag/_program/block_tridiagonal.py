@@ -48,7 +48,7 @@ def elimination(places: Places) -> Elimination:
     i, j = coupled.nonzero()
     size = max(1, int(np.abs(rank[i] - rank[j]).max(initial=0)))
     blocks = -(-m // size)
-    first, second = _pairs_in_a_column(places)
+    first, second = pairs_in_a_column(places)
     at, beside = rank[places.rows[first]], rank[places.rows[second]]
     below = at // size - beside // size
     kept = (below == 0) | (below == 1)
@@ -62,7 +62,7 @@ def elimination(places: Places) -> Elimination:
     return Elimination(order, size, blocks, (first[sorting], second[sorting]), sums, entry.reshape(blocks, 2, size, size))
 
 
-def _pairs_in_a_column(places: Places) -> tuple[np.ndarray, np.ndarray]:
+def pairs_in_a_column(places: Places) -> tuple[np.ndarray, np.ndarray]:
     """All pairs of entries that stand in one column, by their numbers."""
     number = scipy.sparse.csc_matrix(places.pattern())
     starts, entries = number.indptr, number.data - 1

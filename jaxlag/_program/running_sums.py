@@ -123,7 +123,7 @@ class _Cuts:
             return [(self.repeated(array, p["shape"]), True)]
         if depends and name in ELEMENTWISE:
             shape = equation.outvars[0].aval.shape
-            whole = lambda array: self.repeated(jnp.reshape(array, [1] * len(shape)), shape)
+            whole = lambda array: self.repeated(array if np.ndim(array) else jnp.reshape(array, [1] * len(shape)), shape)
             arrays = [whole(array) if moves and np.shape(array) != shape else array for array, moves in operands]
         return [(array, depends) for array in as_function(equation)(*arrays)]
 

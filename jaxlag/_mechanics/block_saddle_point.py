@@ -1,0 +1,152 @@
+"""The constrained solve M x = f + Gᵀλ, G x = c where M and G are sparse: rigid bodies and their joints, however many.
+
+In units in which M has ones on its diagonal and rows have length 1, x and −λ solve one symmetric system,
+
+    [M  Gᵀ] [ x]   [f]
+    [G  0 ] [−λ] = [c].
+
+It is eliminated block by block, each multiplier behind all that its row holds: then no pivot is zero, since a part of the bodies and the
+joints between them is a mechanism as well. M need be positive on the null space of G only, as of quaternions: GᵀG is added to it, and
+taken out of the solution by putting that right once. Where rows depend on each other, so is a −δ in place of the 0.
+
+Source: Benzi, Golub & Liesen, Numerical solution of saddle point problems, Acta Numerica 2005, sections 5, 6 and 8.
+"""
+
+import functools
+from collections.abc import Callable
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array, Bool, Float
+
+from .._program.block_tridiagonal import pairs_in_a_column
+from .._program.block_tridiagonal_lu import Factors as Blocks
+from .._program.block_tridiagonal_lu import factorised as by_blocks
+from .._program.block_tridiagonal_lu import order, positive_eigenvalues, solution
+from .._program.sparse_jacobian import SPARSE
+from .._program.sparse_matrix import Places, SparseMatrix, summed_by
+from .pseudo_inverse import everywhere
+from .sparse_saddle_point import GROWTH, REFINEMENTS, SHIFT
+
+EXACT = 2  # times that a solution is put right where rows are independent: once for GᵀG, once for rounding
+
+
+class Whole(NamedTuple):
+    """How the matrix of (x, −λ) is put together: fixed while tracing, by the places of M and G alone."""
+
+    places: Places
+    pairs: tuple[np.ndarray, np.ndarray]  # of entries of G in one row
+    sums: Places  # by which entries of M, pairs, entries of G, of Gᵀ and the δ are added up
+
+
+@functools.lru_cache(maxsize=64)
+def whole(M: Places, G: Places) -> Whole | None:
+    """None where blocks would be so large that a full matrix serves as well."""
+    (m, n), (by_columns, number) = G.shape, G.transposed
+    first, second = (number[pairs] for pairs in pairs_in_a_column(by_columns))
+    of_rows = n + np.arange(m)
+    rows = np.concatenate([M.rows, G.columns[first], n + G.rows, G.columns, of_rows])
+    columns = np.concatenate([M.columns, G.columns[second], G.columns, n + G.rows, of_rows])
+    there, place = np.unique(rows * (n + m) + columns, return_inverse=True)
+    places = Places(there // (n + m), there % (n + m), (n + m, n + m), n)
+    if SPARSE * order(places).size > n + m:
+        return None
+    sorting = np.argsort(place, kind="stable")
+    return Whole(places, (first, second), Places(place[sorting], sorting, (there.size, place.size)))
+
+
+class Factors(NamedTuple):
+    """What the solve takes as constant: the factors; the units of x and of rows; whether rows are independent; whether M is positive on
+    their null space.
+    """
+
+    of: Blocks
+    units: Float[Array, " n"]
+    weights: Float[Array, " m"]
+    regular: Bool[Array, ""]
+    determined: Bool[Array, ""]
+
+
+def factorised(M: SparseMatrix, G: SparseMatrix) -> Factors:
+    """Rows that depend on each other are seen by what the inverse makes of a vector at random; then δ is not zero, and a solution is put
+    right more often. M is positive on their null space where as many eigenvalues are negative as there are rows (Sylvester).
+    """
+    how, eps, (m, n) = whole(M.places, G.places), jnp.finfo(G.values.dtype).eps, G.shape
+    assert how is not None  # asked where it is of use
+    units = lax.rsqrt(masses(M))
+    values = G.values * units[G.places.columns]
+    squares = summed_by(G.places, values**2)
+    there = squares > (4 * eps) ** 2 * jnp.max(squares)  # a row of nothing but rounding has no part in it
+    weights = jnp.where(there, lax.rsqrt(jnp.where(there, squares, 1)), 0)
+    values, (first, second) = values * weights[G.places.rows], how.pairs
+    shift = eps**SHIFT * weights**2 / _typical(weights**2, there) + ~there  # as much for each row in the units given
+    of_M = M.values * units[M.places.rows] * units[M.places.columns]
+    probe = jnp.asarray(np.random.default_rng(0).choice([-1.0, 1.0], n + m), values.dtype)
+
+    def attempt(carry):
+        _, _, shifted = carry
+        delta = jnp.where(shifted, shift, 0)
+        entries = jnp.concatenate([of_M, values[first] * values[second], values, values, -delta])
+        K = SparseMatrix(summed_by(how.sums, entries[how.sums.columns]), how.places)
+        factors = by_blocks(K)
+        is_singular = ~(jnp.max(jnp.abs(solution(how.places, factors, probe))) < eps**-GROWTH)
+        return (K.values, factors), is_singular & ~shifted, is_singular | shifted
+
+    nothing = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), jax.eval_shape(lambda: attempt((None, None, False))[0]))
+    start = nothing, jnp.array(True), jnp.array(False)
+    (entries, factors), _, shifted = lax.while_loop(lambda carry: carry[1], attempt, start)
+    rising, sound = positive_eigenvalues(SparseMatrix(entries, how.places), factors)
+    return Factors(factors, units, weights, everywhere(~shifted), (rising == n) & sound)
+
+
+def masses(M: SparseMatrix) -> Float[Array, " n"]:
+    """The diagonal of M; where it is not positive, what it typically is."""
+    diagonal = summed_by(M.places, jnp.where(M.places.rows == M.places.columns, M.values, 0))
+    return jnp.where(diagonal > 0, diagonal, _typical(diagonal, diagonal > 0))
+
+
+def is_determined(_: SparseMatrix, factors: Factors) -> Bool[Array, ""]:
+    """Whether M is positive on the null space of the rows."""
+    return factors.determined
+
+
+def _typical(x, among):
+    """The geometric mean of some numbers."""
+    return jnp.exp(jnp.sum(jnp.where(among, jnp.log(jnp.where(among, x, 1)), 0)) / jnp.maximum(jnp.sum(among), 1))
+
+
+def solver(M: SparseMatrix, G: SparseMatrix, factors: Factors) -> tuple[Callable, Callable]:
+    """(f, c) ↦ (x, λ); and (dG, λ) ↦ how λ turns with the null space of Gᵀ to stay of least norm."""
+    how, n = whole(M.places, G.places), G.shape[1]
+    assert how is not None  # asked where it is of use
+    scale = jnp.concatenate([factors.units, factors.weights])[:, None]
+    apart = lambda given: (given[:n], given[n:])
+
+    def by_matrix(given):
+        x, pull = apart(given)
+        return jnp.concatenate([M @ x + G.T @ pull, G @ x])
+
+    def once(given):
+        return scale * jax.vmap(lambda b: solution(how.places, factors.of, b), in_axes=1, out_axes=1)(scale * given)
+
+    def refined(matvec, given):
+        times = jnp.where(factors.regular, EXACT, REFINEMENTS)
+        return lax.fori_loop(0, times, lambda _, found: found + once(given - matvec(found)), once(given))
+
+    def solve(f, c):
+        x, pull = apart(lax.custom_linear_solve(by_matrix, jnp.concatenate([f, c]), refined, symmetric=True))
+        return x, -pull
+
+    def rotated(dG, multipliers):
+        nothing = jnp.zeros((n, multipliers.shape[1]), multipliers.dtype)
+
+        def turned(dG, multipliers):
+            change = dG @ solve(nothing, multipliers)[0]
+            return change - G @ solve(nothing, change)[0]
+
+        return lax.cond(factors.regular, lambda _, multipliers: jnp.zeros_like(multipliers), turned, dG, multipliers)
+
+    return solve, rotated
