@@ -434,6 +434,7 @@ def test_logarithmic_decrement():
     np.testing.assert_allclose(np.log(motion.q[1] / motion.q[2]), 0.646309467677697, rtol=1e-8)  # samples lie between the steps
 
 
+@pytest.mark.slow
 def test_coasting_to_just_before_the_stop():
     """m v̇ = −a − k v²: v = √(a/k) tan(atan(v₀ √(k/a)) − t √(a k)/m), and x = (m/2k) ln((a + k v₀²)/(a + k v²))."""
     m, mu, N, k, v0 = 900.0, 0.015, 9000.0, 0.5, 25.0  # kg, 1, N, kg/m, m/s: a car out of gear

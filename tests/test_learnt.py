@@ -62,6 +62,7 @@ def random_states(cls):
     return jax.tree.map(lambda out: out.reshape(-1, *out.shape[2:]), states)
 
 
+@pytest.mark.slow
 @every_dissipation
 def test_ten_thousand_random_states_are_passive_and_finite(cls):
     at = random_states(cls)
@@ -146,6 +147,7 @@ def nearest_that_rises(force):
 V = jnp.concatenate([jnp.linspace(-0.42, -0.05, 100), jnp.linspace(-0.0495, 0.0495, 100), jnp.linspace(0.05, 0.42, 100)])
 
 
+@pytest.mark.slow
 def test_a_convex_network_learns_dampers():
     linear_and_drag = 3.0 * V + 20.0 * V * jnp.abs(V)
     assert off(trained(ConvexDissipation(0.1, power=0.3, key=jax.random.key(0)), V, linear_and_drag), V, linear_and_drag) < 0.01
@@ -153,6 +155,7 @@ def test_a_convex_network_learns_dampers():
     assert off(trained(ConvexDissipation(0.1, power=0.3, key=jax.random.key(0)), V, bump_and_rebound), V, bump_and_rebound) < 0.01
 
 
+@pytest.mark.slow
 def test_the_passive_network_learns_stribecks_curve_and_no_convex_one_can():
     force = stribeck.true_friction(V)
     least = nearest_that_rises(force)
@@ -184,6 +187,7 @@ def test_gradient_of_a_motion_with_respect_to_all_weights():
     np.testing.assert_allclose(jax.jvp(outcome, (net,), (unravel(along),))[1], expected, rtol=1e-7)
 
 
+@pytest.mark.slow
 def test_batches_of_networks_and_single_precision():
     ts = jnp.linspace(0.0, 0.3, 4)
     nets = jax.vmap(lambda key: ConvexDissipation(0.1, power=0.5, width=4, key=key))(jax.random.split(jax.random.key(10), 3))

@@ -24,8 +24,8 @@ class Table:
     """A `Trajectory` without its params, perhaps with more samples than are wanted."""
 
     rows: Float[Array, "rows T"]  # what is one real number at each sample
-    columns: list[Array]  # what else has the samples as its first axis
-    others: list[Array]
+    columns: list[Array | np.ndarray]  # what else has the samples as its first axis
+    others: list[Array | np.ndarray]
     structure: Any = dataclasses.field(metadata={"static": True})  # of the trajectory
     order: tuple[int, ...] = dataclasses.field(metadata={"static": True})  # of its leaves, among rows, columns, others and params
 

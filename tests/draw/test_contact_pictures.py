@@ -31,6 +31,7 @@ def closed_figures():
     plt.close("all")
 
 
+@pytest.mark.slow
 def test_forces_have_stems_at_impacts_and_bands_where_contacts_are_closed(bouncing):
     """Impacts at t₁(1 + 2e + 2e² + …) with impulses (1 + e) eᵏ v; closed from t₁(1 + e)/(1 − e)."""
     (ax,) = plot.forces(bouncing, units={"t": "s", "floor": "N"})

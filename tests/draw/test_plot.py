@@ -160,6 +160,7 @@ def fall():
     return jl.fit(stone, record, {"g": 8.0}, free=("g",)), np.stack([np.ones_like(ts), ts, -0.5 * ts**2], axis=1), heights
 
 
+@pytest.mark.slow
 def test_the_confidence_band_is_that_of_linear_regression(fall):
     fit, A, z = fall
     there = np.isfinite(z)

@@ -116,6 +116,7 @@ def one():
     return fit(coloured(1))
 
 
+@pytest.mark.slow
 def test_the_covariance_is_the_sandwich_and_all_that_is_made_of_it(one):
     """Where one coefficient does, R_ij = a^|i − j| with that of Yule and Walker, written down in full."""
     r, J = one.residuals[0], slopes(one)
@@ -150,6 +151,7 @@ def test_the_card_and_a_comparison_say_so(one):
     assert not short.converged and "the fit of 'b' has not converged" in repr(jl.compare({"a": white, "b": short}))
 
 
+@pytest.mark.slow
 def test_two_recordings_missing_samples_sigma_and_segments(one):
     per_variance = one.covariance / one.sigma**2
     given = fit(coloured(1, sigma=0.02))

@@ -95,6 +95,7 @@ def test_units_make_no_difference(one):
     np.testing.assert_allclose(changed.bic - one.bic, 60 * np.log(1e6), rtol=1e-6)  # as the density of x is per millimetre
 
 
+@pytest.mark.slow
 def test_experiments_share_the_sigma_of_a_channel():
     """Of different kinds and lengths, with missing samples."""
     short = np.linspace(0.0, 6.0, 40)
@@ -108,6 +109,7 @@ def test_experiments_share_the_sigma_of_a_channel():
     assert both.sigmas[0]["v"] == both.sigmas[1]["v"] and both.aic == pytest.approx(least + 2 * 4, abs=1e-4)
 
 
+@pytest.mark.slow
 def test_segments_and_fits_in_a_batch_agree(one):
     in_segments = fit(record(0), segments=3)
     a, b = jl.fit_each(osc.SYSTEM, [record(0), record(7)], osc.START, free=FREE)

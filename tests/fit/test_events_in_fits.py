@@ -50,6 +50,7 @@ def test_restitution_from_the_sound_of_a_ball():
     assert abs(found.params["e"] - 0.82) < 4 * found.standard_errors["e"]
 
 
+@pytest.mark.slow
 def test_clear_errors():
     experiment, _ = recording(sigma=1e-3)
     with pytest.raises(ValueError, match="must name events of the system, but holds 'click'"):

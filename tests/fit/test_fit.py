@@ -37,6 +37,7 @@ def test_the_shipped_recording_is_what_its_script_makes(tmp_path, monkeypatch):
     np.testing.assert_allclose(again, shipped, atol=1.1e-6)
 
 
+@pytest.mark.slow
 def test_without_noise_the_truth_comes_back():
     fit = jl.fit(vehicle.system, experiment(0, noise=0.0), GUESS, free=("b", "c", "k"), rtol=1e-10, atol=1e-12)
     for name in ("b", "c", "k"):
@@ -105,6 +106,7 @@ def test_several_experiments_and_the_card():
     np.testing.assert_allclose(fit.predictions[1]["y"] + fit.residuals[1]["y"], pair[1].values["y"])
 
 
+@pytest.mark.slow
 def test_a_vector_of_parameters_and_what_is_seen_of_accelerations():
     """Two springs in one parameter; an accelerometer and the force in a rod are the sensors."""
     from jaxlag.examples import pendulum
@@ -130,6 +132,7 @@ def test_a_vector_of_parameters_and_what_is_seen_of_accelerations():
     np.testing.assert_allclose([found.estimates["m"], found.estimates["l"]], [1.7, 0.8], rtol=1e-5)
 
 
+@pytest.mark.slow
 def test_progress_is_shown(capfd):
     jl.fit(vehicle.system, experiment(7), GUESS, free=("b", "k"), progress=True)
     *_, last = capfd.readouterr().err.splitlines()  # no terminal: the last state alone, and what takes long before it

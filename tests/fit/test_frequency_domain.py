@@ -117,6 +117,7 @@ def assert_same(fit, expected):
     np.testing.assert_allclose(np.append(fit.standard_errors["k"], fit.standard_errors["c"]), errors, rtol=1e-4)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("order", [(0, 1, 2), (2, 0, 1)])
 def test_exact_modes_in_any_order_give_the_truth_back(order):
     heavier = TRUTH["m"] + [0.0, 0.0, 1.0]  # without it, several chains have the same frequencies and damping ratios
@@ -137,6 +138,7 @@ def test_estimates_and_errors_from_modes_are_those_of_scipy():
     np.testing.assert_allclose([fit.cost, fit.sigma], [r @ r / 2, np.sqrt(r @ r / 6)], rtol=1e-6)
 
 
+@pytest.mark.slow
 def test_estimates_and_errors_from_a_frequency_response_are_those_of_scipy():
     test, measured, sigma = response_test(3)
     fit = jl.fit(CHAIN, test, GUESS, free=("k", "c"), tolerance=1e-8)
@@ -208,6 +210,7 @@ SPRING = jl.System(sagging, dissipation={"damper": damper})
 HARDENING = {"m": 2.0, "c": 80.0, "k": 500.0, "g": 9.81, "b": 1.5}
 
 
+@pytest.mark.slow
 def test_equilibrium_moves_with_the_parameters():
     m, c, k, g, _ = HARDENING.values()
     y = next(x.real for x in np.roots([k, 0, c, -m * g]) if abs(x.imag) < 1e-12)
@@ -220,6 +223,7 @@ def test_equilibrium_moves_with_the_parameters():
         np.testing.assert_allclose(found.matrix, [[(f * slope / (2 * stiffness) / 0.01) ** 2]], rtol=1e-8)
 
 
+@pytest.mark.slow
 def test_an_added_mass_tells_mass_from_stiffness():
     bare, loaded = 1.3, 1.1  # Hz; f² = c/(4π² m)
     tests = [jl.ModalTest([bare], 0.0, sigma=1e-3), jl.ModalTest([loaded], 0.0, sigma=1e-3, params={"g": 0.0, "extra": 0.5})]
@@ -229,6 +233,7 @@ def test_an_added_mass_tells_mass_from_stiffness():
     np.testing.assert_allclose([fit.estimates["m"], fit.estimates["c"]], [m, m * (2 * np.pi * bare) ** 2], rtol=1e-7)
 
 
+@pytest.mark.slow
 def test_a_steady_motion_is_found_for_every_parameter():
     pendulum = jl.System(  # conical: cos θ = g/(l Ω²), and ω² = Ω² (1 + 3 cos² θ)
         lambda q, qdot, l, g: 0.5 * l**2 * (qdot["theta"] ** 2 + (jnp.sin(q["theta"]) * qdot["phi"]) ** 2) + g * l * jnp.cos(q["theta"])

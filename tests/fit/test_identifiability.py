@@ -41,6 +41,7 @@ def test_estimates_and_errors_are_those_of_scipy(plain):
     np.testing.assert_allclose([low, high], found.x[0] + t * np.sqrt(covariance[0, 0]) * np.array([-1, 1]), rtol=1e-5)
 
 
+@pytest.mark.slow
 def test_the_95_percent_intervals_hold_the_truth_in_95_percent():
     """400 recordings with new noise, fitted in one batch; also σ̂ is right."""
     fits = jl.fit_each(osc.SYSTEM, [osc.record(seed) for seed in range(400)], osc.START, free=FREE)
@@ -153,6 +154,7 @@ def test_outliers_do_not_rule_a_robust_fit():
     assert 0.005 < by_itself.sigma < 0.03 < fit(jl.Experiment(osc.TIMES, z, 1.0, 0.0)).sigma
 
 
+@pytest.mark.slow
 def test_prediction_with_a_band_and_validation(plain):
     """The band against the closed form of the derivatives, the new start against exact data."""
     ts = np.linspace(0, 5, 30)
@@ -209,6 +211,7 @@ def test_information_is_what_a_fit_then_has():
         jl.information(osc.SYSTEM, jl.Experiment(osc.TIMES, None, 1.0, 0.0), osc.TRUE, FREE)
 
 
+@pytest.mark.slow
 def test_many_starts_find_what_one_does_not():
     """A frequency three times off leads nowhere, where damping cannot make the motion small on the way."""
     far = osc.START | {"c": 30.0}
@@ -332,6 +335,7 @@ def test_a_start_without_a_motion_is_refused():
         jl.fit(system, e, {"c": 5.0}, free=("c",), max_steps=5)
 
 
+@pytest.mark.slow
 def test_paths_vectors_and_payloads():
     """A parameter deep in the tree; two machines of one spring with payloads of their own, one of them unknown."""
     system = jl.System(lambda q, qdot, body, load: 0.5 * (body["m"] + load) * qdot**2 - 0.5 * body["c"] @ jnp.ones(2) * q**2)
@@ -349,6 +353,7 @@ def test_paths_vectors_and_payloads():
     np.testing.assert_allclose(found.experiments[1].params["load"], 0.5, rtol=1e-5)
 
 
+@pytest.mark.slow
 def test_gain_offset_and_delay_of_a_sensor():
     ts = osc.TIMES + 0.0
     true = {"gain": 2.5, "offset": -0.3, "lag": 0.05}
@@ -470,6 +475,7 @@ def test_a_direction_that_is_known_to_be_hidden_is_found_beneath_the_error_of_in
     np.testing.assert_allclose(direction / direction[0], hidden / hidden[0], rtol=1e-6)
 
 
+@pytest.mark.slow
 def test_the_delay_and_the_gain_of_an_actuator():
     """They are parameters like others: k u(t − τ) of an input that is linear between its samples; against SciPy."""
     ts = np.linspace(0.0, 10.0, 201)

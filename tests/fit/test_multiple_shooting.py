@@ -105,6 +105,7 @@ def test_everything_free_leaves_the_common_factor_of_masses_and_damping():
     assert all(np.isfinite(known.standard_errors[name]) for name in ("m2", "b1", "b2"))
 
 
+@pytest.mark.slow
 def test_gaps_that_the_integration_leaves_end_the_rounds():
     """With loose tolerances no weight closes the gaps: the last that helped is kept, and the estimates are those of SciPy's motion."""
     ts = np.linspace(0, 50, 500)

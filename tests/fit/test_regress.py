@@ -46,6 +46,7 @@ def test_the_friction_of_a_drive_axis_by_regression(axis):
         assert abs(found.estimates[name] / TRUE[name] - 1) < 0.01, name
 
 
+@pytest.mark.slow
 def test_the_friction_of_a_drive_axis_by_fit_with_exact_stick_slip(axis):
     """Started by regression, where no start is given."""
     found = jl.fit(AXIS, axis, dict.fromkeys(FREE, np.nan), free=FREE)
@@ -140,6 +141,7 @@ def test_nonholonomic_forces_are_eliminated_without_accelerations():
     assert found.linear and abs(found.estimates["g"] / g - 1) < 1e-3 and abs(found.estimates["d"]) < 1e-3
 
 
+@pytest.mark.slow
 def test_standard_errors_hold_for_coloured_noise():
     """A pendulum in Cartesian coordinates; the noise of both is correlated over twenty samples. Up to one in seven may be outside."""
     from scipy.integrate import solve_ivp

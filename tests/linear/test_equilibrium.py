@@ -114,6 +114,7 @@ LENGTH = 1.4 / LINKS
 SAG = {"x": np.linspace(0, 1, LINKS + 1)[1:-1], "y": -0.5 * np.sin(np.linspace(0, np.pi, LINKS + 1)[1:-1])}
 
 
+@pytest.mark.slow
 def test_a_chain_hangs_as_a_catenary():
     """Places of the joints, forces in the links; it is stable."""
     at = jl.equilibrium(CHAIN, SAG, {"l": LENGTH})
@@ -167,6 +168,7 @@ def test_a_bead_on_a_turning_hoop():
     assert lowest.stability == "unstable"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "derivative",
     [jax.jacfwd, jax.jacrev, jax.hessian, lambda f: jax.jacrev(jax.jacrev(f)), lambda f: jax.jacfwd(jax.hessian(f))],
@@ -176,6 +178,7 @@ def test_derivatives_of_an_equilibrium_to_the_third_order(derivative):
     np.testing.assert_allclose(derivative(found_tilt)(TURNING), derivative(tilt)(TURNING), rtol=1e-9)
 
 
+@pytest.mark.slow
 def test_many_equilibria_at_once_and_under_jit():
     Omegas = jnp.array([7.5, 9.0, 12.0])
     each = lambda Omega: found_tilt(jnp.stack([0.2, Omega]))
@@ -249,6 +252,7 @@ def test_states_come_to_rest_too():
 rub = {"ground": lambda qdot, F: F * jnp.abs(qdot["x"])}
 
 
+@pytest.mark.slow
 def test_friction_holds_a_block_on_an_incline():
     """Anywhere: m g sin α of at most F."""
     slope = jl.System(lambda q, qdot, m, alpha: 0.5 * m * qdot["x"] ** 2 + m * g * jnp.sin(alpha) * q["x"], dissipation=rub)
@@ -284,6 +288,7 @@ CONICAL = jl.System(spherical)
 CIRCLING = {"theta": 0.8, "phi": 0.0}, {"theta": 0.0, "phi": 6.0}
 
 
+@pytest.mark.slow
 def test_a_conical_pendulum():
     """cos θ = g/(l φ̇²): with the speed given, with the angle given, and with neither."""
     l = 0.5

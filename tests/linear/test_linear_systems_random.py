@@ -115,6 +115,7 @@ TIMES = np.linspace(0.0, 2.0, 21)
 SEEDS = [0, 1, 2, 3]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", SEEDS)
 def test_a_random_system(seed):
     """Eigenvalues, frequency and step response; these are told in the units of the coordinates."""

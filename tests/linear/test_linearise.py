@@ -145,6 +145,7 @@ def test_a_belt_that_is_moved_by_its_speed():
         np.testing.assert_allclose(response[output], expected[1:] / S[1:], rtol=1e-10, atol=1e-10, err_msg=output)
 
 
+@pytest.mark.slow
 def test_derivatives_of_a_frequency_response():
     """Of the size of x over the base at ω = 4, by b and c."""
     system = jl.System(carried, dissipation=strut, holonomic={"support": lambda q: q["base"]})
@@ -177,6 +178,7 @@ def held_plant(m, b, period):
     return signal.cont2discrete((A, B, np.eye(2), np.zeros((2, 1))), period)[:2]
 
 
+@pytest.mark.slow
 def test_a_controller_that_samples():
     """Eigenvalues of the plant with the held command, closed by the gains; the command itself has no memory."""
     Ad, Bd = held_plant(**PLANT, period=GAINS["period"])
@@ -200,6 +202,7 @@ def test_a_controller_with_too_large_a_gain_is_unstable():
         assert np.all(modes.stable) == stable
 
 
+@pytest.mark.slow
 def test_along_a_motion_with_a_controller():
     """u⁺ = −9 sin q − 3 q̇, held by a unit mass: the row of u is −(9 cos q, 3, 0)."""
     controller = jl.Sampled(lambda q, qdot: -9.0 * jnp.sin(q) - 3.0 * qdot, every=0.1, start=0.0)
@@ -212,6 +215,7 @@ def test_along_a_motion_with_a_controller():
     assert linear.modes().eigenvalues.shape == (6, 3)
 
 
+@pytest.mark.slow
 def test_derivatives_by_the_sample_time():
     def radius(period):
         return jnp.max(jnp.abs(jl.linearise(sampled_pd(), 0.0, params=PLANT | GAINS | {"period": period}).eigenvalues))
@@ -371,6 +375,7 @@ SLEDGE_PARAMS = {"m1": 0.4, "m2": 0.6, "c": 90.0, "F": 5.0, "belt": 0.0}
 SLEDGE_REST = {"sledge": 0.0, "mass": 0.03}
 
 
+@pytest.mark.slow
 def test_what_sticks_is_held():
     """Below the bound, c·0.03 = 2.7 < 5: with the sledge held, the mass alone oscillates about it."""
     linear = jl.linearise(SLEDGE, {"sledge": 0.0, "mass": 0.0}, params=SLEDGE_PARAMS)
@@ -379,6 +384,7 @@ def test_what_sticks_is_held():
     assert_same_spectrum(linear.eigenvalues, [0, 1j * w, -1j * w], rtol=1e-10, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_what_slips_keeps_its_force():
     """On a belt that is faster, with a spring to the wall: an undamped oscillator about x = F/c."""
     system = jl.System(
@@ -449,6 +455,7 @@ def test_under_jit_the_choice_of_coordinates_must_be_given():
         jax.jit(at)(1.0)
 
 
+@pytest.mark.slow
 def test_single_precision():
     with jax.enable_x64(False):
         linear = jl.linearise(pendulum.cartesian, {"x": np.float32(0), "y": np.float32(-1)}, params=pendulum.params)
@@ -456,6 +463,7 @@ def test_single_precision():
         np.testing.assert_allclose(linear.modes().angular_frequency, [np.sqrt(g)], rtol=1e-5)
 
 
+@pytest.mark.slow
 def test_inputs_that_move_a_constraint_are_refused_along_a_trajectory():
     bob = jl.System(lambda q, qdot: 0.5 * qdot @ qdot - 9.81 * q[1], holonomic={"rod": lambda q: jnp.sqrt(q @ q) - 1.0})
     motion = jl.simulate(bob, [0.6, -0.8], [0.0, 0.0], np.linspace(0, 0.1, 3))

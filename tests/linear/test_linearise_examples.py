@@ -506,6 +506,7 @@ def compare(example: Steady):
     }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", [pytest.param(name, marks=[pytest.mark.slow] * (name in SLOW)) for name in EXAMPLES])
 def test_motions_beside_the_steady_one(name):
     """Each independent coordinate, velocity and state is moved a little, an input too, and the full system simulated from there."""
@@ -599,6 +600,7 @@ def compare_along(example: Moving):
     return seen, T[-1] @ carried_along(np.asarray(linear.A), time / 400)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", [pytest.param(name, marks=[pytest.mark.slow] * (name in SLOW_MOVING)) for name in MOVING])
 def test_motions_beside_one_that_is_not_steady(name):
     """What is moved at the start arrives as A says along the motion."""

@@ -25,6 +25,7 @@ def frequencies(count, c):
     return 2 * np.sqrt(c) * np.sin(np.arange(1, count + 1) * np.pi / (2 * N + 2))
 
 
+@pytest.mark.slow
 def test_a_chain_of_springs_and_its_derivatives():
     found = lambda c: jl.lowest_modes(CHAIN, jnp.zeros(N), {"m": 1.0, "c": c}, count=5)
     modes, there = found(4.0), frequencies(5, 4.0)
@@ -37,6 +38,7 @@ def test_a_chain_of_springs_and_its_derivatives():
     np.testing.assert_allclose(jax.grad(lambda c: of(c) @ np.arange(5.0))(4.0), there @ np.arange(5.0) / 8, rtol=1e-10)
 
 
+@pytest.mark.slow
 def test_what_has_no_derivative_says_so():
     found = lambda c: jl.lowest_modes(CHAIN, jnp.zeros(N), {"m": 1.0, "c": c}, count=2)
     assert np.isnan(jax.grad(lambda c: found(c).shapes[0, 3])(4.0))
@@ -51,6 +53,7 @@ def lengths(q, l):
 ROPE = jl.System(lambda q, qdot, m, g: 0.5 * m * jnp.sum(qdot**2) - m * g * jnp.sum(q[:, 1]), holonomic={"rods": lengths})
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("links", [pytest.param(100, marks=pytest.mark.slow), 500])
 def test_a_hanging_rope_swings_as_laguerre_says(links):
     """ω² = g ξ/l with Lₙ(ξ) = 0 (Rouse–Laguerre); nothing depends on the mass, and all of it on √(g/l)."""
@@ -105,6 +108,7 @@ KINDS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", [*(pytest.param(kind, marks=pytest.mark.slow) for kind in list(KINDS)[:3]), "turning and damped"])
 def test_all_modes_by_dense_matrices_say_the_same(kind):
     """Eigenvalues, damping, shapes and constraint forces; and how eigenvalues follow params, through the state of rest too."""
@@ -149,6 +153,7 @@ def test_pictures_take_them():
     assert jl.animate(modes[1], points) is not None
 
 
+@pytest.mark.slow
 def test_repeated_modes():
     """Of two that are equal the mean is smooth: half of what one of them gains."""
     system, half = jl.System(string), N // 2
@@ -210,6 +215,7 @@ def test_in_single_precision(single_precision):
     np.testing.assert_allclose(modes.angular_frequency, 4 * np.sin(np.arange(1, 4) * np.pi / 202), rtol=1e-4)
 
 
+@pytest.mark.slow
 def test_what_is_refused():
     params, start = {"m": 1.0, "c": 4.0}, jnp.zeros(20)
     of = lambda system=CHAIN, q=start, **options: jl.lowest_modes(system, q, params, **options)

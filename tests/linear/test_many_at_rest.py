@@ -62,6 +62,7 @@ def rods_at_rest(l, n=LINKS):
     return jl.equilibrium(RODS, arc(n, 0.6 * n), params_of(n, l=l))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("sign, stability", [(1, "stable"), (-1, "unstable")])
 def test_a_chain_between_two_hooks_and_the_arch_that_it_makes(sign, stability):
     at = jl.equilibrium(RODS, arc(LINKS, 0.6 * LINKS, sign), params_of(LINKS, l=1.0))
@@ -98,6 +99,7 @@ def test_under_transformations_twice_and_in_single_precision():
     np.testing.assert_allclose(at.q[:, 1], expected[0], atol=1e-3)
 
 
+@pytest.mark.slow
 def test_straight_at_an_angle_a_chain_swings_down():
     """Pulled to λ l = half the weight below each rod."""
     system = jl.System(weight, holonomic={"rods": lambda q: jnp.sum(jnp.diff(q, axis=0, prepend=0) ** 2, axis=1) - 1})
@@ -108,6 +110,7 @@ def test_straight_at_an_angle_a_chain_swings_down():
     assert at.stability == "stable"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("stable", [False, pytest.param(True, marks=pytest.mark.slow)])
 def test_springs_that_are_not_stretched_yet(stable):
     """They have no stiffness across, so that Newton's method finds nothing and the potential leads the way."""
@@ -117,6 +120,7 @@ def test_springs_that_are_not_stretched_yet(stable):
     assert at.stability == "stable"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("size", [6, 10])
 def test_a_net_that_is_not_stretched_yet(size):
     """It hangs on two corners; forces by hand balance, and no direction falls. So small a net is sparse by little."""
@@ -162,12 +166,14 @@ def test_a_row_of_springs_and_a_bead_without_anything():
     np.testing.assert_allclose(jax.grad(lambda c: rest(c).q["z"][-1])(jnp.asarray(c)), -below / c**2, rtol=1e-11)
 
 
+@pytest.mark.slow
 def test_without_a_hook_there_is_none():
     loose = jl.System(weight, holonomic={"rods": lambda q: jnp.sum(jnp.diff(q, axis=0) ** 2, axis=1) - 1})
     with pytest.raises(ValueError, match="`q` must be near an equilibrium, but none was found"):
         jl.equilibrium(loose, np.arange(250.0)[:, None] * [0.0, -1.0], {"m": 1.3, "g": GRAVITY})
 
 
+@pytest.mark.slow
 def test_free_springs_are_neutral():
     """A ring of springs that drifts as it likes: its J is singular, and the few coordinates are treated with all zeros; held, it is not."""
     n = 64
@@ -176,6 +182,7 @@ def test_free_springs_are_neutral():
         assert jl.equilibrium(ring, 0.1 * np.sin(np.arange(n)), {"c": c}).stability == stability
 
 
+@pytest.mark.slow
 def test_forces_without_a_potential_are_said():
     n = 64
     system = jl.System(

@@ -170,6 +170,7 @@ def vehicle_modes(kind):
     return vehicle_at(getattr(vehicle, kind), jax.tree.map(jnp.asarray, q), speed)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["system", "substituted", "first_kind"])
 def test_heave_pitch_and_drive_of_the_vehicle(kind):
     """M s² + 2b s + 2c, Θ s² + 2b a² s + 2c a², and s (m' s + 2k(ẋ + v)), also with nine coordinates and six constraints."""
@@ -366,6 +367,7 @@ def derivative_along(value, params):
     return np.asarray(forwards)
 
 
+@pytest.mark.slow
 def test_derivatives_of_complex_eigenvalues():
     at = np.asarray(by_hand.linearised(FULL).eigenvalues)
     nearest = lambda s: np.array(

@@ -27,6 +27,7 @@ def by_shooting(mu):
     return state[0], last - before, np.exp(state[2] - earlier[2])
 
 
+@pytest.mark.slow
 def test_van_der_pol():
     orbit, (amplitude, period, multiplier) = cycle(1.0), by_shooting(1.0)
     np.testing.assert_allclose([orbit.q, orbit.period], [amplitude, period], rtol=1e-9)

@@ -91,6 +91,7 @@ def linearised(v):
     return jl.linearise(bicycle.system, *bicycle.state(v, p["r_R"], p["r_F"]), p)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("v", PUBLISHED)
 def test_the_published_eigenvalues(v):
     """Seven coordinates and three velocities are independent; four eigenvalues are not zero."""

@@ -23,6 +23,7 @@ def receptance(omega):
     return 1 / (P["k"] + P["m"] * s**2 + P["c"] * s * P["b"] / (P["c"] + s * P["b"])), P["c"] / (P["c"] + s * P["b"])
 
 
+@pytest.mark.slow
 def test_frequency_response():
     at = {"x": 0.0, "z": 0.0}
     linear = jl.linearise(DRIVEN, at, params=P | {"f": 0.0}, inputs=("f",), outputs=lambda q: {"x": q["x"], "z": q["z"]})

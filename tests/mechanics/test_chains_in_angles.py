@@ -62,6 +62,7 @@ def test_velocities_by_a_directional_derivative_and_several_chains_at_once():
         close(qddot, np.linalg.solve(*by_hand(q, v, given)), 1e-10)
 
 
+@pytest.mark.slow
 def test_derivatives_in_each_mass_and_length():
     """d(uᵀq̈) by M⁻¹(df − dM q̈), the closed forms differentiated by complex steps; forward, reverse, and of second order."""
     q, v, given = state(80)

@@ -87,6 +87,7 @@ def order(rows):
     return np.argmax(np.abs(rows @ (POINTS / np.linalg.norm(POINTS, axis=1, keepdims=True)).T), axis=1)
 
 
+@pytest.mark.slow
 def test_points_rest_and_slide_each_for_itself():
     load = np.array([[0.5, 0.5], [0.3, -0.9], [3.0, 0.0]])
     system = jl.System(T, dissipation=THREE_POINTS["norm, axis"], force=lambda load: load)

@@ -136,6 +136,7 @@ def test_drag_in_the_plane_and_a_slope_that_differs_by_direction():
     np.testing.assert_allclose(solve(F), rates, rtol=1e-8)
 
 
+@pytest.mark.slow
 def test_drag_beside_a_constraint_that_moves():
     """k|ẋ|ẋ = 2 + λ and b ẏ = −y + 2λ with ẋ + 2ẏ = cos t: one equation for ẋ by bisection."""
     bar = jl.System(

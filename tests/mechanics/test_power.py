@@ -43,6 +43,7 @@ def test_works_of_the_vehicle_in_closed_form():
     np.testing.assert_allclose(motion.work()["dampers"][-1], -lost, rtol=1e-6)
 
 
+@pytest.mark.slow
 def test_the_work_of_projection_is_listed_apart():
     ts, p = jnp.linspace(0, 10, 51), pendulum.params
     run = lambda how: jl.simulate(

@@ -339,6 +339,7 @@ def test_constraints_are_kept(name):
         np.testing.assert_allclose(residual, 0, rtol=0, atol=ON)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", EXAMPLES)
 def test_energy_balance(name):
     assert np.max(np.abs(seen(name)["balance"])) <= BALANCE
@@ -459,6 +460,7 @@ def test_rolling_disc_upright():
     np.testing.assert_allclose(np.linalg.matrix_power(critical, 2)[1, 1], 0, rtol=0, atol=1e-12)  # λ² = 4g/5r − 12w²/5
 
 
+@pytest.mark.slow
 def test_a_disc_that_rolls_is_not_called_stiff():
     """Where it rolls to and turns to are double eigenvalues 0: no time constants, though rounding makes some 1e-8 of them."""
     found = jl.examine(disc, *disc_state(0.0, 0.1, 0.2, 0.0, 2.0), UNITS)
@@ -714,6 +716,7 @@ def test_gradients_with_respect_to_an_initial_value_a_mass_and_a_length(end, by_
         np.testing.assert_allclose(found, expected, rtol=1e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("x", [(3.0, 4.0), (0.5, -0.2)], ids=["on the circle", "far from it"])
 def test_derivatives_of_a_consistent_state_of_every_order(x):
     """The nearest point of the circle |q| = l is l x/|x|, whether the search for it begins there or not."""

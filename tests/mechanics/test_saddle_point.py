@@ -55,6 +55,7 @@ def test_pseudo_inverse_derivatives_at_constant_rank():
     np.testing.assert_allclose(second, (P(h) - 2 * P(0) + P(-h)) / h**2, rtol=1e-3, atol=1e-3)
 
 
+@pytest.mark.slow
 def test_second_derivatives_where_rows_depend_on_each_other():
     """Along a curve of constant rank, forward over forward and reverse over forward, against central differences of NumPy's solution."""
     rng = np.random.default_rng(5)
@@ -95,6 +96,7 @@ def test_a_constraint_written_twice():
     np.testing.assert_allclose(multipliers, np.array([1, 1, 3]) / 11 * once.multipliers["rod"], rtol=1e-9)
 
 
+@pytest.mark.slow
 def test_gradients_with_a_constraint_written_twice():
     rod = pendulum.cartesian_rod
     twice = jl.System(pendulum.cartesian_lagrangian, holonomic={"rod": rod, "again": rod})

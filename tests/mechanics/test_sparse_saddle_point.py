@@ -77,6 +77,7 @@ def test_as_by_dense_matrices(name):
     assert found.sound.determined and found.sound.satisfied
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", SYSTEMS)
 def test_derivatives_forward_and_reverse(name):
     function, x, masses, f, a = problem(name)
@@ -96,6 +97,7 @@ def test_derivatives_forward_and_reverse(name):
     np.testing.assert_allclose([forward, reverse], differences, rtol=2e-7)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["chain", "tree"])
 def test_second_derivatives(name):
     function, x, masses, f, a = problem(name)

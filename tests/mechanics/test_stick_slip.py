@@ -79,6 +79,7 @@ def test_friction_is_a_result_within_its_bound():
     np.testing.assert_allclose(motion.work()["dry"][-1], -(2.0 - 2 * 0.05**2), rtol=1e-7)  # all of the spring's energy but what is held
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("derivative", [jax.grad, jax.jacfwd, jax.jacrev])
 def test_gradient_of_the_point_of_rest(derivative):
     np.testing.assert_allclose(derivative(rest, (0, 1))(1.0, 0.3), (-1.0, 3.5), atol=1e-6)
@@ -186,6 +187,7 @@ def belt_motion(vs, end=40.0, samples=4001):
     return jl.simulate(belt, 0.0, 0.3, np.linspace(0, end, samples), {"c": 1.0, "v": 0.3, "vs": vs}, **SHARP)
 
 
+@pytest.mark.slow
 def test_stick_slip_on_a_belt():
     """The limit cycle, against SciPy with events: slip from x = F_s/c until the slip velocity is zero again, then ride to F_s/c."""
     vs, v, Fs, Fc = 0.05, 0.3, 1.5, 1.0
@@ -279,6 +281,7 @@ def test_a_chain_of_twenty_rubbing_blocks_runs_to_rest():
     np.testing.assert_allclose(motion.friction["floor"].force[-1], springs, atol=1e-10)
 
 
+@pytest.mark.slow
 def test_several_elements_stop_at_the_same_time():
     """Two equal oscillators side by side: their events coincide, and each ends where it ends alone."""
     pair = jl.System(
@@ -289,6 +292,7 @@ def test_several_elements_stop_at_the_same_time():
     assert np.all(motion.qdot[-1] == 0)
 
 
+@pytest.mark.slow
 def test_every_way_to_write_it_is_found():
     ts, p = [0.0, 20.0], {"c": 4.0, "F": 0.3}
     ends = [
@@ -309,6 +313,7 @@ def test_smooth_terms_stay_smooth():
     assert motion.friction == {} and "transitions" not in motion.stats
 
 
+@pytest.mark.slow
 def test_regularised_friction_creeps_as_its_docstring_says():
     w, alpha = 1e-3, 0.3
     motion = jl.simulate(by_formula, 0.0, 0.0, [0.0, 5.0, 10.0], {"m": 2.0, "alpha": alpha, "mu": 0.4}, friction=jl.Regularised(w))
@@ -364,6 +369,7 @@ def test_second_derivatives_of_a_stopping_point():
     np.testing.assert_allclose(jax.hessian(stop, (0, 1))(2.0, 0.7), jax.hessian(exact, (0, 1))(2.0, 0.7), rtol=1e-6)
 
 
+@pytest.mark.slow
 def test_the_capstan():
     """A rope over a rough drum, half a turn: it slides steadily where one end pulls e^{μπ} times as hard as the other.
 
@@ -401,6 +407,7 @@ def test_the_capstan():
     assert run(1.1 * m2 * ratio).qddot[0, 1] < -0.1  # heavier, it runs down
 
 
+@pytest.mark.slow
 def test_friction_beside_a_constraint_of_constant_rows():
     """Up and down a slope x = y of constant rows, whose factors are plain numbers: closed form."""
     slope = jl.System(

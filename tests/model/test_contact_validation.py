@@ -59,6 +59,7 @@ def test_walls_that_close_in():
     np.testing.assert_array_equal(np.isfinite(motion.q), [True, True, True, False])
 
 
+@pytest.mark.slow
 def test_a_start_inside_an_obstacle_is_put_on_it():
     motion = jl.simulate(ball, -0.25, 0.0, jnp.array([0.0, 1.0]))
     np.testing.assert_allclose(motion.q, 0, atol=1e-15)
@@ -66,6 +67,7 @@ def test_a_start_inside_an_obstacle_is_put_on_it():
     assert np.all(motion.contacts["floor"].closed)
 
 
+@pytest.mark.slow
 def test_a_start_inside_of_what_has_no_outside():
     cage = jl.System(fall, unilateral={"below": lambda q: -1 - q**2})
     motion = jl.simulate(cage, 0.1, 0.0, jnp.array([0.0, 1.0]), throw=False)
@@ -115,6 +117,7 @@ def test_a_system_with_contacts_is_pickled():
     assert motion.contacts["floor"].closed[-1] and "floor" in repr(again)
 
 
+@pytest.mark.slow
 def test_a_motion_is_saved_and_sliced(tmp_path):
     motion = jl.simulate(ball, 1.0, 0.0, jnp.linspace(0, 1, 11))
     motion.save(tmp_path / "ball.npz")

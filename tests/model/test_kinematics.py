@@ -33,6 +33,7 @@ def test_the_vehicle_three_ways_is_one_motion(way):
         np.testing.assert_allclose(other.qdot[name], reduced.qdot[name], rtol=1e-9, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_what_the_parts_of_the_vehicle_pass_to_each_other():
     """Newton–Euler, part by part, from the reduced motion: the forces on axles, struts and treads."""
     p, reduced = vehicle.params, motion("system")

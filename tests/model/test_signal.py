@@ -229,6 +229,7 @@ def ride(inputs, samples):
     return jl.simulate(belt, 0.0, 0.0, samples, {name: Signal(*given) for name, given in inputs.items()}, rtol=1e-9, atol=1e-11)
 
 
+@pytest.mark.slow
 def test_a_block_breaks_away_and_sticks_where_inputs_jump():
     motion, (x, v, stuck) = ride(INPUTS, ALONG), exact_ride(INPUTS, ALONG)
     np.testing.assert_allclose(motion.q, x, atol=1e-9)
@@ -253,6 +254,7 @@ def check_derivative_of_a_ride(inputs, derivative):
             np.testing.assert_allclose(found[name][i], slope, atol=3e-7, err_msg=f"{name}[{i}]")
 
 
+@pytest.mark.slow
 def test_the_derivative_of_a_ride_by_all_values():
     check_derivative_of_a_ride(INPUTS, jax.grad)
 
@@ -288,6 +290,7 @@ def test_the_energy_that_a_jump_brings_in_is_counted():
     assert np.ptp(motion.energy()) > 1 and np.max(np.abs(motion.balance())) < 1e-8
 
 
+@pytest.mark.slow
 def test_a_prescribed_position_is_followed_and_its_force_measured():
     """q = u(t), a cubic signal: λ = m ü, with ü by SciPy."""
     follower = jl.System(lambda qdot, m: 0.5 * m * qdot**2, holonomic={"drive": lambda t, q, u: q - u(t)})
@@ -316,6 +319,7 @@ def test_vmap_over_signals_with_times_of_their_own_equals_the_loop(interpolation
     np.testing.assert_array_equal(jax.jit(jax.vmap(lambda u: driven(u, samples).q))(signals), together)
 
 
+@pytest.mark.slow
 def test_vmap_over_rides_equals_the_loop():
     samples = np.linspace(0, 8, 9)
     scaled = [{name: (times, s * values) for name, (times, values) in INPUTS.items()} for s in (1.0, 1.3, 0.7)]

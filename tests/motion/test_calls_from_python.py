@@ -54,6 +54,7 @@ def counts():
     return json.loads(subprocess.run([sys.executable, "-c", COUNTED], capture_output=True, text=True, check=True).stdout)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("call, most", [("simulate", 300), ("acceleration", 150), ("fit", 5700), ("iteration", 300)])
 def test_python_does_little(counts, call, most):
     """One conversion by JAX is some 90 calls of functions: were each number converted by itself, `simulate` would make 4000; were each

@@ -49,6 +49,7 @@ def end_of_bouncing(h, e, g):
     return jnp.sqrt(2 * h / g) * (1 + e) / (1 - e)
 
 
+@pytest.mark.slow
 def test_impacts_of_a_bouncing_ball():
     """Their number, times and impulses, and the flights between them."""
     ts = jnp.linspace(0, 4.0, 401)
@@ -66,6 +67,7 @@ def test_impacts_of_a_bouncing_ball():
     assert not np.any(floor.closed) and not np.any(motion.multipliers["floor"])
 
 
+@pytest.mark.slow
 def test_rest_after_infinitely_many_impacts():
     """At t∞, on the floor for a thousand seconds, which then bears the weight."""
     motion = jl.simulate(ball, H, 0.0, jnp.array([0.0, 10.0, 500.0, 1000.0]), PARAMS)
@@ -123,6 +125,7 @@ def test_many_balls():
     assert np.all(motions.contacts["floor"].closed[resting, -1]) and np.sum(resting) > 100 and np.sum(clear) > 100
 
 
+@pytest.mark.slow
 def test_single_precision():
     motion = bounce(H, E, G, 2.0, jnp.float32)
     n = 3
@@ -143,6 +146,7 @@ def test_a_fit_of_the_restitution_and_the_height():
         assert abs(found.params[name] - PARAMS[name]) < 4 * found.standard_errors[name] < 1e-2
 
 
+@pytest.mark.slow
 def test_a_table_that_shakes():
     """The 1:1 motion: an impact each period at one phase, with g T/2 = ω a cos φ (1 − e)/(1 + e)."""
     table = jl.System(
@@ -162,6 +166,7 @@ def test_a_table_that_shakes():
     np.testing.assert_allclose(motion.q[1::2], a * np.sin(phase) + v * T / 2 - G * T**2 / 8, rtol=1e-8)
 
 
+@pytest.mark.slow
 def test_a_pendulum_against_a_wall():
     """Against SciPy's events, with the work that the wall takes."""
     pendulum = jl.System(
@@ -195,6 +200,7 @@ def test_a_pendulum_against_a_wall():
     assert np.max(np.abs(motion.balance())) < 1e-9
 
 
+@pytest.mark.slow
 def test_a_mass_on_a_string():
     """It flies, the string goes tight at once, it swings: a contact that pulls the mass inwards."""
     string = jl.System(lambda q, qdot: 0.5 * (qdot @ qdot) - 9.81 * q[1], unilateral={"string": lambda q, l: l - jnp.linalg.norm(q)})

@@ -71,6 +71,7 @@ def along(t, v, a, impacts):
     return np.array(course[1:]), np.array([middle_of_a_flight(*at, a)[0] for at in course])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("a", "n"), [(0.014, 1), (0.024, 2)])
 def test_a_periodic_motion_on_a_shaking_table(a, n):
     """Holmes (1982): stable where the eigenvalues of its return map are; after 20 impacts the ball is still on it."""
@@ -100,6 +101,7 @@ def test_a_motion_of_twice_the_period(a, n):
     np.testing.assert_allclose(found, expected, rtol=1e-9)
 
 
+@pytest.mark.slow
 def test_derivatives_of_an_impact_on_a_shaking_table():
     """Of the 20th impact by the start, in a motion that forgets it, and of the third: products of the return map's derivatives."""
     a = 0.018
@@ -146,6 +148,7 @@ def sliding(v, r, below):
     return time, np.array(direct) + np.array([0.0, time / r]) + at_end * r / np.sqrt(squared(end))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("v", "r", "below", "T"),
     [(0.1, 0.4, False, 1.0), (1.1, 0.4, False, 0.5), (3.4, 0.4, True, 0.6), (4.2, 0.4, True, 0.5)],

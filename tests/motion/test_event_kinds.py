@@ -24,6 +24,7 @@ def polynomial(q, roots):
 crossing = jl.System(free, events={"zero": jl.Event(polynomial), "up": jl.Event(polynomial, direction=jl.Rising())})
 
 
+@pytest.mark.slow
 def test_many_random_zeros_within_single_steps():
     """A free particle, which takes as long steps as it may: 400 polynomials with five zeros, some of them hardly apart."""
     rng = np.random.default_rng(3)
@@ -55,6 +56,7 @@ kinds = jl.System(
 )
 
 
+@pytest.mark.slow
 def test_kinds():
     """In one motion: pairs in one step, periods, times (not that of the start), and one that another takes across zero."""
     motion = jl.simulate(kinds, 0.0, 1.0, jnp.array([0.0, 5.0]), {"T": 0.7})
@@ -74,6 +76,7 @@ def test_kinds():
     np.testing.assert_allclose(last(0.7), 7.0, rtol=1e-12)
 
 
+@pytest.mark.slow
 def test_events_of_one_motion():
     """`simulate(..., events=...)`: in place of those of the system; the end of it is the event's, and a success."""
     end = {"end": jl.Event(lambda q, L: q - L, stop=True)}
@@ -113,6 +116,7 @@ ball = jl.System(
 )
 
 
+@pytest.mark.slow
 def test_impacts():
     """Impacts are events, and take witnesses of the velocity across zero; derivatives of their times in the height."""
     ts = jnp.linspace(0, 2.0, 21)
@@ -149,6 +153,7 @@ moving = jl.System(
 )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("T", [0.9, 2.0])
 def test_what_moves_on_behind_the_end(T):
     """A motion that has ended is not hit by a table that has not."""
@@ -166,6 +171,7 @@ belt = jl.System(  # under a block, which it reverses while it slides
 )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("mu", [0.4, 1.6])
 def test_friction_and_events(mu):
     """A block on a belt, from rest: with little friction it slides when the belt reverses, with more it has been caught before."""
@@ -186,6 +192,7 @@ pushed = jl.System(
 )
 
 
+@pytest.mark.slow
 def test_an_event_that_makes_an_impact():
     """What lies on the floor is pushed into it: it leaves with half the speed, and the impact is an event, too."""
     motion = jl.simulate(pushed, 0.0, 0.0, jnp.array([0.0, 0.45, 0.55]))
@@ -195,6 +202,7 @@ def test_an_event_that_makes_an_impact():
     np.testing.assert_allclose(motion.events["click"].qdot[0], 0.0, atol=1e-12)  # before all that happens there
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("single_precision")
 @pytest.mark.filterwarnings("ignore:jaxlag runs in single precision")
 def test_single_precision_under_vmap():

@@ -18,6 +18,7 @@ def oscillator(q, qdot, c):
 TIMES = np.linspace(0, 10, 21)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("direction", "first"), [(jl.Falling(), 0), (jl.Rising(), 1), (jl.Either(), None)], ids=["falling", "rising", "either"]
 )
@@ -37,6 +38,7 @@ def test_turning_points_are_counted(direction, first):
 turning = jl.System(oscillator, events={"turn": jl.Event(lambda qdot: qdot)})
 
 
+@pytest.mark.slow
 def test_derivatives_of_the_time_of_an_event():
     """t = 5π/4 ω⁻¹ 2: forward, reverse and of second order."""
     third = lambda c: jl.simulate(turning, 0.0, 1.0, jnp.array([0.0, 10.0]), {"c": c}, rtol=1e-11, atol=1e-13).events["turn"].ts[2]
@@ -57,6 +59,7 @@ engaging = jl.System(  # a second spring beyond q = 0.3, which stays engaged; an
 )
 
 
+@pytest.mark.slow
 def test_springs_that_engage_and_the_end():
     """A state that an event changes: against SciPy's events; the energy that it brings along is in the balance."""
     T = 7.3
@@ -81,6 +84,7 @@ def test_springs_that_engage_and_the_end():
     assert np.nanmax(np.abs(motion.balance())) < 1e-9
 
 
+@pytest.mark.slow
 def test_a_rope_that_breaks():
     """A rod that breaks where its force reaches a limit: then a parabola. Differentiated by the limit."""
     rope = jl.System(
@@ -109,6 +113,7 @@ def test_a_rope_that_breaks():
     np.testing.assert_allclose(jax.jacfwd(end)(20.0), (by_hand(20.001) - by_hand(19.999)) / 0.002, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_given_times():
     """Pushes at three times, and what is true at the start already."""
     pushed = jl.System(
@@ -134,6 +139,7 @@ def test_many_members():
     np.testing.assert_allclose(motions.events["turn"].ts[:, 0], np.pi / 2 / np.sqrt(c), rtol=1e-7)
 
 
+@pytest.mark.slow
 def test_clear_errors():
     for make, said in (
         (lambda: jl.Event(lambda q: q, direction="up"), "`direction` must be"),

@@ -85,6 +85,7 @@ LOADS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", LOADS)
 def test_a_stuck_block_under_a_load_of_the_time_alone(name):
     """A mode without an error let steps grow until a load had come and gone: 12 of 64 transitions, and none of the pulse's."""
@@ -102,6 +103,7 @@ def shared_load(t, q, rate):
 equal_blocks = jl.System(T, dissipation=lambda qdot: jnp.sum(jnp.abs(qdot)), force=shared_load)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("solver", [None, diffrax.Kvaerno5()], ids=["explicit", "implicit"])
 def test_equal_blocks_break_away_together(solver):
     found = jl.simulate(equal_blocks, jnp.zeros(3), jnp.zeros(3), jnp.linspace(0, 3, 31), {"rate": 0.0}, solver=solver)
@@ -109,6 +111,7 @@ def test_equal_blocks_break_away_together(solver):
     assert found.stats["transitions"][-1] == 3
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("rate", [3.0, 7.0])
 def test_equal_blocks_stop_together(rate):
     """Each moves as one alone does."""
@@ -125,6 +128,7 @@ def brakes(qdot, first, second, radius):
 braked = jl.System(T, dissipation=brakes, force=lambda t: 3 * jnp.sin(t))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("first", "second", "radius"), [(1.0, 1.0, 0.5), (0.2, 4.0, 0.3), (1.5, 0.0, 1.0)])
 def test_two_brakes_on_one_shaft_hold_what_they_hold_together(first, second, radius):
     """Which of them holds how much is not determined; the motion is that of one brake with the sum of their bounds."""
@@ -136,6 +140,7 @@ def test_two_brakes_on_one_shaft_hold_what_they_hold_together(first, second, rad
     assert np.all(np.abs(force) <= np.array([first, second]) * (1 + 1e-9))
 
 
+@pytest.mark.slow
 def test_an_element_rests_by_its_own_scale():
     """Beside a rotor of 1e5 rad/s a slip of 1e-3 m/s counted as none where another element broke away."""
     three = jl.System(
@@ -152,6 +157,7 @@ def test_an_element_rests_by_its_own_scale():
 turning = jl.System(T, dissipation=lambda t, qdot, wave, rate: (1 - rate * t + wave * jnp.cos(6 * t)) * jnp.abs(qdot), force=lambda q, F: F)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("wave", "rate", "F", "v0"), [(0.0, 0.5, 0.0, 5.0), (0.0, 0.5, 0.1, 0.0), (1.01, 0.0, 0.0, 5.0)])
 def test_a_bound_that_turns_negative_ends_the_motion(wave, rate, F, v0):
     found = jl.simulate(turning, 0.0, v0, jnp.linspace(0, 4, 41), {"wave": wave, "rate": rate, "F": F}, throw=False)
@@ -196,6 +202,7 @@ def test_random_blocks(seed, monkeypatch):
     assert error < 1e-7 + off
 
 
+@pytest.mark.slow
 def test_friction_stands_in_few_places_of_a_program():
     """A motion of a bead on a rod with a rough joint; with friction written out wherever it is asked for it takes 22 800 lines."""
     rod, start = (

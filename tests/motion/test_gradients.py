@@ -46,6 +46,7 @@ def test_derivatives_along_directions(number):
     assert {e.outvars[0].aval.shape for e in products} == ({()} if number == 1 else {(), (number,)})
 
 
+@pytest.mark.slow
 def test_vehicle_with_respect_to_every_parameter_and_initial_value():
     inputs = (vehicle.q0, vehicle.qdot0, vehicle.params)
     x, unravel = ravel_pytree(jax.tree.map(jnp.asarray, inputs))
@@ -58,6 +59,7 @@ def test_vehicle_with_respect_to_every_parameter_and_initial_value():
         np.testing.assert_allclose(derivative(default)(x) * scale[None] / size, expected / size, atol=1e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("solver", "coordinates"), [(diffrax.Tsit5(), "polar"), (jl.Dop853(), "cartesian")])
 def test_variational_equations_give_what_the_integrator_would_differentiated(monkeypatch, solver, coordinates):
     """A scheme for ẏ = f, differentiated, is that scheme for δẏ = ∂f δy, with the same steps: equal to rounding."""
@@ -73,6 +75,7 @@ def test_variational_equations_give_what_the_integrator_would_differentiated(mon
     np.testing.assert_allclose(varied, jax.jacfwd(motion)(x), rtol=1e-10, atol=1e-10)
 
 
+@pytest.mark.slow
 def test_second_variations_give_what_the_integrator_would_differentiated_twice(monkeypatch):
     """Of multipliers, accelerations and states, by the start, parameters and both; with the same steps, equal to rounding."""
 
@@ -108,6 +111,7 @@ def cartesian_end(l):
     return jl.simulate(ROD, *start, jnp.linspace(0, 5, 11), {"m": 1.0, "g": 9.81, "l": l}, rtol=1e-10, atol=1e-12).q[-1, 0]
 
 
+@pytest.mark.slow
 def test_rod_length_that_stands_in_a_constraint_alone():
     """dx(5 s)/dl against the angle form, where l is a plain parameter, in closed form with elliptic functions, and differences."""
 
@@ -140,6 +144,7 @@ def oscillator_exact(x0, v0, c, end):
 AT = (1.2, 0.4, 5.0, 2.5)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "derivative", [jax.hessian, lambda f, a: jax.jacrev(jax.jacrev(f, a), a), lambda f, a: jax.jacfwd(jax.jacfwd(f, a), a)]
 )
@@ -175,6 +180,7 @@ def test_vmap_of_gradients_and_gradients_of_vmap():
     np.testing.assert_allclose(jax.vmap(jax.jacfwd(ends))(c), expected, rtol=1e-7)
 
 
+@pytest.mark.slow
 def test_many_parameters_take_the_other_road(monkeypatch):
     """With more inputs than the limit a cotangent is pulled back alone; value and both modes stay the same."""
     outcome = lambda x: oscillator_end(x[0], x[1], x[2], 2.5)
@@ -194,6 +200,7 @@ def test_many_parameters_take_the_other_road(monkeypatch):
         jax.clear_caches()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("adjoint, derivative", [(diffrax.RecursiveCheckpointAdjoint(), jax.grad), (diffrax.ForwardMode(), jax.jacfwd)])
 def test_an_adjoint_of_diffrax_can_be_asked_for(adjoint, derivative):
     ts, p = jnp.linspace(0, 1, 5), pendulum.params
@@ -201,6 +208,7 @@ def test_an_adjoint_of_diffrax_can_be_asked_for(adjoint, derivative):
     np.testing.assert_allclose(derivative(lambda l: end(l, adjoint=adjoint))(1.0), jax.grad(end)(1.0), rtol=1e-9)
 
 
+@pytest.mark.slow
 def test_redundant_constraints_have_the_gradients_of_single_ones():
     rod = pendulum.cartesian_rod
     twice = jl.System(pendulum.cartesian_lagrangian, holonomic={"rod": rod, "again": lambda q, l: 2 * rod(q, l)})
@@ -215,6 +223,7 @@ def test_redundant_constraints_have_the_gradients_of_single_ones():
         np.testing.assert_allclose(derivative(end, 1)(twice, 1.0), derivative(end, 1)(pendulum.cartesian, 1.0), rtol=1e-8)
 
 
+@pytest.mark.slow
 def test_nonholonomic_gradients():
     edge = lambda q, qdot: qdot[0] * jnp.sin(q[2]) - qdot[1] * jnp.cos(q[2])
     system = jl.System(

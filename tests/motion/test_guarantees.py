@@ -69,6 +69,7 @@ def test_random_constraints_are_satisfied_or_refused(kind, e):
         np.testing.assert_allclose(qddot, expected, rtol=0, atol=rounding * (1 + np.max(np.abs(expected))))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind, e", [("near", 1e-3), ("near", 1e-6), ("same", 0.0), ("against", 1.0), ("against", 1e-3)])
 def test_random_constraints_are_kept_or_the_motion_fails(kind, e):
     """Exact, or a failure by name; where rows are nearly the same, a tenth is refused, as more is asked of them than of all else."""
@@ -89,6 +90,7 @@ def test_random_constraints_are_kept_or_the_motion_fails(kind, e):
     assert refused == 20 if kind == "against" else refused <= (2 if e == 1e-6 else 0)
 
 
+@pytest.mark.slow
 def test_one_of_many_that_contradicts_itself_says_so():
     cases = [rows(7, "same", 0.0), rows(7, "against", 1.0)]
     many = jax.tree.map(lambda *leaves: jnp.stack(leaves), *cases)
@@ -105,6 +107,7 @@ two_bars = jl.System(
 crank = jl.System(lambda qdot: 0.5 * qdot**2, holonomic=lambda t, q: jnp.cos(q) - (0.5 + t))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("system, q0", [(two_bars, np.array([0.3, -0.6])), (crank, 1.0)])
 def test_a_mechanism_driven_beyond_its_reach(system, q0):
     """At t = 1/2 the end is as far away as it can be."""
@@ -117,6 +120,7 @@ def test_a_mechanism_driven_beyond_its_reach(system, q0):
 ramp = {"a": 0.3, "b": 0.1, "x": 0.0}
 
 
+@pytest.mark.slow
 def test_a_coordinate_that_a_velocity_constraint_alone_holds():
     """b has no inertia and goes along with a; x is beside them, on a constraint of positions."""
     system = jl.System(

@@ -26,6 +26,7 @@ def after_the_bounce(v, spin, mu):
     return jnp.stack([v + push / SPHERE["m"], spin + 2.5 * push / (SPHERE["m"] * SPHERE["r"])])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("v", "spin"), [(3.0, 0.0), (0.5, 0.0), (0.2, -30.0), (-2.0, 15.0)])
 def test_a_ball_with_spin(v, spin):
     """Coulomb's friction takes the impulses for the forces: slip or grip within the impact, with the balance of energy."""
@@ -51,6 +52,7 @@ balls = jl.System(
 )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("gaps", "after"), [((0, 0, 0), (-0.6, 0.4, 0.4, 0.4, 0.4)), ((1e-3, 2e-3, 1e-3), (0, 0, 0, 0, 1))], ids=["touching", "apart"]
 )
@@ -83,6 +85,7 @@ block = jl.System(
 )
 
 
+@pytest.mark.slow
 def test_a_rocking_block():
     """Housner: each impact leaves 1 − 1.5 sin²α of the rate; and the times between impacts by quadrature."""
     tilt = 0.1
@@ -118,6 +121,7 @@ rod = jl.System(  # of length 2 and mass 1, on its lower end
 )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("e", "gains"), [(0.99, True), (0.1, False)])
 def test_kanes_paradox_is_named(e, gains):
     """A rod that grips within the impact, of which Newton's law would make more energy than there was."""
@@ -137,6 +141,7 @@ def test_kanes_paradox_is_named(e, gains):
         np.testing.assert_allclose(velocity, after, atol=1e-2)  # it turns on, for 9 ms
 
 
+@pytest.mark.slow
 def test_the_pecking_woodpecker():
     """Glocker's toy, linearised: the impacts of one cycle, and how far it falls in it.
 

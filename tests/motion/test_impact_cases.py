@@ -74,6 +74,7 @@ woodpecker = jl.System(
 )
 
 
+@pytest.mark.slow
 def test_the_woodpecker_against_events():
     """A whole cycle: it slides, sticks and hangs free; the sleeve strikes above, the beak, the sleeve above again, and below twice."""
     times = [t for t, *_ in by_hand.simulated(0.15, [])[1]]

@@ -24,6 +24,7 @@ SMOOTH = jl.System(lagrangian, dissipation={"air": lambda qdot, b: 0.5 * b * qdo
 DRY = jl.System(lagrangian, dissipation={"joint": lambda q, qdot, F, l: F * jnp.abs(q[0] * qdot[1] - q[1] * qdot[0]) / l}, holonomic=rod)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "case", [(SMOOTH, jl.Dop853()), (SMOOTH, diffrax.Kvaerno5()), (DRY, jl.Dop853())], ids=["smooth", "implicit", "dry"]
 )
@@ -38,6 +39,7 @@ def test_steps_and_samples_are_those_of_diffrax(case):
         np.testing.assert_allclose(got, wanted, rtol=0, atol=1e-13)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("system", [SMOOTH, DRY], ids=["smooth", "dry"])
 def test_derivatives_are_those_of_diffrax(system):
     """Of a position between two steps, by the length of the rod, which moves the start as well, and by the damping or friction."""
@@ -65,6 +67,7 @@ HELD = jl.System(lagrangian, force={"wind": lambda t, u: jnp.array([1.0, 0.0]) *
 STEPPED = PARAMS | {"u": jl.Signal(np.linspace(0, 4, 9), np.arange(9.0) - 4, jl.ZeroOrderHold())}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("case", [(SMOOTH, PARAMS), (DRY, PARAMS), (HELD, STEPPED)], ids=["smooth", "dry", "input"])
 def test_first_and_last_times_may_be_repeated_inside_a_program(case):
     """As the delay of a sensor has it, and padding: they show the same state."""

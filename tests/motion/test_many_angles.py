@@ -38,6 +38,7 @@ def motion():
     return jl.simulate(CHAIN, START, np.zeros(LINKS), TS, PARAMS, rtol=1e-9, atol=1e-9, works=True)
 
 
+@pytest.mark.slow
 def test_motion_is_that_of_scipy(motion):
     field = lambda t, y: np.append(y[LINKS:], by_hand(y[:LINKS], y[LINKS:], PARAMS))
     expected = solve_ivp(field, (0, 1), np.append(START, np.zeros(LINKS)), "DOP853", TS, rtol=1e-10, atol=1e-10)

@@ -65,6 +65,7 @@ def test_acceleration_and_rod_forces():
     np.testing.assert_allclose(found.multipliers["rods"], multipliers, rtol=0, atol=1e-11 * np.abs(multipliers).max())
 
 
+@pytest.mark.slow
 def test_motion_is_that_of_scipy(motion):
     def field(t, y):
         q, v = y.reshape(2, LINKS, 2)
@@ -117,6 +118,7 @@ def nearest(shift):
     return jnp.sum(jnp.sin(q) + v**2)
 
 
+@pytest.mark.slow
 def test_a_start_is_differentiated():
     """Off the rods by some per cent, where curvature counts."""
     h = 1e-4
@@ -139,6 +141,7 @@ def test_a_start_in_the_metric_of_inertia():
         assert np.abs(left).max() < 1e-10
 
 
+@pytest.mark.slow
 def test_drag_is_found_by_a_fit(motion):
     recorded = motion.q[:, -1]
     experiment = jl.Experiment(TS, recorded, Q0, np.zeros_like(Q0), observe=lambda q: q[-1])
@@ -147,6 +150,7 @@ def test_drag_is_found_by_a_fit(motion):
     np.testing.assert_allclose([found.params["b"], found.params["g"]], [PARAMS["b"], GRAVITY], rtol=1e-5)
 
 
+@pytest.mark.slow
 def test_several_chains_at_once():
     drags = jnp.array([0.1, 0.3, 1.0])
     found = jl.simulate_many(CHAIN, Q0, np.zeros_like(Q0), TS[:3], PARAMS | {"b": drags}, over=("b",), rtol=1e-9, atol=1e-9)
@@ -187,6 +191,7 @@ def net(rows=KNOTS):
     return jl.System(weight, holonomic={"rods": lambda q: lengths(q) - start}), q, lengths
 
 
+@pytest.mark.slow
 def test_a_net_against_a_sparse_factorisation():
     """q̈ and the forces in 264 rods between 142 knots by SciPy's `splu` of the whole saddle point."""
     system, q, lengths = net()
@@ -207,6 +212,7 @@ def test_a_net_against_a_sparse_factorisation():
 EVEN = {"m": 1.0, "l": 1.0, "b": 0.0, "g": GRAVITY}
 
 
+@pytest.mark.slow
 def test_a_hanging_rope_swings_as_laguerre_says():
     """Frequencies ω² = g ξ/l with Lₙ(ξ) = 0 (Rouse–Laguerre), from the state in which it rests."""
     hanging = np.stack([np.zeros(LINKS), -np.arange(1.0, LINKS + 1)], axis=1)

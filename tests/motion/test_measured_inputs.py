@@ -76,6 +76,7 @@ def test_a_held_force_against_the_exact_motion(ts):
     np.testing.assert_allclose(motion.qddot, (held(ts) - B * found[:, 1]) / M, atol=1e-11)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("solver", [jl.Dopri5(), None], ids=["Dopri5", "Dop853"])
 def test_dry_friction_under_a_held_force_against_the_exact_motion(solver):
     ts = SAMPLES["coarse"]
@@ -98,6 +99,7 @@ def end(params, **options):
     return jl.simulate(CART, 0.1, 0.0, SAMPLES["coarse"], params, **options).q[-1]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("derivative", [jax.jacfwd, jax.jacrev])
 def test_derivatives_in_parameters(derivative):
     found = derivative(lambda b: end({"m": M, "b": b, "u": HELD}))(B)
@@ -108,6 +110,7 @@ def test_derivatives_in_parameters(derivative):
     np.testing.assert_allclose(second, (other[0] - 2 * end(PARAMS | {"u": HELD}) + other[1]) / h**2, rtol=1e-3)
 
 
+@pytest.mark.slow
 def test_the_gradient_in_all_values_of_the_signal():
     """More of them than a forward pass takes; the motion is linear in each."""
     gradient = jax.grad(lambda values: end(PARAMS | {"u": jl.Signal(TIMES, values)}))(jnp.asarray(VALUES))
@@ -139,6 +142,7 @@ def test_a_delay_where_every_sample_is_at_a_jump(derivative, solver):
     np.testing.assert_allclose(derivative(late)(0.0), expected, rtol=2e-5)
 
 
+@pytest.mark.slow
 def test_a_delay_and_the_start_among_more_inputs_than_a_forward_pass_takes():
     """In reverse through the loop: by the time of the start and the delay, with all values of the signal."""
     ts = jnp.asarray(SAMPLES["coarse"])
@@ -218,6 +222,7 @@ def test_a_held_speed_of_a_belt_takes_the_mass_along():
     np.testing.assert_allclose(total, 0.5 * M * (9 - 1), rtol=1e-12)
 
 
+@pytest.mark.slow
 def test_a_grip_on_a_ramp_that_stops():
     """x follows u(t), a ramp that ends: its velocity jumps, by an impulse of the grip; y hangs on a spring beside."""
     system = jl.System(
@@ -255,6 +260,7 @@ def test_a_grip_on_a_ramp_that_stops():
         np.testing.assert_allclose(of, exact(c, 0.0)[0], rtol=0, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_single_precision():
     with jax.enable_x64(False):
         found = jl.simulate(CART, np.float32(0), np.float32(0), SAMPLES["coarse"], PARAMS | {"u": jl.Signal(TIMES, VALUES)}).q

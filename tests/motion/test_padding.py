@@ -28,6 +28,7 @@ def test_sizes():
     np.testing.assert_array_equal(sizes[:15], np.arange(2, 17))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("interpolation", [jl.ZeroOrderHold(), jl.Linear(), jl.Cubic()])
 def test_a_motion_is_that_without_padding(interpolation):
     """Compared with the program that is compiled for its own length within `jit`, in all that a motion shows."""
@@ -48,6 +49,7 @@ def test_its_derivatives_are_those_without_padding(derivative, tolerance):
     np.testing.assert_allclose(derivative(work)(0.3), jax.jit(derivative(work))(0.3), rtol=1e-8)
 
 
+@pytest.mark.slow
 def test_many_lengths_compile_few_programs():
     """The motions of a loop over recordings; what cuts them to length is compiled for each, in hundredths of a second."""
     names = []

@@ -98,6 +98,7 @@ def rods():
     return motions, phi, mu, e, u, rate, slip
 
 
+@pytest.mark.slow
 def test_impacts_of_a_rod(rods):
     """In all of them the laws have one solution, also in Painlevé's region, and it is taken; where it gains energy, that is the reason."""
     motions, phi, mu, e, u, *_ = rods

@@ -69,6 +69,7 @@ def by_enumeration(law, angle, v, mu, e):
     return v
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("law", [jl.Newton(), jl.Poisson()], ids=["Newton", "Poisson"])
 def test_rods_that_strike_the_floor(law):
     """At random: angle, velocities, friction, restitution. By Poisson's law no energy is gained, by Newton's it may be (Kane)."""
@@ -97,6 +98,7 @@ def test_rods_that_strike_the_floor(law):
     assert compared > 250 and (gaining > 0) == (law == jl.Newton())
 
 
+@pytest.mark.slow
 def test_derivatives():
     """Of the velocity after an impact with friction, forward and reverse, in e, mu and the velocity before; against differences by hand."""
     angle, v = 1.1, np.array([0.7, -1.0, 0.4])
@@ -113,6 +115,7 @@ def test_derivatives():
     np.testing.assert_allclose(jax.jacrev(after)(jnp.asarray(x)), expected, atol=1e-8)
 
 
+@pytest.mark.slow
 def test_balls_in_contact():
     """Three equal balls in a row, the first strikes; only the last contact gives anything back. By Newton's law nothing, for it did not
     approach; by Poisson's the third of the momentum that it has passed on in the compression, and then the first two meet again.

@@ -86,6 +86,7 @@ def close(found, expected, tolerance):
     np.testing.assert_allclose(found, expected, rtol=0, atol=tolerance * max(1.0, np.max(np.abs(expected), initial=0.0)))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("n, m", [(2, 1), (3, 1), (4, 2), (6, 2)])
 @few
 @given(data=st.data())
@@ -121,6 +122,7 @@ def simulated(system, q0, v0, params):
 turned = jl.substitute(system, lambda q, T: T @ q)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("n, m", [(2, 1), (4, 2)])
 @few
 @given(data=st.data())
@@ -157,6 +159,7 @@ first_kind = jl.System(lagrangian, **SLOTS, holonomic={"solved": unsolved})
 second_kind = jl.substitute(free, all_coordinates)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("n, m", [(3, 1), (4, 2)])
 @few
 @given(data=st.data())

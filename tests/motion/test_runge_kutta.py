@@ -51,6 +51,7 @@ def test_orders(solver, order, steps):
     assert np.log2(coarse.max() / fine.max()) == pytest.approx(order, abs=1.0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("solver", SCHEMES, ids=NAMES)
 def test_all_of_diffrax_can_be_used(solver):
     """Pytrees, dense output, an event, reverse mode, and a jump of the right-hand side that is stepped on, against closed forms."""

@@ -106,6 +106,7 @@ def moved(p):
     return weighted(exactly(AWAY, p, p["x0"], p["v0"])[0])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("derivative", [jax.jacfwd, jax.grad])
 @pytest.mark.parametrize("machine", MACHINES)
 def test_derivatives_in_gains_plant_period_and_start(machine, derivative):
@@ -120,6 +121,7 @@ def test_derivatives_in_gains_plant_period_and_start(machine, derivative):
         np.testing.assert_allclose(found[name] * everything[name], (up - down) / 2e-6, rtol=1e-5, atol=2e-9, err_msg=name)
 
 
+@pytest.mark.slow
 def test_second_derivatives_in_a_gain_and_the_mass():
     """Within the limits of the amplifier, so that differences of the second order hold."""
     scaled = lambda x: FREE_PARAMS | {"limit": 100.0, "kp": FREE_PARAMS["kp"] * x[0], "M": FREE_PARAMS["M"] * x[1]}
@@ -143,6 +145,7 @@ def position_loop(t, q, speed, w, kp, xp=jnp):
     return 0.5 * w + 0.5 * (kp * (goal(t, xp) - q) - 0.003 * speed["u"])
 
 
+@pytest.mark.slow
 def test_two_controllers_of_different_periods_that_read_each_other():
     """Every 10 ms both are due, and neither sees yet what the other has just computed; ticks count from ts[0]."""
     loops = {
@@ -247,6 +250,7 @@ def test_a_controller_that_sets_a_speed():
     np.testing.assert_allclose(sum(motion.work().values()), speed**2 - speed[0] ** 2, rtol=0, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_many_machines_with_gains_and_periods_of_their_own():
     kp, period = jnp.array([80.0, 120.0, 160.0]), jnp.array([1e-3, 1.7e-3, 2.3e-3])
     expected = [exactly(AWAY, FREE_PARAMS | {"kp": k, "period": T})[0] for k, T in zip(kp, period, strict=True)]
@@ -265,6 +269,7 @@ def test_single_precision():
     np.testing.assert_allclose(motion.q, exactly(SAMPLES["some at ticks"], FREE_PARAMS)[0], rtol=0, atol=2e-5)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("system, params", MACHINES.values(), ids=MACHINES)
 def test_the_energy_balance_of_the_loop(system, params):
     motion = jl.simulate(system, *START, AWAY, params, works=True, **SHARP)
@@ -286,6 +291,7 @@ def test_the_acceleration_under_a_given_command_and_under_that_of_the_start():
     np.testing.assert_allclose(motion.qddot, expected, rtol=1e-10)
 
 
+@pytest.mark.slow
 def test_identification_in_the_loop():
     """Mass, oil and friction from noisy positions of a machine that its controller drives, from half as much and more."""
     names, ts, sigma = ("M", "Fv", "Fc"), AWAY, 2e-5

@@ -60,6 +60,7 @@ def within_jit(q, qdot, params):
     return jl.simulate(system, q, qdot, TS, params, throw=False)
 
 
+@pytest.mark.slow
 def test_random_starts_on_the_constraints_and_beside_them(searched):
     """The nearest state is as near as ten roundings."""
     random, nothing = np.random.default_rng(8), 0
@@ -78,6 +79,7 @@ def test_random_starts_on_the_constraints_and_beside_them(searched):
     assert nothing > 10  # of twenty that Newton's method has found: the others are off by more than some roundings
 
 
+@pytest.mark.slow
 def test_derivatives_of_a_start_that_is_not_searched_for(searched):
     """The start moves along with the length of the rod and the speed of its end: forward, reverse and twice, as within `jit`."""
     rod = jl.System(lambda q, qdot: 0.5 * (qdot @ qdot) - 9.81 * q[1], holonomic=lambda t, q, l, s: jnp.hypot(q[0], q[1]) - l - s * t)
@@ -101,6 +103,7 @@ def test_a_batch_is_put_on_the_constraints_member_by_member(searched):
     np.testing.assert_allclose(moved, [0, 1], atol=ROUNDING)
 
 
+@pytest.mark.slow
 def test_a_constraint_that_closes_over_what_is_differentiated_or_a_batch(searched):
     """Not seen among the arguments: the start moves along with the length all the same."""
 
@@ -165,6 +168,7 @@ def test_what_is_wrong_with_a_start_on_the_constraints_is_said_as_within_jit(sys
     assert bool(reasons[0] == reasons[1])
 
 
+@pytest.mark.slow
 def test_with_friction_in_the_joint(searched):
     """Coulomb's torque F l on a rod at rest, in two ways to know the start."""
     lagrangian = lambda q, qdot, g: 0.5 * (qdot @ qdot) - g * q[1]

@@ -17,6 +17,7 @@ from jaxlag.examples import pendulum, vehicle
 SHARP = {"solver": diffrax.Dopri8(), "rtol": 1e-11, "atol": 1e-12}
 
 
+@pytest.mark.slow
 def test_polar_and_cartesian_pendulum_are_the_same_motion():
     ts, p = jnp.linspace(0, 20, 401), pendulum.params
     polar = jl.simulate(pendulum.polar, *pendulum.polar_state(2.0, 0.0, p["l"]), ts, p, **SHARP)
@@ -85,6 +86,7 @@ def car_axis_constraints(t, q, r, w, L):
     return jnp.stack([xb * xl + yb * yl, (xl - xr) ** 2 + (yl - yr) ** 2 - L**2])
 
 
+@pytest.mark.slow
 def test_car_axis_problem():
     """IVP Test Set (Mazzia & Magherini, release 2.4, 2008), index 3: 18 published digits at t = 3, quadruple-precision GAMD."""
     system = jl.System(car_axis_lagrangian, holonomic={"axis": car_axis_constraints})
@@ -189,6 +191,7 @@ def test_consistent_state_is_the_nearest_in_the_metric_of_the_masses():
     np.testing.assert_allclose([q["r"], q["phi"], v["r"], v["phi"]], [1.0, 0.2, 0.0, 0.4], atol=1e-14)
 
 
+@pytest.mark.slow
 def test_consistent_state_far_from_a_curved_constraint():
     """Nearest point of a circle: l q/|q|, whose derivatives are known in closed form, at first and second order."""
     system = jl.System(lambda qdot: 0.5 * qdot @ qdot, holonomic=lambda q, l: q @ q - l**2)
@@ -247,6 +250,7 @@ def test_single_precision_works_and_warns_once(single_precision):
     np.testing.assert_allclose(np.hypot(motion.q["x"], motion.q["y"]), 1, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_coordinates_of_every_kind():
     from typing import NamedTuple
 

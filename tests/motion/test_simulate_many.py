@@ -45,6 +45,7 @@ def rods(lengths, g, end, common=None):
 AT = jnp.array([0.8, 1.0, 1.3]), 9.81, 1.0
 
 
+@pytest.mark.slow
 def test_constraints_and_steps():
     """Rods of different lengths, each start projected, as one by one."""
 
@@ -57,6 +58,7 @@ def test_constraints_and_steps():
         np.testing.assert_allclose(rods(*AT, common=common), one_by_one, rtol=1e-7)
 
 
+@pytest.mark.slow
 def test_gradients():
     """In what differs, in what is shared and in the times, by central differences; forward and reverse."""
     weights = jnp.arange(1.0, 7.0)
@@ -69,6 +71,7 @@ def test_gradients():
     np.testing.assert_allclose(jax.jvp(value, AT, direction)[1], along, rtol=1e-9)
 
 
+@pytest.mark.slow
 def test_dry_friction_takes_steps_of_its_own():
     """Blocks of different friction stop at v₀²/2μg, each at its own time."""
     block = jl.System(lambda qdot: 0.5 * qdot**2, dissipation=lambda qdot, mu: mu * 9.81 * jnp.abs(qdot))
@@ -123,6 +126,7 @@ print(float(jnp.max(jnp.abs(slopes + 1.5 * jnp.sin(3 * jnp.sqrt(c)) / jnp.sqrt(c
 """
 
 
+@pytest.mark.slow
 def test_on_eight_devices():
     """Thirteen members on eight devices, against cos √c t, and the gradient."""
     environment = os.environ | {"XLA_FLAGS": "--xla_force_host_platform_device_count=8"}

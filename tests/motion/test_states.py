@@ -88,6 +88,7 @@ def test_derivatives_in_the_lag_its_start_and_the_mass(derivative):
         np.testing.assert_allclose(found[name], expected, rtol=1e-7, atol=1e-9, err_msg=name)
 
 
+@pytest.mark.slow
 def test_second_derivatives_in_the_lag_and_the_mass():
     found = jax.hessian(lambda x: end({"m": x[0], "tau": x[1]}))(jnp.array([2.0, 0.2]))
     slopes = lambda m, tau: differences(exact_end, {"m": m, "tau": tau}, 1e-4)

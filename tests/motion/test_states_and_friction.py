@@ -3,6 +3,7 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 from scipy.integrate import solve_ivp
 
 import jaxlag as jl
@@ -89,6 +90,7 @@ def hunting(ts):
     return np.transpose([found[s] for s in ts])
 
 
+@pytest.mark.slow
 def test_a_cart_with_an_integrator_and_dry_friction_hunts():
     rail = lambda qdot, F_c, F_s, v_s: jl.dissipation.stribeck(qdot, F_c, F_s, v_s)
     system = jl.System(lambda qdot: qdot**2, dissipation={"rail": rail}, force=feedback, states=integrator)

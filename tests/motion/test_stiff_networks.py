@@ -64,6 +64,7 @@ def by_radau(n, ts):
 TS = np.linspace(0.0, 0.2, 3)
 
 
+@pytest.mark.slow
 def test_motion_is_that_of_scipy():
     found = simulated(SPRINGS, TS, rtol=1e-8, atol=1e-8, works=True)
     expected = by_radau(SPRINGS, TS)

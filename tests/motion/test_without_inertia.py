@@ -36,6 +36,7 @@ def by_hand(p):
     return np.array([expm(rates(**p) * t) @ [1.0, 0.3, 0.2] for t in TS]).T
 
 
+@pytest.mark.slow
 def test_maxwell_element():
     motion = jl.simulate(MAXWELL, Q0, V0, TS, P, works=True, **SHARP)
     x, v, z = by_hand(P)
@@ -50,6 +51,7 @@ def end(p, **more):
     return jnp.stack([motion.q["x"][-1], motion.qdot["z"][-1]])
 
 
+@pytest.mark.slow
 def test_gradients_of_the_maxwell_element():
     def exact(p):
         x, _, z = by_hand(p)
@@ -65,6 +67,7 @@ def test_gradients_of_the_maxwell_element():
         np.testing.assert_allclose(second[name][name], (moved(name, 1) - 2 * exact(P) + moved(name, -1)) / h**2, rtol=1e-5, atol=1e-5)
 
 
+@pytest.mark.slow
 def test_redundant_rows_beside_a_maxwell_element():
     """A mass of two halves, tied by two rows that say the same: λ of least norm, and together half of the spring's force."""
     tied = jl.System(
@@ -80,6 +83,7 @@ def test_redundant_rows_beside_a_maxwell_element():
     np.testing.assert_allclose(motion.multipliers["twice"], 2 * motion.multipliers["tie"], rtol=0, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_many_maxwell_elements():
     b = np.array([0.5, 0.7, 0.9])
     motions = jl.simulate_many(MAXWELL, Q0, V0, TS, P | {"b": b}, over=("b",), **SHARP)
@@ -89,6 +93,7 @@ def test_many_maxwell_elements():
         np.testing.assert_allclose(motions.qdot["z"][i], 3 / b_i * (x - z), rtol=0, atol=1e-8)
 
 
+@pytest.mark.slow
 def test_a_maxwell_element_is_identified():
     noise = np.random.default_rng(1).normal(size=TS.size) * 1e-3
     experiment = jl.Experiment(TS, {"x": by_hand(P)[0] + noise}, q0=Q0, qdot0=V0, observe=lambda q: {"x": q["x"]})
@@ -97,6 +102,7 @@ def test_a_maxwell_element_is_identified():
         assert abs(fit.params[name] - P[name]) < 3 * fit.standard_errors[name] < 0.1
 
 
+@pytest.mark.slow
 def test_linearised_printed_examined():
     linear = jl.linearise(MAXWELL, {"x": 0.0, "z": 0.0}, params=P)
     assert linear.state_names == ("x", "z", "x_dot")
@@ -119,6 +125,7 @@ def test_the_limit_of_a_small_mass():
 # Solids and circuits, with a driven end
 
 
+@pytest.mark.slow
 def test_standard_linear_solid_relaxes_and_creeps():
     """Spring E beside a Maxwell element (c, b): the force after a jump of strain, and the strain under a load."""
     relaxing = jl.System(
@@ -141,6 +148,7 @@ def test_standard_linear_solid_relaxes_and_creeps():
     np.testing.assert_allclose(motion.q["x"], exact[:, 0], rtol=0, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_a_ladder_of_resistors_with_capacitors_and_coils():
     """Charges of meshes, L = ½ Σ Lᵢ q̇ᵢ² − Σ qᵢ²/2C − …, D = ½ Σ R (q̇ᵢ − q̇ᵢ₊₁)²: some meshes have a coil, some have none."""
     coils, caps, R = np.array([0.3, 0.0, 0.0, 0.2]), np.array([1.0, 0.5, 2.0, 0.8]), np.array([1.0, 2.0, 0.5, 1.5, 0.7])
@@ -166,6 +174,7 @@ def test_a_ladder_of_resistors_with_capacitors_and_coils():
     np.testing.assert_allclose(motion.q, exact[:, :4], rtol=0, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_rouse_modes_of_an_overdamped_chain():
     """100 beads: the mode p decays with the rate 4 k/ζ sin²(p π/2n). de Gennes, Scaling Concepts in Polymer Physics, section VI.1."""
     n, k, zeta = 100, 30.0, 1.2
@@ -178,6 +187,7 @@ def test_rouse_modes_of_an_overdamped_chain():
     assert chain and motion.multipliers == {}
 
 
+@pytest.mark.slow
 def test_a_dashpot_of_drag_comes_to_rest_in_finite_time():
     """c z = k ż²: √z falls at the rate ½ √(c/k), and stays at zero."""
     drag = jl.System(lambda q, c: -0.5 * c * q**2, dissipation=lambda qdot, k: k * jnp.abs(qdot) ** 3 / 3)
@@ -187,6 +197,7 @@ def test_a_dashpot_of_drag_comes_to_rest_in_finite_time():
     np.testing.assert_allclose(motion.qdot[:20], -np.maximum(1 - ts / 2, 0)[:20], rtol=0, atol=1e-7)
 
 
+@pytest.mark.slow
 def test_a_rod_to_a_node_that_dashpots_hold():
     """A mass that hangs by a rod on a node without inertia: its small motions, by hand, and energy."""
     rod = jl.System(
@@ -244,6 +255,7 @@ def loop(p, **more):
     return jl.simulate(IWAN, {"x": 0.0, "z": jnp.zeros(N)}, {"x": 1.0, "z": jnp.zeros(N)}, IWAN_TS, p, **more)
 
 
+@pytest.mark.slow
 def test_iwan_against_return_mapping():
     motion, (force, z, heat) = loop(IWAN_P, works=True, **SHARP), return_mapping(IWAN_P)
     np.testing.assert_allclose(motion.multipliers["drive"], force, rtol=0, atol=1e-10)
@@ -300,6 +312,7 @@ def test_a_sprung_mass_with_a_jenkin_element_against_phases_by_hand():
         np.testing.assert_allclose(slope[name], (moved(h)[0, -1] - moved(-h)[0, -1]) / (2 * h), rtol=1e-5, atol=1e-7)
 
 
+@pytest.mark.slow
 def test_masing_rule():
     """Unloading from the largest force is the curve of first loading, twice as large: f(x) = f₀ − 2 g((x₀ − x)/2)."""
     p = IWAN_P
@@ -312,6 +325,7 @@ def test_masing_rule():
         assert abs(force - want) < 1e-10
 
 
+@pytest.mark.slow
 def test_friction_beside_a_dashpot():
     """D = F|ż| + ½ b ż² (Bingham): ż = (|f| − F)₊ sign f / b, f = c (u(t) − z), by a Gauss-Legendre quadrature between the transitions."""
     bingham = jl.System(
@@ -329,6 +343,7 @@ def test_friction_beside_a_dashpot():
     np.testing.assert_allclose(motion.qdot["z"][begins < TS], 1.5 * (1 - np.exp(-late[begins < TS] * 3 / 0.4)), rtol=0, atol=1e-9)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("solver", ["implicit", "single"])
 def test_other_solvers_and_precisions(solver):
     if solver == "implicit":  # stiff: the dashpot gives way at once
@@ -341,6 +356,7 @@ def test_other_solvers_and_precisions(solver):
         np.testing.assert_allclose(motion.q["x"], by_hand(P)[0], rtol=0, atol=2e-4)
 
 
+@pytest.mark.slow
 def test_a_slider_under_steps_and_ramps_of_its_load():
     """|f(t) − c z| ≤ F: z goes at once as far as it has to, under a load that jumps; and along with one that bends."""
     slider = jl.System(lambda q, c: -0.5 * c * q**2, dissipation=lambda qdot, F: F * jnp.abs(qdot), force=lambda t, f: f(t))
@@ -377,6 +393,7 @@ def phases(rate, y, ends, event, change):
     return np.array([found[s] for s in ends]).T, impacts
 
 
+@pytest.mark.slow
 def test_a_mass_on_a_damped_leg_bounces():
     leg = jl.System(
         lambda q, qdot, m, c: 0.5 * m * qdot["x"] ** 2 - 9.81 * m * q["x"] - 0.5 * c * (q["x"] - 1 - q["z"]) ** 2,
@@ -397,6 +414,7 @@ def test_a_mass_on_a_damped_leg_bounces():
     assert np.max(np.abs(motion.balance())) < 1e-9
 
 
+@pytest.mark.slow
 def test_events_and_states_see_the_velocity_that_dissipation_decides():
     system = jl.System(
         dict(MAXWELL.lagrangian),

@@ -381,6 +381,7 @@ def test_every_system_of_a_notebook_is_in_the_table():
     assert there <= table and {name.split(".")[0] for name in table} | FROM_EXAMPLES == set(notebooks)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", [*EXAMPLES, *NOTEBOOK_SYSTEMS, *MORE])
 def test_formulas_and_programs_equal_the_simulation_at_random_states(name, tmp_path, monkeypatch):
     if name in SOLVED_BY_NUMBERS:

@@ -27,6 +27,7 @@ def swing(x):
     return jnp.concatenate([motion.q[:, 0], motion.multipliers["rod"], motion.friction["joint"].force])
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(jax.default_backend() != "cpu", reason="the option is for CPUs")
 @pytest.mark.parametrize("function, x", [(ride, 3000.0), (swing, 0.7), (jax.jacfwd(ride), 3000.0)], ids=["ride", "swing", "slope"])
 def test_both_emitters_give_the_same(function, x):

@@ -62,6 +62,7 @@ def lowered():
     is_on.clear()
 
 
+@pytest.mark.slow
 def test_random_programs_have_words_of_their_own():
     """Two programs have equal words where, and only where, they are printed alike, with the same constants."""
     found = collections.defaultdict(set)
@@ -134,6 +135,7 @@ def motion(system, params=None, **options):
     return np.asarray(jl.simulate(system, 1.0, 0.0, TS, params, **options).q)
 
 
+@pytest.mark.slow
 def test_a_motion_is_found_where_all_is_the_same_and_only_there(compilation_cache, tmp_path, lowered, monkeypatch):
     jl.keep_compiled(tmp_path)
     cosine = lambda w: np.cos(w * TS)
@@ -222,6 +224,7 @@ class Halved(dfx.Tsit5):
     """A user's solver: its methods are no part of its name."""
 
 
+@pytest.mark.slow
 def test_what_outlives_its_functions_is_not_found(compilation_cache, tmp_path, lowered, capfd):
     """After `jax.clear_caches()` a global that has changed is seen; so is a bit of a file; a user's solver and progress are left to JAX."""
     jl.keep_compiled(tmp_path)

@@ -27,6 +27,7 @@ Z = rng.normal(size=(3, 3)) + 1j * rng.normal(size=(3, 3))
 H, F = Z + Z.conj().T, np.exp(-2j * np.pi * np.outer(range(3), range(3)) / 3)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("block", range(BLOCKS))
 def test_random_programs_are_the_plain_ones(block):
     with jax.numpy_rank_promotion("allow"):  # as a user's program may do
@@ -35,6 +36,7 @@ def test_random_programs_are_the_plain_ones(block):
     assert sum(other for _, other, _, _ in results) > len(results) / 2  # most were rewritten: the rest is what stays plain
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [18])
 def test_accelerations_and_reactions_of_random_energies(seed):
     """With a constraint and dissipation, compiled, and their derivatives, against a dense solve in plain JAX."""
@@ -83,6 +85,7 @@ POTENTIALS = {
 HALF = {"half precision": lambda q: jnp.sum((q.astype(jnp.bfloat16) * q.astype(jnp.float16)).astype(float))}
 
 
+@pytest.mark.slow
 def test_complex_numbers_are_those_of_jax():
     """Accelerations −∂V/∂q and their derivatives, all in one program."""
     every = lambda q: jnp.stack([V(q) for V in POTENTIALS.values()])
@@ -187,6 +190,7 @@ def test_examine_compares_with_plain_jax(monkeypatch):
 # JAX's own checks.
 
 
+@pytest.mark.slow
 def test_nothing_traced_is_left_behind():
     """Derivative rules once held the scalars they were made from."""
     rod = jl.System(

@@ -72,6 +72,7 @@ def links(n):
     return jl.System(lagrangian, dissipation=lambda qdot, b: 0.5 * b * qdot @ qdot)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("n", [2, 5])
 def test_a_motion_and_its_derivatives_are_those_without_loops(monkeypatch, n):
     """Forward and reverse; the gradient of two links and the motion of five are among the looped programs."""

@@ -69,6 +69,7 @@ def two_ways(masses, seed=0):
     return diagonal, full, rows, f
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("massless", [0, 2])
 def test_diagonal_and_full_inertia_agree(massless):
     """Also where masses are zero and constraints hold the massless coordinates; with all derivatives."""
@@ -119,6 +120,7 @@ def test_a_chain_in_cartesian_coordinates_is_one_in_angles(n):
     np.testing.assert_allclose(found, expected, rtol=1e-8, atol=1e-8)
 
 
+@pytest.mark.slow
 def test_a_joint_without_mass_in_a_long_chain():
     """Two rods that meet at an angle cannot pull at a point without mass: the chain beyond it falls freely."""
     n, k = 12, 5

@@ -43,6 +43,7 @@ def third_kind(n, amplitude, k2):
     return within(amplitude - turns * np.pi) + 2 * turns * within(np.pi / 2)
 
 
+@pytest.mark.slow
 def test_a_heavy_top_by_angles_and_by_a_quaternion():
     """The same motion over 20 s, some 290 turns; and its nutation and precession by elliptic functions (Goldstein, section 5.7).
 
@@ -76,6 +77,7 @@ def test_a_heavy_top_by_angles_and_by_a_quaternion():
     np.testing.assert_allclose(energy, weight * u0, rtol=1e-9)
 
 
+@pytest.mark.slow
 def test_the_card_says_where_angles_come_near_their_singularity():
     """φ and ψ turn about the same axis where θ = 0."""
     near, far = (jl.examine(BY_ANGLES, np.array([0.2, theta, 0.3]), RATES, PARAMS).findings for theta in (0.005, 0.2))
@@ -123,6 +125,7 @@ COIN = jl.System(
 )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("theta", [1.2, 0.5])
 def test_a_rolling_coin_runs_in_a_circle(theta):
     """(C + m r²) n Ω sin θ − A Ω² sin θ cos θ + m g r cos θ = 0, n the spin about its axle (Neimark & Fufaev, section II.2): as it begins,
@@ -189,6 +192,7 @@ def test_a_gradient_through_a_rolling_coin():
         np.testing.assert_allclose(derivative, expected, rtol=0, atol=1e-5 * np.abs(expected).max())
 
 
+@pytest.mark.slow
 def test_a_gradient_through_a_top():
     """Of where it points after half a second by its mass, forward and reverse, against differences."""
     axis = lambda m: jl.simulate(BY_QUATERNION, *as_quaternion(ANGLES, RATES), [0.0, 0.5], {"m": m, "g": 9.81}).q[-1]

@@ -32,6 +32,7 @@ def test_other_rotations():
         np.testing.assert_allclose(single(0.7), Rotation.from_euler(axis, 0.7).as_matrix(), atol=1e-15)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("size", [0.0, 1e-9, 0.5, 1 - 1e-9, 1 + 1e-9, 3.0])
 def test_rotation_vectors_have_the_derivatives_of_the_exponential(size):
     """At rest, and where the series ends; of three orders, against JAX's expm."""
@@ -116,6 +117,7 @@ def test_what_is_no_rotation_or_no_body_is_refused_with_the_cure(case):
     assert said in str(error.value) and str(error.value).endswith(".")
 
 
+@pytest.mark.slow
 def test_a_quaternion_of_another_length_is_put_on_its_constraint_and_that_is_said():
     system = jl.System(
         lambda q, qdot: rigid.kinetic_energy(1.0, [1.0, 2.0, 2.5], lambda q: jnp.zeros(3), rigid.quaternion)(q, qdot), holonomic=rigid.unit
