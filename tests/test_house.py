@@ -75,6 +75,7 @@ WINGS = {  # each imports only from those above it, and each file of a wing only
         "lagrange",
         "pseudo_inverse",
         "sparse_saddle_point",
+        "block_saddle_point",
         "saddle_point",
         "constrained_root",
         "massless",

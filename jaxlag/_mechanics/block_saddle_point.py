@@ -31,6 +31,7 @@ from .._program.sparse_matrix import Places, SparseMatrix, summed_by
 from .pseudo_inverse import everywhere
 from .sparse_saddle_point import GROWTH, REFINEMENTS, SHIFT
 
+LIGHT = 0.25  # exponent of eps: a mass beside the largest, below which it sets no scale
 EXACT = 2  # times that a solution is put right where rows are independent: once for GᵀG, once for rounding
 
 
@@ -103,9 +104,9 @@ def factorised(M: SparseMatrix, G: SparseMatrix) -> Factors:
 
 
 def masses(M: SparseMatrix) -> Float[Array, " n"]:
-    """The diagonal of M; where it is not positive, what it typically is."""
+    """The diagonal of M, where that is not (next to) nothing beside its largest number, as of what constraints alone hold."""
     diagonal = summed_by(M.places, jnp.where(M.places.rows == M.places.columns, M.values, 0))
-    return jnp.where(diagonal > 0, diagonal, _typical(diagonal, diagonal > 0))
+    return jnp.maximum(diagonal, jnp.finfo(diagonal.dtype).eps ** LIGHT * jnp.max(diagonal))
 
 
 def is_determined(_: SparseMatrix, factors: Factors) -> Bool[Array, ""]:

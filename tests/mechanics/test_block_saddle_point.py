@@ -126,6 +126,19 @@ def test_as_by_dense_matrices(name):
     assert found.sound.determined and found.sound.satisfied
 
 
+@pytest.mark.parametrize("aside", [0.0, 1e-17, 1e-9, 1e-4])
+def test_next_to_no_inertia_sets_no_scale(aside):
+    """Of unit vectors along an axis the first number has the inertia `aside`², and is held by their length alone."""
+    x, m, f, a = problem("no inertia along")
+    vectors = np.tile([1.0, aside, -aside], (BODIES, 1))
+    x = x.reshape(-1, 6).at[:, 3:].set(vectors / np.linalg.norm(vectors, axis=1, keepdims=True)).ravel()
+    found, (expected, multipliers) = solved("no inertia along", x, m, f, a), by_hand("no inertia along", x, m, f, a)
+    np.testing.assert_allclose(found.x, expected, rtol=0, atol=1e-10 * np.abs(expected).max())
+    np.testing.assert_allclose(found.multipliers, multipliers, rtol=0, atol=1e-10 * np.abs(multipliers).max())
+    assert found.sound.determined and found.sound.satisfied
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize("name", SYSTEMS)
 def test_derivatives_forward_and_reverse(name):
     x, m, f, a = problem(name)
@@ -145,6 +158,7 @@ def test_derivatives_forward_and_reverse(name):
     np.testing.assert_allclose([forward, reverse], differences, rtol=2e-7)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["chain", "no inertia along"])
 def test_second_derivatives(name):
     x, m, f, a = problem(name)
