@@ -74,9 +74,9 @@ def saddle_point(M: lx.AbstractLinearOperator, G: Rows, f, c, reach: Float[Array
 
 def _for_rows(M, G):
     """M and G as they are solved with: with as many of their zeros as that needs."""
-    if isinstance(M, lx.DiagonalLinearOperator) or (isinstance(M, StructuredInertia) and G.shape[0] <= FEW):
-        return M, G if isinstance(M, lx.DiagonalLinearOperator) else dense(G)
-    if not isinstance(M, StructuredInertia):
+    if isinstance(M, lx.DiagonalLinearOperator):
+        return M, G
+    if not isinstance(M, StructuredInertia) or G.shape[0] <= FEW:
         return M, dense(G)
     if isinstance(G, SparseMatrix) and not M.sums and block_saddle_point.whole(M.slopes.places, G.places) is not None:
         return M.slopes, G

@@ -6,14 +6,21 @@ By hand: for the chain S has three diagonals, in one call of a tridiagonal solve
 of 30 calls, each length in a process of its own; 1 s of motion of 200 links and of 1000, each of unit length and mass; and its
 gradient in the mass of each link; rest between two hooks, with the forces left; the lowest modes where it hangs. Beside the rods: the
 same chain, at rest, as a tree of hinges in MuJoCo, which nests no more than 1024 bodies; without the forces in the hinges. Its
-accelerations of the points are compared with those of the rods.
+accelerations of the points are compared with those of the rods. And bodies in the plane, their centers of mass beside their joints, by three
+coordinates each: beside SciPy's `splu` of the whole saddle point.
 """
 
 import subprocess
 import sys
 from time import perf_counter
 
-LENGTHS, MOTIONS, HINGES, HANGING = (64, 256, 1024, 4096, 10_000), (200, 1000), (64, 256, 1000), (64, 256, 1024)
+LENGTHS, MOTIONS, HINGES, HANGING, BODIES = (
+    (64, 256, 1024, 4096, 10_000),
+    (200, 1000),
+    (64, 256, 1000),
+    (64, 256, 1024),
+    (64, 256, 1024, 4096),
+)
 
 
 def chain(n):
@@ -262,19 +269,72 @@ def modes(n, kind):
     )
 
 
+def bodies(n, kind):
+    """Accelerations and forces in the joints of a chain of rigid bodies."""
+    import jax
+    import jax.numpy as jnp
+    import numpy as np
+    import scipy.sparse as sparse
+    from scipy.sparse.linalg import splu
+
+    import jaxlag as jl
+
+    m, J, e, l, g = 1.0, 0.1, 0.3, 1.0, 9.81
+    across, along = (lambda phi: jnp.stack([-jnp.sin(phi), jnp.cos(phi)], 1)), (lambda phi: jnp.stack([jnp.cos(phi), jnp.sin(phi)], 1))
+
+    def lagrangian(q, qdot):
+        velocity = qdot["r"] + e * qdot["phi"][:, None] * across(q["phi"])
+        height = q["r"][:, 1] + e * jnp.sin(q["phi"])
+        return 0.5 * m * jnp.sum(velocity**2) + 0.5 * J * jnp.sum(qdot["phi"] ** 2) - m * g * jnp.sum(height)
+
+    joints = lambda q: q["r"] - jnp.concatenate([jnp.zeros((1, 2)), (q["r"] + l * along(q["phi"]))[:-1]])
+    system = jl.System(lagrangian, holonomic={"joints": joints})
+    phi = 0.3 * np.sin(np.arange(n))
+    q = {"r": jnp.asarray(np.cumsum(l * along(phi), 0) - l * along(phi)), "phi": jnp.asarray(phi)}
+    turning = {"r": jnp.zeros((n, 2)), "phi": jnp.cos(jnp.arange(n))}
+    first, each, found = timed(jax.jit(lambda q, v: jl.acceleration(system, q, v)), q, turning)
+
+    i, three = np.arange(n), lambda k: 3 * np.arange(n) + k  # x, y and φ of a body together
+    ones = np.ones(n)
+    rows = np.concatenate([three(0), three(1), three(2), three(0), three(2), three(1), three(2)])
+    columns = np.concatenate([three(0), three(1), three(2), three(2), three(0), three(2), three(1)])
+    at, beside = (2 * i[1:], 2 * i[1:] + 1), (three(0), three(1), three(2))
+    of_rows = np.concatenate([2 * i, 2 * i + 1, *at, *at])
+    of_columns = np.concatenate([*beside[:2], beside[0][:-1], beside[1][:-1], beside[2][:-1], beside[2][:-1]])
+
+    def by_hand(phi, omega):
+        s, c = np.sin(phi), np.cos(phi)
+        M = sparse.csc_matrix(
+            (np.concatenate([m * ones, m * ones, (J + m * e**2) * ones, *[-m * e * s] * 2, *[m * e * c] * 2]), (rows, columns))
+        )
+        slopes = [ones, ones, -ones[1:], -ones[1:], l * s[:-1], -l * c[:-1]]
+        G = sparse.csc_matrix((np.concatenate(slopes), (of_rows, of_columns)), (2 * n, 3 * n))
+        f = np.stack([m * e * c * omega**2, m * e * s * omega**2 - m * g, -m * g * e * c], 1).ravel()
+        gamma = np.stack([l * c * omega**2, l * s * omega**2], 1)
+        wanted = -np.concatenate([np.zeros((1, 2)), gamma[:-1]]).ravel()
+        whole = sparse.bmat([[M, -G.T], [G, None]], format="csc")
+        return splu(whole).solve(np.concatenate([f, wanted]))
+
+    _, hand, expected = timed(by_hand, phi, np.cos(i))
+    off = float(np.abs(found.qddot["phi"] - expected[: 3 * n].reshape(n, 3)[:, 2]).max() / np.abs(expected[: 3 * n]).max())
+    print(f"{n:>7} bodies{1e3 * each:>12.3f}{1e3 * hand:>12.3f}{each / hand:>8.2f}{first:>9.2f}{0:>9.2f}{off:>11.1e}")
+
+
 def main():
     if len(sys.argv) == 4:
         import jax
 
         jax.config.update("jax_enable_x64", True)
-        kinds = {"acceleration": accelerations, "hinges": hinges, "motion": motion, "gradient": gradient, "rest": rest, "modes": modes}
+        kinds = {"acceleration": accelerations, "hinges": hinges, "motion": motion, "gradient": gradient, "rest": rest}
+        kinds |= {"modes": modes, "bodies": bodies}
         return kinds[sys.argv[1]](int(sys.argv[2]), sys.argv[3])
     most = int(sys.argv[1]) if len(sys.argv) > 1 else LENGTHS[-1]
     print(f"{'links':>14}{'jaxlag ms':>12}{'by hand ms':>12}{'ratio':>8}{'first s':>9}{'by hand':>9}{'difference':>11}", flush=True)
-    parts = {"acceleration": LENGTHS, "hinges": HINGES, "motion": MOTIONS, "gradient": MOTIONS[:1], "rest": HANGING, "modes": HANGING}
+    parts = {"acceleration": LENGTHS, "hinges": HINGES, "motion": MOTIONS, "gradient": MOTIONS[:1], "rest": HANGING}
+    parts |= {"modes": HANGING, "bodies": BODIES}
     for kind, lengths in parts.items():
         for n in lengths:
-            for coordinates in () if n > most else ("places",) if kind in ("hinges", "rest", "modes") else CHAINS:
+            for coordinates in () if n > most else ("places",) if kind in ("hinges", "rest", "modes", "bodies") else CHAINS:
                 subprocess.run([sys.executable, __file__, kind, str(n), coordinates], check=True)
 
 
