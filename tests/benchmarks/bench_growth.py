@@ -6,8 +6,8 @@ By hand: for the chain S has three diagonals, in one call of a tridiagonal solve
 of 30 calls, each length in a process of its own; 1 s of motion of 200 links and of 1000, each of unit length and mass; and its
 gradient in the mass of each link; rest between two hooks, with the forces left; the lowest modes where it hangs. Beside the rods: the
 same chain, at rest, as a tree of hinges in MuJoCo, which nests no more than 1024 bodies; without the forces in the hinges. Its
-accelerations of the points are compared with those of the rods. And bodies in the plane, their centers of mass beside their joints, by three
-coordinates each: beside SciPy's `splu` of the whole saddle point.
+accelerations of the points are compared with those of the rods. And bodies in the plane, their centers of mass beside their joints, by
+three coordinates each: beside SciPy's `splu` of the whole saddle point.
 """
 
 import subprocess
@@ -317,7 +317,7 @@ def bodies(n, kind):
 
     _, hand, expected = timed(by_hand, phi, np.cos(i))
     off = float(np.abs(found.qddot["phi"] - expected[: 3 * n].reshape(n, 3)[:, 2]).max() / np.abs(expected[: 3 * n]).max())
-    print(f"{n:>7} bodies{1e3 * each:>12.3f}{1e3 * hand:>12.3f}{each / hand:>8.2f}{first:>9.2f}{0:>9.2f}{off:>11.1e}")
+    print(f"{n:>7} bodies{1e3 * each:>12.3f}{1e3 * hand:>12.3f}{each / hand:>8.2f}{first:>9.2f}{'':>9}{off:>11.1e}")
 
 
 def main():
