@@ -72,6 +72,7 @@ def test_ten_thousand_random_states_are_passive_and_finite(cls):
     assert jnp.all(at.half_way <= at.D * (1 + 1e3 * eps))  # D grows on every ray
 
 
+@pytest.mark.slow
 def test_a_convex_network_is_convex_and_a_passive_one_need_not_be():
     at, free = random_states(ConvexDissipation), random_states(PassiveDissipation)
     curvature = jnp.linalg.eigvalsh(at.hessian)

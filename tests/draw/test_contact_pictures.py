@@ -48,6 +48,7 @@ def test_forces_have_stems_at_impacts_and_bands_where_contacts_are_closed(bounci
     np.testing.assert_allclose(low / high, below / above)  # zero is at one height
 
 
+@pytest.mark.slow
 def test_motions_have_lines_at_events(bouncing):
     (ax,) = plot.motion(bouncing)
     lines = [line.get_xdata()[0] for line in ax.lines if line.get_linestyle() == ":"]

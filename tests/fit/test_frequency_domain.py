@@ -129,6 +129,7 @@ def test_exact_modes_in_any_order_give_the_truth_back(order):
     np.testing.assert_allclose(fit.predictions[0]["frequency"], F[list(order)], rtol=1e-10)
 
 
+@pytest.mark.slow
 def test_estimates_and_errors_from_modes_are_those_of_scipy():
     first, second = modal_test(1, (1, 2, 0)), modal_test(2, (2, 1, 0))
     fit = jl.fit(CHAIN, [first, second], GUESS, free=("k", "c"), tolerance=1e-8)

@@ -101,6 +101,7 @@ def test_the_published_eigenvalues(v):
     np.testing.assert_allclose(found.eigenvalues[:6], 0, atol=DUST)
 
 
+@pytest.mark.slow
 def test_modes_at_a_speed_at_which_it_stays_upright():
     """Weave, capsize and castering; x, y, yaw and the rotations of the wheels may be shifted, and the speed changed."""
     modes = linearised(5.0).modes()

@@ -345,6 +345,7 @@ def test_energy_balance(name):
     assert np.max(np.abs(seen(name)["balance"])) <= BALANCE
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", CONSTRAINED)
 def test_constraint_forces_are_orthogonal_to_every_allowed_velocity(name):
     """Null space of G by NumPy's singular values; each force by itself, relative to the largest."""

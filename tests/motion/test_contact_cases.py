@@ -85,6 +85,7 @@ def test_a_periodic_motion_on_a_shaking_table(a, n):
     np.testing.assert_allclose(found[:, 1], v, rtol=1e-9)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("a", "n"), [(0.018, 1), (0.026, 2)])
 def test_a_motion_of_twice_the_period(a, n):
     """What the period doubles to when that of one impact has become unstable: the return map is iterated till it repeats itself."""

@@ -132,6 +132,7 @@ def test_impacts():
     np.testing.assert_allclose([jax.grad(third)(1.0), jax.jacfwd(third)(1.0)], slope, rtol=1e-10)
 
 
+@pytest.mark.slow
 def test_files_and_copies(tmp_path):
     """What happened is in files, tables and slices; events are pickled with their system."""
     motion = jl.simulate(ball, 1.0, 0.0, jnp.linspace(0, 2.0, 21))

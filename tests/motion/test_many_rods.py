@@ -151,6 +151,21 @@ def test_drag_is_found_by_a_fit(motion):
 
 
 @pytest.mark.slow
+def test_twenty_masses_of_a_chain_of_two_hundred_are_found():
+    """Each of ten links; the drag is known, without which the masses have a common factor."""
+    chain = jl.System(lambda q, qdot, m, g: lagrangian(q, qdot, jnp.repeat(m, 10), g), dissipation={"air": drag}, holonomic={"rods": rods})
+    angles = np.linspace(0.3, 1.4, 200)
+    start = np.cumsum(np.stack([np.sin(angles), -np.cos(angles)], axis=1), axis=0)
+    at_rest, ts = np.zeros_like(start), np.linspace(0.0, 2.0, 21)
+    params = {"m": np.random.default_rng(5).uniform(0.5, 2.0, 20), "l": 1.0, "b": 0.3, "g": GRAVITY}
+    recorded = jl.simulate(chain, start, at_rest, ts, params).q[:, 9::10]
+    experiment = jl.Experiment(ts, recorded, start, at_rest, observe=lambda q: q[9::10])
+    guess = params | {"m": params["m"] * np.tile([0.7, 1.3], 10)}
+    found = jl.fit(chain, experiment, guess, free=("m",))
+    np.testing.assert_allclose(found.params["m"], params["m"], rtol=1e-4)
+
+
+@pytest.mark.slow
 def test_several_chains_at_once():
     drags = jnp.array([0.1, 0.3, 1.0])
     found = jl.simulate_many(CHAIN, Q0, np.zeros_like(Q0), TS[:3], PARAMS | {"b": drags}, over=("b",), rtol=1e-9, atol=1e-9)

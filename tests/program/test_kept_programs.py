@@ -74,6 +74,7 @@ def test_random_programs_have_words_of_their_own():
     assert len(set().union(*found.values())) == len(found)
 
 
+@pytest.mark.slow
 def test_a_change_of_any_part_changes_the_words():
     """One parameter of one equation of a random program: what JAX prints does not show all of them."""
     changed = 0
