@@ -29,7 +29,7 @@ from .._program.block_tridiagonal_lu import order, positive_eigenvalues, solutio
 from .._program.sparse_jacobian import SPARSE
 from .._program.sparse_matrix import Places, SparseMatrix, summed_by
 from .pseudo_inverse import everywhere
-from .sparse_saddle_point import GROWTH, REFINEMENTS, SHIFT
+from .sparse_saddle_point import REFINEMENTS, SHIFT, shifted_where_singular
 
 LIGHT = 0.25  # exponent of eps: a mass beside the largest, below which it sets no scale
 EXACT = 2  # times that a solution is put right where rows are independent: once for GᵀG, once for rounding
@@ -87,19 +87,13 @@ def factorised(M: SparseMatrix, G: SparseMatrix) -> Factors:
     of_M = M.values * units[M.places.rows] * units[M.places.columns]
     probe = jnp.asarray(np.random.default_rng(0).choice([-1.0, 1.0], n + m), values.dtype)
 
-    def attempt(carry):
-        _, _, shifted = carry
-        delta = jnp.where(shifted, shift, 0)
+    def factored(delta):
         entries = jnp.concatenate([of_M, values[first] * values[second], values, values, -delta])
         K = SparseMatrix(summed_by(how.sums, entries[how.sums.columns]), how.places)
-        factors = by_blocks(K)
-        is_singular = ~(jnp.max(jnp.abs(solution(how.places, factors, probe))) < eps**-GROWTH)
-        return (K.values, factors), is_singular & ~shifted, is_singular | shifted
+        return K, by_blocks(K)
 
-    nothing = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), jax.eval_shape(lambda: attempt((None, None, False))[0]))
-    start = nothing, jnp.array(True), jnp.array(False)
-    (entries, factors), _, shifted = lax.while_loop(lambda carry: carry[1], attempt, start)
-    rising, sound = positive_eigenvalues(SparseMatrix(entries, how.places), factors)
+    (K, factors), shifted = shifted_where_singular(factored, lambda found: solution(how.places, found[1], probe), shift)
+    rising, sound = positive_eigenvalues(K, factors)
     return Factors(factors, units, weights, everywhere(~shifted), (rising == n) & sound)
 
 

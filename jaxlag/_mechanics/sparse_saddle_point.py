@@ -5,7 +5,7 @@ a number that grows with m alone for a chain (b = 1, 2), for a tree or a strip; 
 """
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -51,15 +51,24 @@ def factorised(M: lx.DiagonalLinearOperator, G: SparseMatrix) -> Factors:
     shift = eps**SHIFT * D**2 * typical  # as much for each row in the units given
     probe = jnp.asarray(np.random.default_rng(0).choice([-1.0, 1.0], (*D.shape, 1)), D.dtype)
 
+    factored = lambda shift: factor(on + diagonal(shift), below)
+    factors, shifted = shifted_where_singular(factored, lambda factors: by_factor(factors, probe), shift)
+    return Factors(factors, everywhere(~shifted & (jnp.sum(there) == G.shape[0])), D)
+
+
+def shifted_where_singular(factored: Callable, probed: Callable, shift: Array) -> tuple[Any, Bool[Array, ""]]:
+    """Factors without a shift, or with it where the inverse makes too much of a vector at random; and whether that is so."""
+
     def attempt(carry):
         _, _, shifted = carry
-        factors = factor(on + diagonal(jnp.where(shifted, shift, 0)), below)
-        is_singular = ~(jnp.max(jnp.abs(by_factor(factors, probe))) < eps**-GROWTH)
+        factors = factored(jnp.where(shifted, shift, 0))
+        is_singular = ~(jnp.max(jnp.abs(probed(factors))) < jnp.finfo(shift.dtype).eps ** -GROWTH)
         return factors, is_singular & ~shifted, is_singular | shifted
 
-    start = (on, below), jnp.array(True), jnp.array(False)
+    nothing = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), jax.eval_shape(factored, shift))
+    start = nothing, jnp.array(True), jnp.array(False)
     factors, _, shifted = lax.while_loop(lambda carry: carry[1], attempt, start)
-    return Factors(factors, everywhere(~shifted & (jnp.sum(there) == G.shape[0])), D)
+    return factors, shifted
 
 
 def solver(M: lx.DiagonalLinearOperator, G: SparseMatrix, factors: Factors) -> tuple[Callable, Callable]:

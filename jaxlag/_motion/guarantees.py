@@ -26,13 +26,10 @@ def verified(
     reached = ts[-1]
     result = RESULTS.where((result == RESULTS.dt_min_reached) & _locks(equations, ts, samples[0]), RESULTS.beyond_reach, result)
     ts, ys, (sample, evidence) = jax.tree.map(lambda leaf: leaf[:-1], (ts, ys, samples))
-    there = jnp.all(jnp.isfinite(ys), axis=1)
+    finite = jnp.all(jnp.isfinite(ys), axis=1)
     passed = ts < reached if equations.events else ts <= reached  # behind the end of a motion there is nothing
-    lost = (result == RESULTS.successful) & passed & ~there
-    result = RESULTS.where(jnp.any(lost), RESULTS.undefined, result)
-    reached = jnp.where(jnp.any(lost), jnp.minimum(reached, ts[jnp.argmax(lost)]), reached)
-    there = there & (jnp.cumsum(lost) == 0)
-    for projected, reason in _guarantees(equations, ts, sample, evidence, tolerances):
+    there = finite | (passed & (result == RESULTS.successful))
+    for projected, reason in [(finite, RESULTS.undefined), *_guarantees(equations, ts, sample, evidence, tolerances)]:
         broken = there & ~projected
         first = jnp.argmax(broken)
         there = there & (jnp.cumsum(broken) == 0)
