@@ -52,18 +52,25 @@ def factorised(M: lx.DiagonalLinearOperator, G: SparseMatrix) -> Factors:
     probe = jnp.asarray(np.random.default_rng(0).choice([-1.0, 1.0], (*D.shape, 1)), D.dtype)
 
     factored = lambda shift: factor(on + diagonal(shift), below)
-    factors, shifted = shifted_where_singular(factored, lambda factors: by_factor(factors, probe), shift)
+    factors, shifted = shifted_where_singular(factored, lambda factors: by_factor(factors, probe), shift, is_work=how.size > 1)
     return Factors(factors, everywhere(~shifted & (jnp.sum(there) == G.shape[0])), D)
 
 
-def shifted_where_singular(factored: Callable, probed: Callable, shift: Array) -> tuple[Any, Bool[Array, ""]]:
-    """Factors without a shift, or with it where the inverse makes too much of a vector at random; and whether that is so."""
+def shifted_where_singular(factored: Callable, probed: Callable, shift: Array, is_work: bool = True) -> tuple[Any, Bool[Array, ""]]:
+    """Factors without a shift, or with it where the inverse makes too much of a vector at random; and whether that is so. They stand in
+    the program once, but where making them `is_work` no more than adding the shift.
+    """
+
+    is_singular = lambda factors: ~(jnp.max(jnp.abs(probed(factors))) < jnp.finfo(shift.dtype).eps ** -GROWTH)
+    if not is_work:
+        shifted = is_singular(factored(jnp.zeros_like(shift)))
+        return factored(jnp.where(shifted, shift, 0)), shifted
 
     def attempt(carry):
         _, _, shifted = carry
         factors = factored(jnp.where(shifted, shift, 0))
-        is_singular = ~(jnp.max(jnp.abs(probed(factors))) < jnp.finfo(shift.dtype).eps ** -GROWTH)
-        return factors, is_singular & ~shifted, is_singular | shifted
+        again = is_singular(factors) & ~shifted
+        return factors, again, again | shifted
 
     nothing = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), jax.eval_shape(factored, shift))
     start = nothing, jnp.array(True), jnp.array(False)

@@ -60,6 +60,9 @@ def _by_arrays(function: Callable, push: Callable, x: Float[Array, " n"]) -> lx.
         return lx.DiagonalLinearOperator(push(jnp.ones_like(x)))
     if (color := few_colors(pattern)) is None:
         return None
+    by_row = colors(pattern.T)
+    if 2 * (max(by_row) + 1) <= max(color) + 1:
+        return _entries_by_rows(jax.linear_transpose(push, x), by_row, pattern, x)
     return entries(push, color, pattern, x)
 
 
@@ -68,6 +71,14 @@ def entries(push: Callable, color: np.ndarray, pattern: Any, x: Float[Array, " n
     places = Places.of(pattern)
     directions = along(push, color, x).T  # as they are computed: this way around they are read faster, too
     return SparseMatrix(directions.ravel()[color[places.columns] * places.shape[0] + places.rows], places)
+
+
+def _entries_by_rows(pull: Callable, color: np.ndarray, pattern: Any, x: Float[Array, " n"]) -> SparseMatrix:
+    """The same by transposed directions, each the sum of the rows of one color."""
+    places = Places.of(pattern)
+    directions = jnp.asarray(np.arange(max(color) + 1)[:, None] == color, x.dtype)
+    (pulled,) = jax.vmap(pull)(directions)
+    return SparseMatrix(pulled.ravel()[color[places.rows] * places.shape[1] + places.columns], places)
 
 
 def few_colors(pattern: Any) -> np.ndarray | None:

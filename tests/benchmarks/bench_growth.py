@@ -122,8 +122,10 @@ def accelerations(n, kind):
     make, of_hand = CHAINS[kind]
     system, q, params = make(n)
     given = q, 0.1 * q[::-1], params
-    first, each, found = timed(jax.jit(lambda *given: jl.acceleration(system, *given)), *given)
-    first_by_hand, each_by_hand, expected = timed(jax.jit(of_hand), *given)
+    ours, hand = jax.jit(lambda *given: jl.acceleration(system, *given)), jax.jit(of_hand)
+    (first, _, found), (first_by_hand, _, expected) = timed(ours, *given, times=1), timed(hand, *given, times=1)
+    rounds = [(timed(ours, *given, times=30)[1], timed(hand, *given, times=30)[1]) for _ in range(10)]  # in turn: the machine is shared
+    each, each_by_hand = np.median(rounds, axis=0)
     off = float(np.abs(found.qddot - expected[0]).max() / np.abs(expected[0]).max())
     times = f"{1e3 * each:>12.3f}{1e3 * each_by_hand:>12.3f}{each / each_by_hand:>8.2f}{first:>9.2f}{first_by_hand:>9.2f}"
     print(f"{n:>7} {kind}{times}{off:>11.1e}")
