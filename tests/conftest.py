@@ -3,6 +3,7 @@
 They are compiled with the flag that README recommends for a CPU, in two thirds of the time; `program/test_jit` compares with the default.
 """
 
+import collections
 import os
 import pathlib
 import tempfile
@@ -51,6 +52,19 @@ def fresh_caches():
     """Releases what a file has compiled: each program holds memory maps, of which a process may have only some 65 000."""
     yield
     jax.clear_caches()
+
+
+@pytest.fixture
+def lowered():
+    """How often each program is lowered to be compiled, during a test."""
+    counts = collections.Counter()
+
+    def listen(event, _, fun_name=None, **__):
+        counts.update([fun_name] if event.endswith("jaxpr_to_mlir_module_duration") else [])
+
+    jax.monitoring.register_event_duration_secs_listener(listen)
+    yield counts
+    jax.monitoring.unregister_event_duration_listener(listen)
 
 
 @pytest.fixture

@@ -27,7 +27,7 @@ from .._program.block_tridiagonal_lu import Factors as Blocks
 from .._program.block_tridiagonal_lu import factorised as by_blocks
 from .._program.block_tridiagonal_lu import order, positive_eigenvalues, solution
 from .._program.sparse_jacobian import SPARSE
-from .._program.sparse_matrix import Places, SparseMatrix, summed_by
+from .._program.sparse_matrix import Places, SparseMatrix, picked, summed_by
 from .pseudo_inverse import everywhere
 from .sparse_saddle_point import REFINEMENTS, SHIFT, shifted_where_singular
 
@@ -78,18 +78,18 @@ def factorised(M: SparseMatrix, G: SparseMatrix) -> Factors:
     how, eps, (m, n) = whole(M.places, G.places), jnp.finfo(G.values.dtype).eps, G.shape
     assert how is not None  # asked where it is of use
     units = lax.rsqrt(masses(M))
-    values = G.values * units[G.places.columns]
+    values = G.values * picked(units, G.places.columns)
     squares = summed_by(G.places, values**2)
     there = squares > (4 * eps) ** 2 * jnp.max(squares)  # a row of nothing but rounding has no part in it
     weights = jnp.where(there, lax.rsqrt(jnp.where(there, squares, 1)), 0)
-    values, (first, second) = values * weights[G.places.rows], how.pairs
+    values, (first, second) = values * picked(weights, G.places.rows), how.pairs
     shift = eps**SHIFT * weights**2 / _typical(weights**2, there) + ~there  # as much for each row in the units given
-    of_M = M.values * units[M.places.rows] * units[M.places.columns]
+    of_M = M.values * picked(units, M.places.rows) * picked(units, M.places.columns)
     probe = jnp.asarray(np.random.default_rng(0).choice([-1.0, 1.0], n + m), values.dtype)
 
     def factored(delta):
-        entries = jnp.concatenate([of_M, values[first] * values[second], values, values, -delta])
-        K = SparseMatrix(summed_by(how.sums, entries[how.sums.columns]), how.places)
+        entries = jnp.concatenate([of_M, picked(values, first) * picked(values, second), values, values, -delta])
+        K = SparseMatrix(summed_by(how.sums, picked(entries, how.sums.columns)), how.places)
         return K, by_blocks(K)
 
     (K, factors), shifted = shifted_where_singular(factored, lambda found: solution(how.places, found[1], probe), shift)

@@ -15,7 +15,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float
 
 from .._program.block_tridiagonal import by_factor, elimination, factor
-from .._program.sparse_matrix import SparseMatrix, summed_by
+from .._program.sparse_matrix import SparseMatrix, picked, summed_by
 from .pseudo_inverse import FOLLOWS, everywhere
 
 SHIFT = 0.35  # exponent of eps: what is added to S where rows depend on each other
@@ -39,8 +39,9 @@ def factorised(M: lx.DiagonalLinearOperator, G: SparseMatrix) -> Factors:
     They are seen by what S⁻¹ makes of a vector at random: in the null space of S that is as large as rounding allows.
     """
     how, eps = elimination(G.places), jnp.finfo(G.values.dtype).eps
-    pairs = G.values[how.pairs[0]] * G.values[how.pairs[1]] / M.diagonal[G.places.columns[how.pairs[0]]]
-    S = jnp.append(summed_by(how.sums, pairs), 0)[how.entry]
+    first, second = how.pairs
+    pairs = picked(G.values, first) * picked(G.values, second) / picked(M.diagonal, G.places.columns[first])
+    S = picked(jnp.append(summed_by(how.sums, pairs), 0), how.entry)
     squares, diagonal = jnp.diagonal(S[:, 0], axis1=1, axis2=2), jax.vmap(jnp.diag)
     there = squares > (4 * eps) ** 2 * jnp.max(squares)  # a row of nothing but rounding has no part in it
     D = jnp.where(there, lax.rsqrt(jnp.where(there, squares, 1)), 0)
@@ -86,9 +87,9 @@ def solver(M: lx.DiagonalLinearOperator, G: SparseMatrix, factors: Factors) -> t
     S = lambda X: G @ by_inertia(G.T @ X)
 
     def once(R):
-        blocks = jnp.concatenate([R[how.order], jnp.zeros((how.padding, R.shape[1]), R.dtype)]).reshape(*factors.D.shape, -1)
+        blocks = jnp.concatenate([picked(R, how.order), jnp.zeros((how.padding, R.shape[1]), R.dtype)]).reshape(*factors.D.shape, -1)
         scaled = factors.D[:, :, None] * by_factor(factors.of, factors.D[:, :, None] * blocks)
-        return scaled.reshape(-1, R.shape[1])[back]
+        return picked(scaled.reshape(-1, R.shape[1]), back)
 
     def refined(matvec, R):
         times = jnp.where(factors.regular, 0, REFINEMENTS)

@@ -173,19 +173,14 @@ def _jacobian_product(of, varying, constant, ts, y, dx):
     """J dx by one forward pass, whose transpose is one reverse pass.
 
     JAX takes a transpose from the user in `custom_linear_solve` alone: here a symmetric one whose "solution" of (a, b) is
-    (Jᵀb, Ja). Of the two products the one that is not asked for is dropped by the compiler.
+    (Jᵀb, Ja). Of the two products the one that is not asked for is dropped by the compiler, or costs nothing, as that of zeros.
     """
-    x, unravel = ravel_pytree(varying)
+    x = ravel_pytree(varying)[0]
     constant, ts = jax.tree.map(lambda leaf: jnp.asarray(leaf) if isinstance(leaf, np.ndarray) else leaf, (constant, ts))
-
-    def at_x(solve):
-        return lambda x: solve(eqx.combine(unravel(x), constant), ts)[0]
 
     def products(_, z):
         a, b = z
-        pushed = jax.jvp(at_x(of.solve), (x,), (a,))[1]
-        pulled = jax.vjp(at_x(of.pull_back), x)[1](b)[0]
-        return pulled, pushed
+        return pulled(of, varying, constant, ts, b), pushed(of, varying, constant, ts, a)
 
     def matrix(z):
         only_first = eqx.internal.nondifferentiable(x, msg=SECOND_ORDER)
@@ -193,6 +188,28 @@ def _jacobian_product(of, varying, constant, ts, y, dx):
 
     nothing = jax.tree.map(lambda leaf: jnp.zeros_like(leaf) + 0 * jnp.sum(dx), y)  # linear in dx, as JAX wants all of it
     return jax.lax.custom_linear_solve(matrix, (dx, nothing), products, symmetric=True)[1]
+
+
+@compiled
+def pushed(of: DifferentiableMap, varying: Any, constant: Any, ts: Any, dx: Any) -> Any:
+    """J dx."""
+    return _unless_zero(lambda x, solve, dx: jax.jvp(solve, (x,), (dx,))[1], of.solve, varying, constant, ts, dx)
+
+
+@compiled
+def pulled(of: DifferentiableMap, varying: Any, constant: Any, ts: Any, dy: Any) -> Any:
+    """Jᵀ dy."""
+    return _unless_zero(lambda x, solve, dy: jax.vjp(solve, x)[1](dy)[0], of.pull_back, varying, constant, ts, dy)
+
+
+def _unless_zero(product, solve, varying, constant, ts, vector):
+    """A product of the Jacobian and a vector; where that is zero, without a motion."""
+    x, unravel = ravel_pytree(varying)
+    of_vector = lambda vector: product(x, lambda x: solve(eqx.combine(unravel(x), constant), ts)[0], vector)
+    like = jax.eval_shape(of_vector, vector)
+    nothing = lambda _: jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), like)
+    is_zero = jnp.all(jnp.array([jnp.all(leaf == 0) for leaf in jax.tree.leaves(vector)]))
+    return jax.lax.cond(is_zero, nothing, of_vector, vector)
 
 
 SECOND_ORDER = (

@@ -16,7 +16,7 @@ from jaxtyping import Array, Bool, Float
 from .array_dependence import dependence
 from .expressions import Algebra, Node, TooLong, UnknownPrimitive
 from .interpreter import Interpreter, traced
-from .sparse_matrix import Places, SparseMatrix, colors
+from .sparse_matrix import Places, SparseMatrix, colors, picked
 from .structured_jacobian import structured_jacobian
 
 MAX_DENSE_COLUMNS = 3  # up to here a direction for each column costs less than looking for zeros
@@ -70,7 +70,7 @@ def entries(push: Callable, color: np.ndarray, pattern: Any, x: Float[Array, " n
     """The entries of a Jacobian, by directions of one color each."""
     places = Places.of(pattern)
     directions = along(push, color, x).T  # as they are computed: this way around they are read faster, too
-    return SparseMatrix(directions.ravel()[color[places.columns] * places.shape[0] + places.rows], places)
+    return SparseMatrix(picked(directions.ravel(), color[places.columns] * places.shape[0] + places.rows), places)
 
 
 def _entries_by_rows(pull: Callable, color: np.ndarray, pattern: Any, x: Float[Array, " n"]) -> SparseMatrix:
@@ -78,7 +78,7 @@ def _entries_by_rows(pull: Callable, color: np.ndarray, pattern: Any, x: Float[A
     places = Places.of(pattern)
     directions = jnp.asarray(np.arange(max(color) + 1)[:, None] == color, x.dtype)
     (pulled,) = jax.vmap(pull)(directions)
-    return SparseMatrix(pulled.ravel()[color[places.rows] * places.shape[1] + places.columns], places)
+    return SparseMatrix(picked(pulled.ravel(), color[places.rows] * places.shape[1] + places.columns), places)
 
 
 def few_colors(pattern: Any) -> np.ndarray | None:

@@ -201,6 +201,22 @@ def test_many_parameters_take_the_other_road(monkeypatch):
 
 
 @pytest.mark.slow
+def test_gradients_in_many_numbers_are_compiled_once(lowered):
+    """Those of the stiffnesses of a hundred springs side by side, called from Python, forward and in reverse."""
+    springs = jl.System(lambda q, qdot, c: 0.5 * qdot**2 - 0.5 * jnp.sum(c) * q**2)
+    end = lambda c: jl.simulate(springs, 1.0, 0.0, [0.0, 2.0], {"c": c}, rtol=1e-10, atol=1e-12).q[-1]
+    forward = lambda c: jax.jvp(end, (c,), (jnp.ones_like(c),))[1]
+    c, others = jnp.linspace(0.02, 0.06, 100), jnp.linspace(0.03, 0.04, 100)
+    jax.block_until_ready((jax.grad(end)(c), forward(c)))
+    lowered.clear()
+    gradient, along = jax.grad(end)(others), forward(others)
+    assert not lowered
+    expected = jax.grad(lambda c: oscillator_exact(1.0, 0.0, c, 2.0))(3.5)
+    np.testing.assert_allclose(gradient, np.full(100, expected), rtol=1e-7)
+    np.testing.assert_allclose(along, 100 * expected, rtol=1e-7)
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize("adjoint, derivative", [(diffrax.RecursiveCheckpointAdjoint(), jax.grad), (diffrax.ForwardMode(), jax.jacfwd)])
 def test_an_adjoint_of_diffrax_can_be_asked_for(adjoint, derivative):
     ts, p = jnp.linspace(0, 1, 5), pendulum.params

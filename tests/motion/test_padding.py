@@ -50,18 +50,9 @@ def test_its_derivatives_are_those_without_padding(derivative, tolerance):
 
 
 @pytest.mark.slow
-def test_many_lengths_compile_few_programs():
+def test_many_lengths_compile_few_programs(lowered):
     """The motions of a loop over recordings; what cuts them to length is compiled for each, in hundredths of a second."""
-    names = []
-
-    def listen(event, duration, **about):
-        names.extend([about.get("fun_name")] if event.endswith("backend_compile_duration") else [])
-
-    jax.monitoring.register_event_duration_secs_listener(listen)
-    try:
-        ends = [float(motion(length, jl.Linear()).q[-1]) for length in range(101, 129)]
-    finally:
-        jax.monitoring.unregister_event_duration_listener(listen)
+    ends = [float(motion(length, jl.Linear()).q[-1]) for length in range(101, 129)]
     sizes = {(padded_size(length), padded_size(length - 3)) for length in range(101, 129)}  # of the samples, and of the input
-    assert 1 <= sum("_trajectory" in str(name) for name in names) <= len(sizes) <= 8
+    assert 1 <= sum(count for name, count in lowered.items() if "_trajectory" in str(name)) <= len(sizes) <= 8
     np.testing.assert_allclose(ends, ends[0], rtol=1e-2)

@@ -48,20 +48,6 @@ def answer(function, *given, **named):
     return words.digest()
 
 
-@pytest.fixture
-def lowered():
-    """How often each program was lowered since."""
-    counts, is_on = collections.Counter(), [True]
-
-    def listener(event, _, fun_name=None, **__):
-        if is_on and event.endswith("jaxpr_to_mlir_module_duration"):
-            counts[fun_name] += 1
-
-    jax.monitoring.register_event_duration_secs_listener(listener)
-    yield counts
-    is_on.clear()
-
-
 @pytest.mark.slow
 def test_random_programs_have_words_of_their_own():
     """Two programs have equal words where, and only where, they are printed alike, with the same constants."""
