@@ -26,10 +26,10 @@ from .._program.block_tridiagonal import pairs_in_a_column
 from .._program.block_tridiagonal_lu import Factors as Blocks
 from .._program.block_tridiagonal_lu import factorised as by_blocks
 from .._program.block_tridiagonal_lu import order, positive_eigenvalues, solution
+from .._program.shifted_factors import REFINEMENTS, SHIFT, shifted_where_singular, signs
 from .._program.sparse_jacobian import SPARSE
 from .._program.sparse_matrix import Places, SparseMatrix, picked, summed_by
 from .pseudo_inverse import everywhere
-from .sparse_saddle_point import REFINEMENTS, SHIFT, shifted_where_singular
 
 LIGHT = 0.25  # exponent of eps: a mass beside the largest, below which it sets no scale
 EXACT = 2  # times that a solution is put right where rows are independent: once for GᵀG, once for rounding
@@ -85,7 +85,7 @@ def factorised(M: SparseMatrix, G: SparseMatrix) -> Factors:
     values, (first, second) = values * picked(weights, G.places.rows), how.pairs
     shift = eps**SHIFT * weights**2 / _typical(weights**2, there) + ~there  # as much for each row in the units given
     of_M = M.values * picked(units, M.places.rows) * picked(units, M.places.columns)
-    probe = jnp.asarray(np.random.default_rng(0).choice([-1.0, 1.0], n + m), values.dtype)
+    probe = signs((n + m,), values.dtype)
 
     def factored(delta):
         entries = jnp.concatenate([of_M, picked(values, first) * picked(values, second), values, values, -delta])

@@ -5,7 +5,7 @@ a number that grows with m alone for a chain (b = 1, 2), for a tree or a strip; 
 """
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -15,12 +15,9 @@ from jax import lax
 from jaxtyping import Array, Bool, Float
 
 from .._program.block_tridiagonal import by_factor, elimination, factor
+from .._program.shifted_factors import REFINEMENTS, SHIFT, shifted_where_singular, signs
 from .._program.sparse_matrix import SparseMatrix, picked, summed_by
 from .pseudo_inverse import FOLLOWS, everywhere
-
-SHIFT = 0.35  # exponent of eps: what is added to S where rows depend on each other
-GROWTH = 0.85  # exponent of 1/eps: what S⁻¹ makes of a number where rows do; a straight chain of m links makes m²/8 of it
-REFINEMENTS = 12  # times that a solution is put right then, by what is left
 
 
 class Factors(NamedTuple):
@@ -50,33 +47,11 @@ def factorised(M: lx.DiagonalLinearOperator, G: SparseMatrix) -> Factors:
     below = S[:, 1] * D[:, :, None] * before[:, None, :]
     typical = jnp.exp(-2 * jnp.mean(jnp.log(jnp.where(there, D, 1))))
     shift = eps**SHIFT * D**2 * typical  # as much for each row in the units given
-    probe = jnp.asarray(np.random.default_rng(0).choice([-1.0, 1.0], (*D.shape, 1)), D.dtype)
+    probe = signs((*D.shape, 1), D.dtype)
 
     factored = lambda shift: factor(on + diagonal(shift), below)
     factors, shifted = shifted_where_singular(factored, lambda factors: by_factor(factors, probe), shift, is_work=how.size > 1)
     return Factors(factors, everywhere(~shifted & (jnp.sum(there) == G.shape[0])), D)
-
-
-def shifted_where_singular(factored: Callable, probed: Callable, shift: Array, is_work: bool = True) -> tuple[Any, Bool[Array, ""]]:
-    """Factors without a shift, or with it where the inverse makes too much of a vector at random; and whether that is so. They stand in
-    the program once, but where making them `is_work` no more than adding the shift.
-    """
-
-    is_singular = lambda factors: ~(jnp.max(jnp.abs(probed(factors))) < jnp.finfo(shift.dtype).eps ** -GROWTH)
-    if not is_work:
-        shifted = is_singular(factored(jnp.zeros_like(shift)))
-        return factored(jnp.where(shifted, shift, 0)), shifted
-
-    def attempt(carry):
-        _, _, shifted = carry
-        factors = factored(jnp.where(shifted, shift, 0))
-        again = is_singular(factors) & ~shifted
-        return factors, again, again | shifted
-
-    nothing = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), jax.eval_shape(factored, shift))
-    start = nothing, jnp.array(True), jnp.array(False)
-    factors, _, shifted = lax.while_loop(lambda carry: carry[1], attempt, start)
-    return factors, shifted
 
 
 def solver(M: lx.DiagonalLinearOperator, G: SparseMatrix, factors: Factors) -> tuple[Callable, Callable]:

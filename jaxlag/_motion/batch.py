@@ -18,6 +18,6 @@ class BatchedEquations(AugmentedSystem):
         """The largest of the members."""
         return jnp.max(self.equations.error_norm(error))
 
-    def along_axis(self, function: Callable, t: Any, y: Array, args: Arguments) -> Array:
+    def along_axis(self, function: Callable, t: Any, y: Any, args: Arguments) -> Array:
         member = lambda y, own: function(t, y, Arguments(eqx.combine(args.params, own), args.scales))
         return jax.vmap(member, in_axes=-1, out_axes=-1)(y, args.own)

@@ -26,6 +26,7 @@ from .interval_inputs import Inputs, Rows
 from .protocol import Arguments
 from .results import RESULTS, under_diffrax
 from .runge_kutta import ExplicitRungeKutta
+from .sparse_implicit import SparseImplicit
 from .step_size import GuardedController, ResumingController, with_tolerances
 from .variational import varied_along, with_variations
 
@@ -126,16 +127,26 @@ class IntervalLoop(NamedTuple):
     def _start(self, controller, first, last, y0, following, sample, numbers: Numbers) -> tuple[Moving, Steps]:
         """What is there before the first step."""
         term, y = self._term(), _alone(y0, numbers)
+        args_of = lambda params: numbers.args._replace(params=self.inputs(params).pieces(following))
         params, origin = numbers.varied
-        args = numbers.args._replace(params=self.inputs(params).pieces(following))
         planned = FIRST_STEP if self.dense else None  # and otherwise as the rates and their change suggest
-        t1, controller_state = controller.init(term, first, last, y, planned, args, self.solver.func, self.solver.error_order(term))
-        state, is_new = _initial_state(self.solver, term, first, t1, y, args)
-        changing, rest = eqx.partition(state, eqx.is_inexact_array)
-        unvaried = lambda x: functools.reduce(_with_zeros, y0.shape[y.ndim :], x)
-        moving = Moving(unvaried(origin), y0, jax.tree.map(unvaried, changing))  # y0 is that at a fixed time, where there are directions
+        more = y, planned, args_of(params), self.solver.func, self.solver.error_order(term)
+        t1, controller_state = controller.init(term, first, last, *more)
+
+        def make(y, given):
+            return eqx.partition(self.solver.init(term, first, t1, y, args_of(given[0])), eqx.is_inexact_array)
+
+        is_new = isinstance(getattr(self.solver, "solver", self.solver), (ExplicitRungeKutta, SparseImplicit))
+        if is_new:  # the first step makes the state of the solver, as it does behind a jump
+            zeros = lambda like: jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), like)
+            changing, rest = zeros(jax.eval_shape(make, y, numbers.varied))
+            changing = jax.tree.map(lambda x: functools.reduce(_with_zeros, y0.shape[y.ndim :], x), changing)
+        else:
+            changing, rest = varied_along(make, numbers.directions)(y0, numbers.varied)
+        origin = functools.reduce(_with_zeros, y0.shape[y.ndim :], origin)
+        moving = Moving(origin, y0, changing)  # y0 is that at a fixed time, where there are directions
         zero = jnp.array(0)
-        return moving, Steps(t1 - first, rest, controller_state, is_new, following, sample, dfx.RESULTS.successful, zero, zero)
+        return moving, Steps(t1 - first, rest, controller_state, jnp.array(is_new), following, sample, dfx.RESULTS.successful, zero, zero)
 
     def _varied(self, controller, rounding, steps: Steps, numbers: Numbers) -> Callable:
         """A step of what moves and its value at a sample, with their variations along the directions of what is varied, for each order."""
@@ -230,11 +241,3 @@ def _alone(x: Array, numbers: Numbers) -> Array:
 def _with_zeros(x: Array, size: int) -> Array:
     """With variations of zero as a last axis of this size."""
     return with_variations(x, jnp.zeros((*x.shape, size - 1), x.dtype))
-
-
-def _initial_state(solver, term, t0, t1, y0, args):
-    """The state of the solver, and whether it has yet to be made: by the first step, where that does so behind a jump as well."""
-    make = lambda: solver.init(term, t0, t1, y0, args)
-    if not isinstance(getattr(solver, "solver", solver), ExplicitRungeKutta):
-        return make(), jnp.array(False)
-    return jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), jax.eval_shape(make)), jnp.array(True)

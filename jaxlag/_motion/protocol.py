@@ -110,15 +110,19 @@ class AugmentedSystem(abc.ABC):
         """y, put back on the manifold."""
         return _along_axis(self, "projected", t, y, args)
 
+    def imbalance(self, t: Any, state: tuple[Array, Array], args: Arguments) -> Array:
+        """Of y and (q̈, λ): what is left of the equations."""
+        return _along_axis(self, "imbalance", t, state, args)
+
     @abc.abstractmethod
     def error_norm(self, error: Array) -> Array:
         """The size of an error of y."""
 
     @abc.abstractmethod
-    def along_axis(self, function: Callable, t: Any, y: Array, args: Arguments) -> Array:
+    def along_axis(self, function: Callable, t: Any, y: Any, args: Arguments) -> Array:
         """A function (t, y, args) of the equations, for all that lies along the last axis."""
 
 
 @jitted  # so that diffrax's many calls trace it once
-def _along_axis(augmented: AugmentedSystem, name: str, t: Any, y: Array, args: Arguments) -> Array:
+def _along_axis(augmented: AugmentedSystem, name: str, t: Any, y: Any, args: Arguments) -> Array:
     return augmented.along_axis(getattr(augmented.equations, name), t, y, args)

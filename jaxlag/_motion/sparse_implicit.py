@@ -1,12 +1,13 @@
-"""Diagonally implicit Runge–Kutta schemes for many coordinates, where each acceleration depends on a few of them.
+"""Diagonally implicit Runge–Kutta schemes for many coordinates, where each force and each constraint depends on a few of them.
 
-A stage is an equation for its velocities alone: with Q = q* + γh V,
+A stage is an equation for its accelerations and multipliers: with V = v* + γh A and Q = q* + γh V,
 
-    V − v* − γh q̈(t, Q, V) = 0,     Newton's matrix  1 − γh ∂q̈/∂v − (γh)² ∂q̈/∂q,
+    r = M A − f − Gᵀλ = 0,               [M + γh ∂r/∂v + (γh)² ∂r/∂q    −Gᵀ]
+    s = G A + γ = 0,     Newton's matrix [G + γh ∂s/∂v + (γh)² ∂s/∂q      0]
 
-which is as sparse as the accelerations are: a few directional derivatives make it, and it is factorised once a step, in blocks. Errors
-are judged in positions and velocities: in rates, as diffrax does, a stiff spring asks for positions to rounding (128 springs of
-k = 1e6 over 1 s at rtol 1e-5: 803 steps, half of them refused, in place of 110).
+which is as sparse as these are, and q̈ = M⁻¹(f + Gᵀλ) is not: a few directional derivatives make it, and it is factorised once a step, in
+blocks, each multiplier behind all that its row holds. Errors are judged in positions and velocities: in rates, as diffrax does, a stiff
+spring asks for positions to rounding (128 springs of k = 1e6 over 1 s at rtol 1e-5: 803 steps, half of them refused, in place of 110).
 
 Source: Hairer & Wanner, Solving Ordinary Differential Equations II, sections IV.6 and IV.8.
 """
@@ -22,10 +23,9 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float
 
-from .._program.block_tridiagonal_lu import Factors
 from .._program.sparse_jacobian import MANY
 from .._program.sparse_matrix import Places
-from .._program.sparse_newton import by_factors, factors_along, linear_solution, newton_places
+from .._program.sparse_newton import NewtonFactors, by_factors, factors_along, linear_solution
 from .batch import BatchedEquations
 from .first_order import EquationsOfMotion
 from .protocol import Arguments, FirstOrderSystem
@@ -33,9 +33,11 @@ from .runge_kutta import as_rows, weighted, with_row
 
 
 class Iteration(NamedTuple):
-    """Newton's iteration for the velocities of a stage, with the sizes of its last change and of the one before, in tolerances."""
+    """Newton's iteration for the accelerations and multipliers of a stage, with the sizes of its last change and of the one before, in
+    tolerances.
+    """
 
-    V: Array
+    u: Array
     size: Float[Array, ""]
     before: Float[Array, ""]
     count: Any
@@ -47,7 +49,7 @@ class Iteration(NamedTuple):
 
     def has_converged(self, kappa: float) -> Bool[Array, ""]:
         """Whether what is left of the error is below κ."""
-        tiny = self.size < 100 * jnp.finfo(self.V.dtype).eps
+        tiny = self.size < 100 * jnp.finfo(self.u.dtype).eps
         return (self.count > 1) & (tiny | ((self.rate < 1) & (self.size * self.rate < kappa * (1 - self.rate))))
 
     def goes_on(self, kappa: float, most: int) -> Bool[Array, ""]:
@@ -57,9 +59,10 @@ class Iteration(NamedTuple):
 
 
 class SparseImplicit(dfx.AbstractImplicitSolver, dfx.AbstractAdaptiveSolver):
-    """The scheme of a solver of diffrax, its stages solved in the structure of the accelerations."""
+    """The scheme of a solver of diffrax, its stages solved in the structure of the equations; from step to step λ is handed on."""
 
     scheme: type[dfx.AbstractESDIRK] = eqx.field(static=True)
+    equations: Any = eqx.field(static=True)
     places: Places = eqx.field(static=True)  # of Newton's matrix
     root_finder: Any  # diffrax's, with its tolerances
     root_find_max_steps: int
@@ -73,66 +76,70 @@ class SparseImplicit(dfx.AbstractImplicitSolver, dfx.AbstractAdaptiveSolver):
         return self.scheme().order(terms)
 
     def init(self, terms, t0, t1, y0, args):
-        return terms.vf(t0, y0, args)
+        n = self.places.last
+        return terms.vf(t0, y0, args), jnp.zeros((self.places.shape[0] - n, *y0.shape[1:]), y0.dtype)
 
     def func(self, terms, t0, y0, args):
         return terms.vf(t0, y0, args)
 
     def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
-        tableau, h, n = self.scheme.tableau, t1 - t0, self.places.shape[0]
+        tableau, h, n = self.scheme.tableau, t1 - t0, self.places.last
         gamma_h = float(tableau.a_diagonal[-1]) * h
+        first, multipliers = solver_state
         if made_jump is not False:
-            solver_state = lax.cond(made_jump, lambda: terms.vf(t0, y0, args), lambda: solver_state)
+            first = lax.cond(made_jump, lambda: terms.vf(t0, y0, args), lambda: first)
 
-        def state(V, base):
+        def state(u, base):
+            V = base[n : 2 * n] + gamma_h * u[:n]
             return jnp.concatenate([base[:n] + gamma_h * V, V, base[2 * n :]])
 
-        def residual(V, t, base):
-            return V - base[n : 2 * n] - gamma_h * terms.vf(t, state(V, base), args)[n : 2 * n]
+        def residual(u, t, base):
+            return self.equations.imbalance(t, (state(u, base), u), args)
 
-        at_start = y0.at[:n].add(-gamma_h * y0[n : 2 * n])
-        _, push = jax.linearize(lambda V: residual(V, t0, at_start), y0[n : 2 * n])
-        factors = factors_along(push, self.places, y0[:n])
+        at_start = jnp.concatenate([y0[:n] - gamma_h * y0[n : 2 * n], y0[n : 2 * n] - gamma_h * first[n : 2 * n], y0[2 * n :]])
+        u0 = jnp.concatenate([first[n : 2 * n], multipliers])
+        _, push = jax.linearize(lambda u: residual(u, t0, at_start), u0)
+        factors = factors_along(push, self.places, u0)
 
         def stage(carry, row):
-            f, solved = carry
+            f, multipliers, solved = carry
             i, c, weights, predicting = row
             t, base = jnp.where(c == 1, t1, t0 + c * h), y0 + h * weighted(weights, f)
-            guess = base[n : 2 * n] + gamma_h * weighted(predicting, f)[n : 2 * n]
-            V, converged = self._root(lambda V: residual(V, t, base), guess, base, state, factors)
-            rates = jnp.concatenate([V, (V - base[n : 2 * n]) / gamma_h])
+            guess = jnp.concatenate([weighted(predicting, f)[n : 2 * n], multipliers])
+            u, converged = self._root(lambda u: residual(u, t, base), guess, base, state, factors)
+            end = state(u, base)
+            rates = jnp.concatenate([end[n : 2 * n], u[:n]])
             if len(y0) > 2 * n:
-                rates = jnp.concatenate([rates, terms.vf(t, state(V, base), args)[2 * n :]])
-            return (with_row(f, rates, i), solved & converged), None
+                rates = jnp.concatenate([rates, terms.vf(t, end, args)[2 * n :]])
+            return (with_row(f, rates, i), u[n:], solved & converged), None
 
         size, dtype = len(tableau.b_sol), y0.dtype
         lower, predictor = (as_rows(rows, size, dtype) for rows in (tableau.a_lower, tableau.a_predictor))
         rows = np.arange(1, size), np.asarray(tableau.c, dtype), lower, predictor
-        start = jnp.concatenate([solver_state[None], jnp.zeros((size - 1, *y0.shape), dtype)])
-        (f, solved), _ = lax.scan(stage, (start, jnp.array(True)), rows)
+        start = jnp.concatenate([first[None], jnp.zeros((size - 1, *y0.shape), dtype)])
+        (f, multipliers, solved), _ = lax.scan(stage, (start, multipliers, jnp.array(True)), rows)
         y1, error = y0 + h * weighted(tableau.b_sol.astype(dtype), f), h * weighted(tableau.b_error.astype(dtype), f)
         result = dfx.RESULTS.where(solved, dfx.RESULTS.successful, dfx.RESULTS.nonlinear_divergence)
-        return y1, jnp.where(solved, error, jnp.inf), {"y0": y0, "y1": y1, "k": h * f}, f[-1], result
+        return y1, jnp.where(solved, error, jnp.inf), {"y0": y0, "y1": y1, "k": h * f}, (f[-1], multipliers), result
 
-    def _root(self, residual: Callable, guess, base, state: Callable, factors: Factors):
-        """V where the residual is zero, with the derivative of what that says; and whether it was found."""
-        finder, n = self.root_finder, len(guess)
+    def _root(self, residual: Callable, guess, base, state: Callable, factors: NewtonFactors):
+        """Where the residual is zero, with the derivative of what that says; and whether it was found."""
+        finder, n = self.root_finder, self.places.last
 
         def iterated(residual, guess):
             def changed(iteration):
-                change = by_factors(self.places, factors, residual(iteration.V))
-                V = iteration.V - change
-                of_both = (state(V, base) - state(iteration.V, base))[: 2 * n]
-                scale = finder.atol + finder.rtol * jnp.abs(state(V, base)[: 2 * n])
-                return Iteration(V, finder.norm(of_both / scale), iteration.size, iteration.count + 1)
+                u = iteration.u - by_factors(self.places, factors, residual(iteration.u))
+                of_both = (state(u, base) - state(iteration.u, base))[: 2 * n]
+                scale = finder.atol + finder.rtol * jnp.abs(state(u, base)[: 2 * n])
+                return Iteration(u, finder.norm(of_both / scale), iteration.size, iteration.count + 1)
 
             one = jnp.ones((), guess.dtype)
             start = Iteration(guess, one, one, 0)
             end = lax.while_loop(lambda it: it.goes_on(finder.kappa, self.root_find_max_steps), changed, start)
-            return end.V, end.has_converged(finder.kappa).astype(guess.dtype)  # a number: JAX wants its derivative, too
+            return end.u, end.has_converged(finder.kappa).astype(guess.dtype)  # a number: JAX wants its derivative, too
 
-        V, converged = lax.custom_root(residual, guess, iterated, lambda push, b: linear_solution(push, self.places, b), has_aux=True)
-        return V, converged > 0
+        u, converged = lax.custom_root(residual, guess, iterated, lambda push, b: linear_solution(push, self.places, b), has_aux=True)
+        return u, converged > 0
 
 
 def in_structure(solver: Any, equations: FirstOrderSystem, t0, y0, args: Arguments) -> Any:
@@ -148,6 +155,6 @@ def in_structure(solver: Any, equations: FirstOrderSystem, t0, y0, args: Argumen
     chosen = solver.root_finder != type(solver)().root_finder
     if chosen or alone.modes or alone.light or alone.states.size:
         return solver
-    y, n, args = y0[(..., *[0] * (y0.ndim - 1))], alone.size, Arguments(params, args.scales)
-    places = newton_places(lambda y: alone.rates(t0, y, args)[n : 2 * n], y, n)
-    return solver if places is None else SparseImplicit(type(solver), places, solver.root_finder, solver.root_find_max_steps)
+    y, args = y0[(..., *[0] * (y0.ndim - 1))], Arguments(params, args.scales)
+    places = alone.newton_places(t0, y, args)
+    return solver if places is None else SparseImplicit(type(solver), equations, places, solver.root_finder, solver.root_find_max_steps)

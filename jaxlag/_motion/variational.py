@@ -84,7 +84,7 @@ class VariationalEquations(AugmentedSystem):
         """The error of the motion alone sets the steps."""
         return self.equations.error_norm(error[..., 0])
 
-    def along_axis(self, function: Callable, t: Any, y: Array, args: Arguments) -> Array:
+    def along_axis(self, function: Callable, t: Any, y: Any, args: Arguments) -> Array:
         *before, directions = args.directions
         given = lambda numbers: Arguments(numbers[0], own=numbers[1], directions=tuple(before))
         along = varied_along(lambda y, numbers: (function(t, y, given(numbers)), None), [directions])

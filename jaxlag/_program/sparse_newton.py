@@ -1,23 +1,28 @@
 """Newton's matrix of a function of many numbers, sparse: its places, its factors from a few directions, and what it solves."""
 
 from collections.abc import Callable
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import scipy.sparse
 from jax import lax
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from .array_dependence import dependence
 from .block_tridiagonal_lu import Factors, factorised, order, solution, transposed
 from .expressions import TooLong
+from .shifted_factors import REFINEMENTS, SHIFT, shifted_where_singular, signs
 from .sparse_jacobian import SPARSE
-from .sparse_matrix import Places, SparseMatrix, colors
+from .sparse_matrix import Places, SparseMatrix, colors, picked, summed_by
+
+LIGHT = 0.25  # exponent of eps: a number on the diagonal beside the largest, below which it sets no scale
 
 
 def newton_places(function: Callable, x: Float[Array, " k"], n: int) -> Places | None:
-    """Those of 1 + A + B + …, where A, B, … are the n columns each of ∂f/∂x that come first; None where a dense matrix serves better.
+    """Those of ∂f/∂u + ∂f/∂v + ∂f/∂q, x = (q, v, u): n columns each of the last two, which are the first of x. Rows behind the n-th come
+    last. None where a dense matrix serves better.
 
     That is where there are many entries in a row, many directions, or blocks so large that there are few.
     """
@@ -25,7 +30,8 @@ def newton_places(function: Callable, x: Float[Array, " k"], n: int) -> Places |
         found = dependence(function, x)
     except TooLong:
         return None
-    return sparse_places(found[:, :n] + found[:, n : 2 * n])
+    first = found[:, :n] + found[:, n : 2 * n] + found[:, 2 * n : 3 * n]
+    return sparse_places(scipy.sparse.hstack([first, found[:, 3 * n :]], "csr"), last=n)
 
 
 def sparse_places(pattern: scipy.sparse.csr_matrix, last: int | None = None, sparse: int = SPARSE) -> Places | None:
@@ -40,18 +46,48 @@ def sparse_places(pattern: scipy.sparse.csr_matrix, last: int | None = None, spa
     return places if sparse * order(places).size <= n else None
 
 
-def factors_along(push: Callable, places: Places, like: Float[Array, "n *b"]) -> Factors:  # noqa: F821
+class NewtonFactors(NamedTuple):
+    """Those of a matrix in `units` in which its numbers are near one; where rows that come last depend on each other, in so far as
+    they are not `regular`, with a −δ in place of their zeros: what is left of a solution puts it right.
+    """
+
+    of: Factors
+    units: Float[Array, " n"]
+    regular: Bool[Array, ""]
+
+
+def factors_along(push: Callable, places: Places, like: Float[Array, "n *b"]) -> NewtonFactors:  # noqa: F821
     """Of a matrix, by its products along a few directions; of each of a batch, along the last axis. They are not differentiated."""
     color = colors(places.pattern())
     directions = jnp.asarray(np.arange(max(color) + 1)[:, None] == color, like.dtype)
     directions = jnp.broadcast_to(directions.reshape(*directions.shape, *[1] * (like.ndim - 1)), (len(directions), *like.shape))
     values = jax.vmap(push)(directions)[color[places.columns], places.rows]
-    return lax.stop_gradient(_of_each(lambda values: factorised(SparseMatrix(values, places)), like)(values))
+    return lax.stop_gradient(_of_each(lambda values: _factorised(SparseMatrix(values, places)), like)(values))
 
 
-def by_factors(places: Places, factors: Factors, b: Float[Array, "n *b"]) -> Float[Array, "n *b"]:  # noqa: F821
+def _factorised(A: SparseMatrix) -> NewtonFactors:
+    (n, _), last = A.shape, A.places.last
+    if last is None or last == n:
+        return NewtonFactors(factorised(A), jnp.ones(n, A.values.dtype), jnp.array(True))
+    rows, columns, eps = A.places.rows, A.places.columns, jnp.finfo(A.values.dtype).eps
+    is_last = np.arange(n) >= last
+    size = jnp.abs(summed_by(A.places, jnp.where(rows == columns, A.values, 0)))
+    size = jnp.where(is_last, 0, jnp.maximum(size, eps**LIGHT * jnp.max(size)))
+    units = jnp.where(is_last, 0, lax.rsqrt(jnp.where(is_last, 1, size)))
+    length = summed_by(A.places, (A.values * picked(units, columns)) ** 2)
+    units = jnp.where(is_last, lax.rsqrt(jnp.where(length > 0, length, 1)), units)
+    scaled = SparseMatrix(A.values * picked(units, rows) * picked(units, columns), A.places)
+    shift = jnp.where(is_last, -(eps**SHIFT), 0.0)
+    probe = signs((n,), units.dtype)
+    factors, shifted = shifted_where_singular(
+        lambda shift: factorised(scaled.plus_diagonal(shift)), lambda factors: solution(A.places, factors, probe), shift
+    )
+    return NewtonFactors(factors, units, ~shifted)
+
+
+def by_factors(places: Places, factors: NewtonFactors, b: Float[Array, "n *b"]) -> Float[Array, "n *b"]:  # noqa: F821
     """A⁻¹ b, of each of a batch."""
-    return _of_each(lambda factors, b: solution(places, factors, b), b)(factors, b)
+    return _of_each(lambda factors, b: factors.units * solution(places, factors.of, factors.units * b), b)(factors, b)
 
 
 def linear_solution(push: Callable, places: Places, b: Float[Array, "n *b"]) -> Float[Array, "n *b"]:  # noqa: F821
@@ -60,12 +96,14 @@ def linear_solution(push: Callable, places: Places, b: Float[Array, "n *b"]) -> 
 
     def refined(factors):
         def solve(matvec, b):
-            x = by_factors(places, factors, b)
-            return x + by_factors(places, factors, b - matvec(x))
+            times = jnp.where(jnp.all(factors.regular), 1, REFINEMENTS)
+            turn = lambda _, x: x + by_factors(places, factors, b - matvec(x))
+            return lax.fori_loop(0, times, turn, by_factors(places, factors, b))
 
         return solve
 
-    return lax.custom_linear_solve(push, b, refined(factors), refined(_of_each(transposed, b)(factors)))
+    turned = factors._replace(of=_of_each(transposed, b)(factors.of))
+    return lax.custom_linear_solve(push, b, refined(factors), refined(turned))
 
 
 def _of_each(function: Callable, like: Array) -> Callable:

@@ -216,6 +216,15 @@ def test_gradients_in_many_numbers_are_compiled_once(lowered):
     np.testing.assert_allclose(along, 100 * expected, rtol=1e-7)
 
 
+@pytest.mark.parametrize("solver", [diffrax.ReversibleHeun(), diffrax.Kvaerno3()], ids=["ReversibleHeun", "Kvaerno3"])
+def test_what_a_solver_keeps_from_the_start_is_differentiated(solver):
+    """Rates at the start, or none of them."""
+    system = jl.System(lambda q, qdot, c: 0.5 * qdot**2 - 0.5 * c * q**2)
+    end = lambda x: jl.simulate(system, x[0], 0.0, [0.0, 2.0], {"c": x[1]}, solver=solver, rtol=1e-6, atol=1e-8).q[-1]
+    exact = jax.grad(lambda x: x[0] * jnp.cos(2 * jnp.sqrt(x[1])))(jnp.array([1.0, 4.0]))
+    np.testing.assert_allclose(jax.jacfwd(end)(jnp.array([1.0, 4.0])), exact, atol=3e-6)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("adjoint, derivative", [(diffrax.RecursiveCheckpointAdjoint(), jax.grad), (diffrax.ForwardMode(), jax.jacfwd)])
 def test_an_adjoint_of_diffrax_can_be_asked_for(adjoint, derivative):

@@ -1,0 +1,40 @@
+"""Factors of a matrix that may be singular: then something is added to its diagonal, and what it solves is put right by what is left."""
+
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array, Bool, Float
+
+SHIFT = 0.35  # exponent of eps: what is added then, in units in which the matrix has numbers near one
+GROWTH = 0.85  # exponent of 1/eps: what the inverse makes of a number then; that of a straight chain of m links makes m²/8 of it
+REFINEMENTS = 12  # times that a solution is put right then
+
+
+def shifted_where_singular(factored: Callable, probed: Callable, shift: Array, is_work: bool = True) -> tuple[Any, Bool[Array, ""]]:
+    """Factors without a shift, or with it where the inverse makes too much of a vector at random; and whether that is so. They stand in
+    the program once, but where making them `is_work` no more than adding the shift.
+    """
+    is_singular = lambda factors: ~(jnp.max(jnp.abs(probed(factors))) < jnp.finfo(shift.dtype).eps ** -GROWTH)
+    if not is_work:
+        shifted = is_singular(factored(jnp.zeros_like(shift)))
+        return factored(jnp.where(shifted, shift, 0)), shifted
+
+    def attempt(carry):
+        _, _, shifted = carry
+        factors = factored(jnp.where(shifted, shift, 0))
+        again = is_singular(factors) & ~shifted
+        return factors, again, again | shifted
+
+    nothing = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), jax.eval_shape(factored, shift))
+    start = nothing, jnp.array(True), jnp.array(False)
+    factors, _, shifted = lax.while_loop(lambda carry: carry[1], attempt, start)
+    return factors, shifted
+
+
+def signs(shape: tuple[int, ...], dtype: Any) -> Float[Array, "..."]:
+    """A vector at random, in no null space but by chance."""
+    return jnp.asarray(np.random.default_rng(0).choice([-1.0, 1.0], shape), dtype)
