@@ -38,6 +38,7 @@ WINGS = {  # each imports only from those above it, and each file of a wing only
         "sparse_matrix",
         "block_tridiagonal",
         "block_tridiagonal_lu",
+        "shifted_factors",
         "array_dependence",
         "sparse_jacobian",
         "running_sums",

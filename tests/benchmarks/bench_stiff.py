@@ -3,14 +3,15 @@
 python tests/benchmarks/bench_stiff.py [most springs of a chain]
 
 1 s of a chain, fixed at one end, from rest at an angle; 0.2 s of a net that hangs on two corners; k = 1e6, rtol 1e-5, atol 1e-7. By hand:
-`solve_ivp` with the sparsity of the Jacobian stated. CPU time, the least of three calls, each size in a process of its own.
+`solve_ivp` with the sparsity of the Jacobian stated. CPU time, the least of three calls, each size in a process of its own. And 1 s of a
+rope of rods whose joints resist bending, stiffly, beside the explicit scheme.
 """
 
 import subprocess
 import sys
 from time import process_time
 
-CHAINS, NETS = (128, 512, 1000, 4000), (20, 35, 50)
+CHAINS, NETS, ROPES = (128, 512, 1000, 4000), (20, 35, 50), (64, 256, 1000)
 TITLES, WIDTHS = ("", "n", "jaxlag s", "Radau s", "BDF s", "ratio", "first s", "steps", "MB", "apart"), (6, 6, 10, 9, 8, 8, 9, 7, 7, 10)
 STIFFNESS, DAMPING, GRAVITY = 1e6, 1e3, 9.81
 
@@ -118,7 +119,48 @@ def line(kind, n):
     )
 
 
+def rope(n):
+    """One line: a rope of n rods, by the implicit and by the explicit scheme."""
+    import diffrax
+    import jax
+    import jax.numpy as jnp
+    import numpy as np
+
+    import jaxlag as jl
+
+    jax.config.update("jax_enable_x64", True)
+    joined = lambda x: jnp.diff(jnp.concatenate([jnp.zeros((1, 2)), x]), axis=0)
+    cross = lambda a, b: a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]
+
+    def lagrangian(q, qdot, g, B):
+        s = joined(q)
+        return 0.5 * jnp.sum(qdot**2) - g * jnp.sum(q[:, 1]) - 0.5 * B * jnp.sum(cross(s[:-1], s[1:]) ** 2)
+
+    def bending(q, qdot, c):
+        s, w = joined(q), joined(qdot)
+        return 0.5 * c * jnp.sum((cross(s[:-1], w[1:]) + cross(w[:-1], s[1:])) ** 2)
+
+    rods = lambda q: jnp.sum(joined(q) ** 2, axis=1) - 1
+    system = jl.System(lagrangian, dissipation={"bending": bending}, holonomic={"rods": rods})
+    angles = np.linspace(0.3, 1.2, n)
+    q = np.cumsum(np.stack([np.sin(angles), -np.cos(angles)], axis=1), axis=0)
+    params, ts = {"g": GRAVITY, "B": STIFFNESS, "c": DAMPING}, np.linspace(0, 1, 11)
+    runs = {}
+    for solver in (diffrax.Kvaerno5(), jl.Dop853()):
+        run = lambda solver=solver: jl.simulate(system, q, np.zeros_like(q), ts, params, solver=solver, rtol=1e-6, atol=1e-8)
+        first, each, found = timed(lambda run=run: jax.block_until_ready(run()), 2)
+        runs[type(solver).__name__] = each, first, found
+    off = float(np.abs(runs["Kvaerno5"][2].q - runs["Dop853"][2].q).max())
+    words = [
+        f"{name} {each:.3f} s, {int(found.stats['num_steps'])} steps, the first {first:.1f} s"
+        for name, (each, first, found) in runs.items()
+    ]
+    print(f"  rope{n:>6} rods: {'; '.join(words)}; apart {off:.1e}")
+
+
 def main():
+    if len(sys.argv) == 3 and sys.argv[1] == "rope":
+        return rope(int(sys.argv[2]))
     if len(sys.argv) == 3:
         return line(sys.argv[1], int(sys.argv[2]))
     most = int(sys.argv[1]) if len(sys.argv) > 1 else CHAINS[-1]
@@ -128,6 +170,8 @@ def main():
         for n in sizes:
             if kind == "net" or n <= most:
                 subprocess.run([sys.executable, __file__, kind, str(n)], check=True)
+    for n in ROPES:
+        subprocess.run([sys.executable, __file__, "rope", str(n)], check=True)
 
 
 if __name__ == "__main__":
