@@ -1,8 +1,8 @@
 """Programs cut at their running sums: what lies between the cuts touches few numbers each.
 
 Positions of a chain in joint angles are sums of all links before, x = Σ l sin φ: each velocity depends on half of q̇, and ∂²L/∂q̇² is full.
-With the running sums w = (u₁, u₁ + u₂, …) as further unknowns, L(q̇, w) and the summands u(q̇, w) are sparse again. A number that is
-repeated along an axis is a running sum, too: of itself and zeros.
+With the running sums w = (u₁, u₁ + u₂, …) as further unknowns, L(q̇, w) and the summands u(q̇, w) are sparse again. A product with a
+triangle of ones is a running sum, too; and a number that is repeated along an axis, of itself and zeros.
 """
 
 from collections.abc import Callable
@@ -14,11 +14,11 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from .array_dependence import dependence
-from .constants import ELEMENTWISE, as_function
+from .constants import ELEMENTWISE, as_function, fold_by_jax, is_numeric
 from .expressions import TooLong
 from .sparse_jacobian import entries
 from .sparse_matrix import SparseMatrix, colors
-from .walker import CALLS, called_program, walk
+from .walker import CALLS, called_program, primitive_names, walk
 
 MIN_LENGTH = 16  # of an axis, from which on a sum along it is cut
 MAX_COLORS = 48  # directions of a chain of bodies in space with some sums each; more, and it is not sparse between the cuts
@@ -98,12 +98,14 @@ class _Cuts:
 
     def __init__(self, given: list[Array] | None = None):
         self.given = given
+        self.has_products = False
         self.sums: list[RunningSum] = []
         self.values: list[Array] = []
         self.summands: list[Array] = []
 
     def run(self, closed: Any, x: Array) -> Array:
         """The result."""
+        self.has_products = "dot_general" in primitive_names(closed)
         return self.within(closed, [(x, True)])[0][0]
 
     def within(self, program: Any, operands: list) -> list:
@@ -114,6 +116,10 @@ class _Cuts:
         """The rule of running sums; all else is as it was."""
         name, p = equation.primitive.name, equation.params
         arrays, depends = [array for array, _ in operands], any(moves for _, moves in operands)
+        if self.has_products and not depends and all(map(is_numeric, arrays)):  # it may be what something is multiplied by
+            return [(array, False) for array in fold_by_jax(equation, arrays)]
+        if name == "dot_general" and (product := _as_running_sum(arrays, [moves for _, moves in operands], p)) is not None:
+            return [(self.cut(*product), True)]
         if depends and name in CALLS:
             return self.within(called_program(equation), operands)
         if depends and name == "cumsum" and arrays[0].shape[p["axis"]] >= MIN_LENGTH:
@@ -143,3 +149,19 @@ class _Cuts:
         self.values.append(w)
         self.summands.append(summands.ravel())
         return w.reshape(kind.shape)
+
+
+def _as_running_sum(arrays: list, depends: list[bool], p: dict) -> tuple[Array, RunningSum] | None:
+    """The summands of a product with a triangle of ones along one axis, and their sums; None where it is another product."""
+    (contracted, batch), at = p["dimension_numbers"], depends.index(True) if any(depends) else 0
+    x, K = arrays[at], arrays[1 - at]
+    is_matrix = sum(depends) == 1 and is_numeric(K) and np.ndim(K) == 2 and K.shape[0] == K.shape[1] >= MIN_LENGTH
+    if not is_matrix or len(contracted[0]) != 1 or batch[0]:
+        return None
+    A = np.asarray(K) if contracted[1 - at] == (1,) else np.asarray(K).T
+    reverse = not np.array_equal(A, np.tril(np.ones(A.shape)))
+    if reverse and not np.array_equal(A, np.triu(np.ones(A.shape))):
+        return None
+    axis = 0 if at else x.ndim - 1  # where the axis of the matrix stands in the product
+    summands = jnp.moveaxis(x, contracted[at][0], axis)
+    return summands, RunningSum(summands.shape, axis, reverse)

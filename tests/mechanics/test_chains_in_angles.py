@@ -7,6 +7,7 @@ import pytest
 from scipy.linalg import eigvalsh_tridiagonal
 
 import jaxlag as jl
+from jaxlag._mechanics.structured_inertia import StructuredInertia, structured_inertia
 
 RNG = np.random.default_rng(3)
 GRAVITY = 9.81
@@ -60,6 +61,38 @@ def test_velocities_by_a_directional_derivative_and_several_chains_at_once():
     found = jax.vmap(lambda q: jl.acceleration(system, q, v, given).qddot)(qs)
     for q, qddot in zip(qs, found, strict=True):
         close(qddot, np.linalg.solve(*by_hand(q, v, given)), 1e-10)
+
+
+ONES = np.tril(np.ones((80, 80)))
+PRODUCTS = {  # velocities of the masses, by what is made of the steps (links, 2) of each link
+    "a triangle on the left": (lambda steps: ONES @ steps, True),
+    "made within L": (lambda steps: jnp.tril(jnp.ones((80, 80))) @ steps, True),
+    "on the right, transposed": (lambda steps: (steps.T @ ONES.T).T, True),
+    "axes in another order": (lambda steps: jnp.einsum("ij,jk->ki", ONES, steps).T, True),
+    "from the other end": (lambda steps: (ONES.T @ steps[::-1])[::-1], True),
+    "not all of them ones": (lambda steps: (ONES * (1 + 1e-9 * np.eye(80))) @ steps, False),
+    "one more": (lambda steps: (ONES + np.eye(80, k=7)) @ steps, False),
+    "no triangle": (lambda steps: np.roll(ONES, 3, axis=0) @ steps, False),
+}
+
+
+@pytest.mark.parametrize("name", PRODUCTS)
+def test_a_product_with_a_triangle_of_ones_is_a_running_sum(name):
+    """And another product is not: compared with JAX's own second derivatives of L."""
+    velocities, is_sum = PRODUCTS[name]
+
+    def of_products(q, qdot, m, l, g):
+        v = velocities(l[:, None] * jnp.stack([jnp.cos(q), jnp.sin(q)], axis=1) * qdot[:, None])
+        return jnp.sum(0.5 * m * jnp.sum(v**2, axis=1)) + g * jnp.sum(jnp.cos(q))
+
+    q, v, given = state(80)
+    L = lambda q, v: of_products(q, v, **given)
+    M = structured_inertia(lambda v: L(q, v), jnp.asarray(v))
+    assert (isinstance(M, StructuredInertia) and bool(M.sums)) == is_sum
+    dense = jax.hessian(L, 1)(q, v)
+    close(M.as_matrix(), dense, 1e-14)
+    carried = jax.jvp(lambda q: jax.grad(L, 1)(q, v), (q,), (v,))[1]
+    close(jl.acceleration(jl.System(of_products), q, v, given).qddot, np.linalg.solve(dense, jax.grad(L)(q, v) - carried), 1e-9)
 
 
 @pytest.mark.slow
