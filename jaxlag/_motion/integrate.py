@@ -64,6 +64,11 @@ class SolverOptions:
             kinds, cure = CHOICES[name]
             if not isinstance(given, kinds):
                 raise TypeError(f"`{name}` must be an object that makes the choice, but is {given!r}. Take e.g. {cure}.")
+        if not isinstance(solver, dfx.AbstractAdaptiveSolver) or solver.term_structure is not dfx.AbstractTerm:
+            raise TypeError(
+                "`solver` must estimate its error and solve ẏ = f(t, y) as a whole, but "
+                f"`diffrax.{type(solver).__name__}` does not. Take e.g. {CHOICES['solver'][1]}."
+            )
         count(max_steps, "`max_steps`", cure="The default is 100_000.")
         return cls(solver, formulation, max_steps, adjoint, progress)
 
