@@ -227,6 +227,8 @@ class IntervalLoop(NamedTuple):
         more = error, self.solver.error_order(term), steps.controller_state
         keep, t, end, _, control, controlled = controller.adapt_step_size(*states, args, *more)
         y, state = jax.tree.map(lambda new, old: jnp.where(keep, new, old), (y1, new), (y0, state))
+        if result is dfx.RESULTS.successful:  # always, as of an explicit scheme: to compare them would be compiled
+            return keep, y, state, dense, end - t, control, controlled
         ended = result != dfx.RESULTS.successful
         if not (self.equations.contacts or self.equations.events):
             ended &= keep  # what was refused is tried again
