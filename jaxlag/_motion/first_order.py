@@ -16,7 +16,6 @@ from .._mechanics.contact import free, in_contact
 from .._mechanics.friction_elements import FrictionElements, light_coordinates
 from .._mechanics.friction_treatment import Regularised, StickSlip
 from .._mechanics.impact import check_impacts
-from .._mechanics.lagrange import imbalance
 from .._mechanics.massless import completed, first_order
 from .._mechanics.power import energy_exchange, listed_powers
 from .._mechanics.projection import Baumgarte, NoStabilisation, Projection
@@ -28,8 +27,6 @@ from .._model.state_values import NOTHING, Layout, of_first_order, period, ravel
 from .._model.system import System
 from .._program.jit import jitted
 from .._program.scalarise import scalarised
-from .._program.sparse_matrix import Places
-from .._program.sparse_newton import newton_places
 from .._program.walker import used_arguments
 from .interval_inputs import called_elsewhere, pieces_at, warn_of_delays
 from .protocol import Arguments
@@ -215,20 +212,6 @@ class EquationsOfMotion:
         """ẏ."""
         return _rates(self, t, y, args)
 
-    def imbalance(self, t, state, args):
-        """Of y and (q̈, λ): M q̈ − f − Gᵀλ and G q̈ + γ, which are zero in motion."""
-        return _imbalance(self, t, *state, args)
-
-    def newton_places(self, t, y, args) -> Places | None:
-        """Those of the derivatives of the imbalance by q̈ and λ where q̇, and q, move with q̈; None where a dense matrix serves better."""
-        n, rows = self.size, self.flat_at(args.params, self.states_of(t, self.parts(y))).rows
-
-        def imbalance(x):
-            q, v, u = jnp.split(x, [n, 2 * n])
-            return self.imbalance(t, (jnp.concatenate([q, v, y[2 * n :]]), u), args)
-
-        return newton_places(imbalance, jnp.concatenate([y[: 2 * n], jnp.zeros(n + rows, y.dtype)]), n)
-
     def projected(self, t, y, args):
         """y, put back on the constraints."""
         return _projected(self, t, y, args, False)
@@ -268,15 +251,6 @@ def _rates(equations: EquationsOfMotion, t, y, args):
     stuck = parts.time_stuck if elements is None else jnp.maximum(sticking(elements, sigma).astype(y.dtype), held)
     resting = Parts(*(jnp.zeros_like(part) for part in parts))
     return resting._replace(q=v, v=qddot, z=rates, works=powers, time_stuck=stuck).y
-
-
-@jitted
-def _imbalance(equations: EquationsOfMotion, t, y, u, args):
-    parts = equations.parts(y)
-    _, mode, _ = equations.mode(t, parts, args)
-    left, rates = imbalance(mode, t, parts.q, parts.v, u[: equations.size], u[equations.size :])
-    feedback = equations.formulation.stabilisation.feedback()
-    return jnp.concatenate([left, rates if feedback is None else rates + feedback(mode, t, parts.q, parts.v)])
 
 
 @jitted

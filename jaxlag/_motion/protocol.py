@@ -110,10 +110,6 @@ class AugmentedSystem(abc.ABC):
         """y, put back on the manifold."""
         return _along_axis(self, "projected", t, y, args)
 
-    def imbalance(self, t: Any, state: tuple[Array, Array], args: Arguments) -> Array:
-        """Of y and (q̈, λ): what is left of the equations."""
-        return _along_axis(self, "imbalance", t, state, args)
-
     @abc.abstractmethod
     def error_norm(self, error: Array) -> Array:
         """The size of an error of y."""

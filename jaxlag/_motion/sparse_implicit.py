@@ -12,6 +12,7 @@ spring asks for positions to rounding (128 springs of k = 1e6 over 1 s at rtol 1
 Source: Hairer & Wanner, Solving Ordinary Differential Equations II, sections IV.6 and IV.8.
 """
 
+import functools
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -23,12 +24,14 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float
 
+from .._mechanics.lagrange import imbalance
+from .._program.jit import jitted
 from .._program.sparse_jacobian import MANY
 from .._program.sparse_matrix import Places
-from .._program.sparse_newton import NewtonFactors, by_factors, factors_along, linear_solution
+from .._program.sparse_newton import NewtonFactors, by_factors, factors_along, linear_solution, newton_places
 from .batch import BatchedEquations
 from .first_order import EquationsOfMotion
-from .protocol import Arguments, FirstOrderSystem
+from .protocol import Arguments, AugmentedSystem, FirstOrderSystem
 from .runge_kutta import as_rows, weighted, with_row
 
 
@@ -94,7 +97,7 @@ class SparseImplicit(dfx.AbstractImplicitSolver, dfx.AbstractAdaptiveSolver):
             return jnp.concatenate([base[:n] + gamma_h * V, V, base[2 * n :]])
 
         def residual(u, t, base):
-            return self.equations.imbalance(t, (state(u, base), u), args)
+            return stage_imbalance(self.equations, t, (state(u, base), u), args)
 
         at_start = jnp.concatenate([y0[:n] - gamma_h * y0[n : 2 * n], y0[n : 2 * n] - gamma_h * first[n : 2 * n], y0[2 * n :]])
         u0 = jnp.concatenate([first[n : 2 * n], multipliers])
@@ -142,6 +145,31 @@ class SparseImplicit(dfx.AbstractImplicitSolver, dfx.AbstractAdaptiveSolver):
         return u, converged > 0
 
 
+@jitted
+def stage_imbalance(equations: FirstOrderSystem, t, state, args: Arguments) -> Array:
+    """Of y and (q̈, λ): M q̈ − f − Gᵀλ and G q̈ + γ, which are zero in motion."""
+    if isinstance(equations, AugmentedSystem):
+        return equations.along_axis(functools.partial(stage_imbalance, equations.equations), t, state, args)
+    assert isinstance(equations, EquationsOfMotion)  # or it would be solved as it is
+    (y, u), n = state, equations.size
+    parts = equations.parts(y)
+    _, mode, _ = equations.mode(t, parts, args)
+    left, rates = imbalance(mode, t, parts.q, parts.v, u[:n], u[n:])
+    feedback = equations.formulation.stabilisation.feedback()
+    return jnp.concatenate([left, rates if feedback is None else rates + feedback(mode, t, parts.q, parts.v)])
+
+
+def _places(equations: EquationsOfMotion, t, y, args: Arguments) -> Places | None:
+    """Those of the derivatives of the imbalance by q̈ and λ where q̇, and q, move with q̈; None where a dense matrix serves better."""
+    n, rows = equations.size, equations.flat_at(args.params, equations.states_of(t, equations.parts(y))).rows
+
+    def left(x):
+        q, v, u = jnp.split(x, [n, 2 * n])
+        return stage_imbalance(equations, t, (jnp.concatenate([q, v, y[2 * n :]]), u), args)
+
+    return newton_places(left, jnp.concatenate([y[: 2 * n], jnp.zeros(n + rows, y.dtype)]), n)
+
+
 def in_structure(solver: Any, equations: FirstOrderSystem, t0, y0, args: Arguments) -> Any:
     """A diagonally implicit solver that solves in the structure of the equations, where these are many and sparse; otherwise as it is.
 
@@ -156,5 +184,5 @@ def in_structure(solver: Any, equations: FirstOrderSystem, t0, y0, args: Argumen
     if chosen or alone.modes or alone.light or alone.states.size:
         return solver
     y, args = y0[(..., *[0] * (y0.ndim - 1))], Arguments(params, args.scales)
-    places = alone.newton_places(t0, y, args)
+    places = _places(alone, t0, y, args)
     return solver if places is None else SparseImplicit(type(solver), equations, places, solver.root_finder, solver.root_find_max_steps)
