@@ -26,12 +26,11 @@ from .._program.block_tridiagonal import pairs_in_a_column
 from .._program.block_tridiagonal_lu import Factors as Blocks
 from .._program.block_tridiagonal_lu import factorised as by_blocks
 from .._program.block_tridiagonal_lu import order, positive_eigenvalues, solution
-from .._program.shifted_factors import REFINEMENTS, SHIFT, shifted_where_singular, signs
+from .._program.shifted_factors import REFINEMENTS, SHIFT, scales, shifted_where_singular, signs
 from .._program.sparse_jacobian import SPARSE
 from .._program.sparse_matrix import Places, SparseMatrix, picked, summed_by
 from .pseudo_inverse import everywhere
 
-LIGHT = 0.25  # exponent of eps: a mass beside the largest, below which it sets no scale
 EXACT = 2  # times that a solution is put right where rows are independent: once for GᵀG, once for rounding
 
 
@@ -99,8 +98,7 @@ def factorised(M: SparseMatrix, G: SparseMatrix) -> Factors:
 
 def masses(M: SparseMatrix) -> Float[Array, " n"]:
     """The diagonal of M, where that is not (next to) nothing beside its largest number, as of what constraints alone hold."""
-    diagonal = summed_by(M.places, jnp.where(M.places.rows == M.places.columns, M.values, 0))
-    return jnp.maximum(diagonal, jnp.finfo(diagonal.dtype).eps ** LIGHT * jnp.max(diagonal))
+    return scales(summed_by(M.places, jnp.where(M.places.rows == M.places.columns, M.values, 0)))
 
 
 def is_determined(_: SparseMatrix, factors: Factors) -> Bool[Array, ""]:

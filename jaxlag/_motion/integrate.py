@@ -67,7 +67,7 @@ class SolverOptions:
         if not isinstance(solver, dfx.AbstractAdaptiveSolver) or solver.term_structure is not dfx.AbstractTerm:
             raise TypeError(
                 "`solver` must estimate its error and solve ẏ = f(t, y) as a whole, but "
-                f"`diffrax.{type(solver).__name__}` does not. Take e.g. {CHOICES['solver'][1]}."
+                f"{type(solver).__name__} does not. Take e.g. {CHOICES['solver'][1]}."
             )
         count(max_steps, "`max_steps`", cure="The default is 100_000.")
         return cls(solver, formulation, max_steps, adjoint, progress)

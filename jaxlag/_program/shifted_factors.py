@@ -12,6 +12,7 @@ from jaxtyping import Array, Bool, Float
 SHIFT = 0.35  # exponent of eps: what is added then, in units in which the matrix has numbers near one
 GROWTH = 0.85  # exponent of 1/eps: what the inverse makes of a number then; that of a straight chain of m links makes m²/8 of it
 REFINEMENTS = 12  # times that a solution is put right then
+LIGHT = 0.25  # exponent of eps: a number on the diagonal beside the largest, below which it sets no scale
 
 
 def shifted_where_singular(factored: Callable, probed: Callable, shift: Array, is_work: bool = True) -> tuple[Any, Bool[Array, ""]]:
@@ -33,6 +34,13 @@ def shifted_where_singular(factored: Callable, probed: Callable, shift: Array, i
     start = nothing, jnp.array(True), jnp.array(False)
     factors, _, shifted = lax.while_loop(lambda carry: carry[1], attempt, start)
     return factors, shifted
+
+
+def scales(diagonal: Float[Array, " n"]) -> Float[Array, " n"]:
+    """The sizes of a diagonal, those that are (next to) nothing beside the largest raised; ones where all are nothing."""
+    size = jnp.abs(diagonal)
+    largest = jnp.max(size)
+    return jnp.where(largest > 0, jnp.maximum(size, jnp.finfo(size.dtype).eps ** LIGHT * largest), 1)
 
 
 def signs(shape: tuple[int, ...], dtype: Any) -> Float[Array, "..."]:

@@ -10,28 +10,10 @@ import scipy.sparse
 from jax import lax
 from jaxtyping import Array, Bool, Float
 
-from .array_dependence import dependence
 from .block_tridiagonal_lu import Factors, factorised, order, solution, transposed
-from .expressions import TooLong
-from .shifted_factors import REFINEMENTS, SHIFT, shifted_where_singular, signs
+from .shifted_factors import REFINEMENTS, SHIFT, scales, shifted_where_singular, signs
 from .sparse_jacobian import SPARSE
 from .sparse_matrix import Places, SparseMatrix, colors, picked, summed_by
-
-LIGHT = 0.25  # exponent of eps: a number on the diagonal beside the largest, below which it sets no scale
-
-
-def newton_places(function: Callable, x: Float[Array, " k"], n: int) -> Places | None:
-    """Those of ∂f/∂u + ∂f/∂v + ∂f/∂q, x = (q, v, u): n columns each of the last two, which are the first of x. Rows behind the n-th come
-    last. None where a dense matrix serves better.
-
-    That is where there are many entries in a row, many directions, or blocks so large that there are few.
-    """
-    try:
-        found = dependence(function, x)
-    except TooLong:
-        return None
-    first = found[:, :n] + found[:, n : 2 * n] + found[:, 2 * n : 3 * n]
-    return sparse_places(scipy.sparse.hstack([first, found[:, 3 * n :]], "csr"), last=n)
 
 
 def sparse_places(pattern: scipy.sparse.csr_matrix, last: int | None = None, sparse: int = SPARSE) -> Places | None:
@@ -69,15 +51,13 @@ def _factorised(A: SparseMatrix) -> NewtonFactors:
     (n, _), last = A.shape, A.places.last
     if last is None or last == n:
         return NewtonFactors(factorised(A), jnp.ones(n, A.values.dtype), jnp.array(True))
-    rows, columns, eps = A.places.rows, A.places.columns, jnp.finfo(A.values.dtype).eps
-    is_last = np.arange(n) >= last
-    size = jnp.abs(summed_by(A.places, jnp.where(rows == columns, A.values, 0)))
-    size = jnp.where(is_last, 0, jnp.maximum(size, eps**LIGHT * jnp.max(size)))
-    units = jnp.where(is_last, 0, lax.rsqrt(jnp.where(is_last, 1, size)))
+    rows, columns, is_last = A.places.rows, A.places.columns, np.arange(n) >= last
+    on_diagonal = summed_by(A.places, jnp.where((rows == columns) & (rows < last), A.values, 0))
+    units = jnp.where(is_last, 0, lax.rsqrt(scales(on_diagonal)))
     length = summed_by(A.places, (A.values * picked(units, columns)) ** 2)
     units = jnp.where(is_last, lax.rsqrt(jnp.where(length > 0, length, 1)), units)
     scaled = SparseMatrix(A.values * picked(units, rows) * picked(units, columns), A.places)
-    shift = jnp.where(is_last, -(eps**SHIFT), 0.0)
+    shift = jnp.where(is_last, -(jnp.finfo(units.dtype).eps ** SHIFT), 0.0).astype(units.dtype)
     probe = signs((n,), units.dtype)
     factors, shifted = shifted_where_singular(
         lambda shift: factorised(scaled.plus_diagonal(shift)), lambda factors: solution(A.places, factors, probe), shift

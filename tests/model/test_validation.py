@@ -182,8 +182,8 @@ def test_the_error_of_jax_stays_the_cause():
 OF_A_WRONG_TYPE = {
     'jl.simulate(system, 1.0, 0.0, [0, 1], solver="rk4")': "`solver` must be an object that makes the choice, but is 'rk4'. Take e.g. `jaxlag.Dop853()`",
     "jl.simulate(system, 1.0, 0.0, [0, 1], solver=jl.Dop853)": "`solver` must be an object that makes the choice, but is <class",
-    "jl.simulate(system, 1.0, 0.0, [0, 1], solver=diffrax.Euler())": "`solver` must estimate its error and solve ẏ = f(t, y) as a whole, but `diffrax.Euler` does not. Take e.g.",
-    "jl.simulate(system, 1.0, 0.0, [0, 1], solver=diffrax.KenCarp4())": "`solver` must estimate its error and solve ẏ = f(t, y) as a whole, but `diffrax.KenCarp4` does not. Take e.g.",
+    "jl.simulate(system, 1.0, 0.0, [0, 1], solver=diffrax.Euler())": "`solver` must estimate its error and solve ẏ = f(t, y) as a whole, but Euler does not. Take e.g.",
+    "jl.simulate(system, 1.0, 0.0, [0, 1], solver=diffrax.KenCarp4())": "`solver` must estimate its error and solve ẏ = f(t, y) as a whole, but KenCarp4 does not. Take e.g.",
     'jl.simulate(system, 1.0, 0.0, [0, 1], stabilisation="x")': "`stabilisation` must be an object that makes the choice, but is 'x'. Take e.g. `Projection()`",
     'jl.simulate(system, 1.0, 0.0, [0, 1], friction="x")': "`friction` must be an object that makes the choice, but is 'x'. Take e.g. `StickSlip()`",
     "jl.simulate(system, 1.0, 0.0, [0, 1], friction=None)": "`friction` must be an object that makes the choice, but is None",
