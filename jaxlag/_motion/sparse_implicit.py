@@ -13,7 +13,6 @@ Source: Hairer & Wanner, Solving Ordinary Differential Equations II, sections IV
 """
 
 import functools
-import itertools
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -22,17 +21,14 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-import scipy.sparse
 from jax import lax
 from jaxtyping import Array, Bool, Float
 
 from .._mechanics.lagrange import imbalance
-from .._program.array_dependence import dependence
-from .._program.expressions import TooLong
 from .._program.jit import jitted
 from .._program.sparse_jacobian import MANY
 from .._program.sparse_matrix import Places
-from .._program.sparse_newton import NewtonFactors, by_factors, factors_along, linear_solution, sparse_places
+from .._program.sparse_newton import NewtonFactors, by_factors, factors_along, linear_solution, newton_places
 from .batch import BatchedEquations
 from .first_order import EquationsOfMotion
 from .protocol import Arguments, AugmentedSystem, FirstOrderSystem
@@ -171,12 +167,7 @@ def _places(equations: EquationsOfMotion, t, y, args: Arguments) -> Places | Non
         q, v, u = jnp.split(x, [n, 2 * n])
         return stage_imbalance(equations, t, (jnp.concatenate([q, v, y[2 * n :]]), u), args)
 
-    try:
-        pattern = dependence(left, jnp.concatenate([y[: 2 * n], jnp.zeros(n + rows, y.dtype)]))
-    except TooLong:
-        return None
-    of_q, of_v, of_qddot, of_multipliers = (pattern[:, start:end] for start, end in itertools.pairwise([0, n, 2 * n, 3 * n, 3 * n + rows]))
-    return sparse_places(scipy.sparse.hstack([of_q + of_v + of_qddot, of_multipliers], "csr"), last=n)
+    return newton_places(left, jnp.concatenate([y[: 2 * n], jnp.zeros(n + rows, y.dtype)]), n)
 
 
 def in_structure(solver: Any, equations: FirstOrderSystem, t0, y0, args: Arguments) -> Any:

@@ -10,10 +10,24 @@ import scipy.sparse
 from jax import lax
 from jaxtyping import Array, Bool, Float
 
+from .array_dependence import dependence
 from .block_tridiagonal_lu import Factors, factorised, order, solution, transposed
+from .expressions import TooLong
 from .shifted_factors import REFINEMENTS, SHIFT, scales, shifted_where_singular, signs
 from .sparse_jacobian import SPARSE
 from .sparse_matrix import Places, SparseMatrix, colors, picked, summed_by
+
+
+def newton_places(function: Callable, x: Float[Array, " k"], n: int) -> Places | None:
+    """Those of Newton's matrix in u of f(q, v, u) = 0, where q and v, n numbers each, move with the first n of u; others, and their rows,
+    come last. x = (q, v, u). None where a dense matrix serves better, or the program is too long to be read.
+    """
+    try:
+        found = dependence(function, x)
+    except TooLong:
+        return None
+    moving = found[:, :n] + found[:, n : 2 * n] + found[:, 2 * n : 3 * n]
+    return sparse_places(scipy.sparse.hstack([moving, found[:, 3 * n :]], "csr"), last=n)
 
 
 def sparse_places(pattern: scipy.sparse.csr_matrix, last: int | None = None, sparse: int = SPARSE) -> Places | None:
