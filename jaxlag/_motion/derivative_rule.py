@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
 
+from .._mechanics.pseudo_inverse import everywhere
 from .._program.jit import compiled, jitted
 from .variational import derived, pushforward, split_varying
 
@@ -208,7 +209,7 @@ def _unless_zero(product, solve, varying, constant, ts, vector):
     of_vector = lambda vector: product(x, lambda x: solve(eqx.combine(unravel(x), constant), ts)[0], vector)
     like = jax.eval_shape(of_vector, vector)
     nothing = lambda _: jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), like)
-    is_zero = jnp.all(jnp.array([jnp.all(leaf == 0) for leaf in jax.tree.leaves(vector)]))
+    is_zero = everywhere(jnp.all(jnp.array([jnp.all(leaf == 0) for leaf in jax.tree.leaves(vector)])))
     return jax.lax.cond(is_zero, nothing, of_vector, vector)
 
 
