@@ -41,6 +41,7 @@ WINGS = {  # each imports only from those above it, and each file of a wing only
         "shifted_factors",
         "array_dependence",
         "sparse_jacobian",
+        "sums_in_scans",
         "running_sums",
         "places_in_line",
         "recursive_elimination",

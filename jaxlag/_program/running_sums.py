@@ -2,7 +2,7 @@
 
 Positions of a chain in joint angles are sums of all links before, x = Σ l sin φ: each velocity depends on half of q̇, and ∂²L/∂q̇² is full.
 With the running sums w = (u₁, u₁ + u₂, …) as further unknowns, L(q̇, w) and the summands u(q̇, w) are sparse again. A product with a
-triangle of ones is a running sum, too; and a number that is repeated along an axis, of itself and zeros.
+triangle of ones is a running sum, too, and so is what a scan adds up; and a number that is repeated along an axis, of itself and zeros.
 """
 
 from collections.abc import Callable
@@ -18,6 +18,7 @@ from .constants import ELEMENTWISE, as_function, fold_by_jax, is_numeric
 from .expressions import TooLong
 from .sparse_jacobian import entries
 from .sparse_matrix import SparseMatrix, colors
+from .sums_in_scans import in_running_sums
 from .walker import CALLS, called_program, primitive_names, walk
 
 MIN_LENGTH = 16  # of an axis, from which on a sum along it is cut
@@ -98,14 +99,14 @@ class _Cuts:
 
     def __init__(self, given: list[Array] | None = None):
         self.given = given
-        self.has_products = False
+        self.needs_numbers = False
         self.sums: list[RunningSum] = []
         self.values: list[Array] = []
         self.summands: list[Array] = []
 
     def run(self, closed: Any, x: Array) -> Array:
         """The result."""
-        self.has_products = "dot_general" in primitive_names(closed)
+        self.needs_numbers = bool({"dot_general", "scan"}.intersection(primitive_names(closed)))
         return self.within(closed, [(x, True)])[0][0]
 
     def within(self, program: Any, operands: list) -> list:
@@ -116,7 +117,7 @@ class _Cuts:
         """The rule of running sums; all else is as it was."""
         name, p = equation.primitive.name, equation.params
         arrays, depends = [array for array, _ in operands], any(moves for _, moves in operands)
-        if self.has_products and not depends and all(map(is_numeric, arrays)):  # it may be what something is multiplied by
+        if self.needs_numbers and not depends and all(map(is_numeric, arrays)):  # something may be multiplied by it, or picked
             return [(array, False) for array in fold_by_jax(equation, arrays)]
         if name == "dot_general" and (product := _as_running_sum(arrays, [moves for _, moves in operands], p)) is not None:
             return [(self.cut(*product), True)]
@@ -124,6 +125,10 @@ class _Cuts:
             return self.within(called_program(equation), operands)
         if depends and name == "cumsum" and arrays[0].shape[p["axis"]] >= MIN_LENGTH:
             return [(self.cut(arrays[0], RunningSum(arrays[0].shape, p["axis"], p["reverse"])), True)]
+        if depends and name == "scan" and p["length"] >= MIN_LENGTH:
+            along = lambda summands, reverse: self.cut(summands, RunningSum(summands.shape, 0, reverse))
+            if (found := in_running_sums(equation, arrays, [moves for _, moves in operands], along)) is not None:
+                return found
         if depends and name == "broadcast_in_dim":
             array = jnp.expand_dims(arrays[0], [d for d in range(len(p["shape"])) if d not in p["broadcast_dimensions"]])
             return [(self.repeated(array, p["shape"]), True)]
