@@ -117,6 +117,7 @@ def test_modes_at_a_speed_at_which_it_stays_upright():
     assert np.all(np.asarray(modes.stable)[~zero])
 
 
+@pytest.mark.slow
 def test_shapes_keep_to_the_equations_by_hand():
     """Roll and steer of each mode, and the yaw that the rolling wheels make of the steer: ψ̇ = (v δ + c δ̇) cos λ/w."""
     v, p = 5.0, bicycle.params

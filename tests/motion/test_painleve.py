@@ -114,6 +114,7 @@ def test_impacts_of_a_rod(rods):
     assert 0 < gains < 20 and np.sum(mu[:EACH] > 4 / 3) > 100
 
 
+@pytest.mark.slow
 def test_a_sliding_rod(rods):
     """One normal force, or none or two of them, which is Painlevé's paradox and is named."""
     motions, phi, mu, _, _, rate, slip = rods
@@ -128,6 +129,7 @@ def test_a_sliding_rod(rods):
     assert np.all(solutions >= 5)
 
 
+@pytest.mark.slow
 def test_how_sliding_ends(rods):
     """Lift-off when the force has gone, rest of the sliding end, or a force without bounds, with a name: against SciPy's events."""
     motions, phi, mu, _, _, rate, slip = rods

@@ -265,6 +265,7 @@ def test_iwan_against_return_mapping():
     assert np.max(np.abs(motion.balance())) < 1e-8
 
 
+@pytest.mark.slow
 def test_gradients_of_iwan():
     """From both sides, at samples away from transitions."""
     at = np.array([37, 90, 133])
@@ -276,6 +277,7 @@ def test_gradients_of_iwan():
             np.testing.assert_allclose(forward[name][:, i], (moved[0] - moved[1]) / (2 * h), rtol=1e-6, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_a_sprung_mass_with_a_jenkin_element_against_phases_by_hand():
     """x'' = −k x − c (x − z): phases of sticking and slipping, each a harmonic motion, from event to event."""
     system = jl.System(
