@@ -13,19 +13,20 @@ from jax import lax
 from jaxtyping import Array, Float, PyTree
 
 from .._mechanics.friction_elements import find_elements
-from .._mechanics.lagrange import imbalance, inertia
+from .._mechanics.lagrange import imbalance, inertia, position_rows
+from .._mechanics.saddle_point import saddle_point
 from .._model.flat import Flat
 from .._model.state_values import start_values
 from .._model.system import System
 from .._model.validation import checked
-from .._program.block_tridiagonal_lu import factorised
 from .._program.jit import compiled
 from .._program.sparse_jacobian import MANY
 from .._program.sparse_matrix import SparseMatrix, row_sums
+from .._program.sparse_newton import newton_factors, refined
 from .newton import Root
 from .rest import Curvature, Equations, Given, Rest, Search
 from .sparse_descent import eigenvalues_below, sparse_minimum_near
-from .sparse_root import SparseEquations, refined, sparse_root_near
+from .sparse_root import SparseEquations, sparse_root_near
 
 MOST_DENSE = 400  # unknowns that are searched for with all zeros where the structure finds nothing: less than a minute
 
@@ -81,7 +82,7 @@ def _with_multipliers(equations: SparseEquations, given: Given, w: Array) -> Arr
     of_q = np.arange(w.size) < n
     within = of_q[J.places.rows] & of_q[J.places.columns]
     A = SparseMatrix(jnp.where(within, 0, J.values), J.places).plus_diagonal(jnp.asarray(of_q, w.dtype))
-    balance = refined(A, factorised(A), jnp.where(of_q, -equations.residual(given, w), 0))
+    balance = refined(A.__matmul__, A.places, newton_factors(A), jnp.where(of_q, -equations.residual(given, w), 0))
     return w + jnp.where(of_q | ~jnp.all(jnp.isfinite(balance)), 0, balance)
 
 
@@ -91,14 +92,18 @@ def _described(of_rest: EquationsOfRest, equations: SparseEquations, given: Give
     known, at_rest = lax.stop_gradient((given, w))
     J, R = equations.jacobian(known, at_rest), equations.residual(known, at_rest)
     allowed = abs(J) @ (1 + jnp.abs(at_rest)) + jnp.finfo(w.dtype).tiny
-    shown = lambda x: jnp.where(root.found, x, jnp.nan)
+    shown, multipliers = lambda x: jnp.where(root.found, x, jnp.nan), of.multipliers
+    if flat.rows:  # of dependent rows, those of least norm
+        _, G = position_rows(flat, given.t, q)
+        unit = lx.DiagonalLinearOperator(jnp.ones_like(q))
+        multipliers = saddle_point(unit, G, -(G.T @ multipliers), jnp.zeros_like(multipliers)).multipliers
     alone = jnp.asarray(equations.alone[: q.size] > 0)
     M = lax.stop_gradient(inertia(flat, given.t, q, v)[0])
     return Rest(
         flat.unravel(shown(q)),
         flat.unravel(v),
         {},
-        flat.unravel_multipliers(shown(of.multipliers)),
+        flat.unravel_multipliers(shown(multipliers)),
         {},
         jnp.array(False),
         given.t,

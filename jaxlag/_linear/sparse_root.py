@@ -10,16 +10,15 @@ import scipy.sparse
 from jaxtyping import Array, Bool, Float
 
 from .._program.array_dependence import dependence
-from .._program.block_tridiagonal_lu import Factors, factorised, solution
 from .._program.expressions import TooLong
 from .._program.implicit import implicit_root
+from .._program.shifted_factors import GROWTH
 from .._program.sparse_jacobian import entries
 from .._program.sparse_matrix import Places, SparseMatrix, colors
-from .._program.sparse_newton import linear_solution, sparse_places
+from .._program.sparse_newton import linear_solution, newton_factors, refined, sparse_places
 from .newton import Residual, Root, is_root, newton
 
 BY_VALUES = 2  # as sparse as is of use: the dense search finds singular values of all by all, at twenty times the cost of factors
-GROWTH = 0.85  # exponent of 1/eps: what J⁻¹ makes of a number where J is singular
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -49,44 +48,43 @@ class SparseEquations:
         pattern = self.places.pattern()
         return SparseMatrix(entries(push, colors(pattern), pattern, w).values, self.places)
 
-    def invertible(self, J: SparseMatrix) -> SparseMatrix:
-        """J, with ones for what is alone."""
-        return J.plus_diagonal(jnp.asarray(self.alone, J.values.dtype))
+    def negative(self, J: SparseMatrix) -> SparseMatrix:
+        """−J, with ones for what is alone."""
+        return (-J).plus_diagonal(jnp.asarray(self.alone, J.values.dtype))
 
     def change(self, args: Any, w: Float[Array, " u"], R: Float[Array, " u"]) -> Float[Array, " u"]:
         """−J⁻¹ R, to be differentiated."""
         _, push = jax.linearize(lambda w: self.residual(args, w), w)
-        return -linear_solution(lambda x: push(x) + jnp.asarray(self.alone, x.dtype) * x, self.places, R)
+        return linear_solution(lambda x: jnp.asarray(self.alone, x.dtype) * x - push(x), self.places, R)
 
     def differentiable_root(self, args: Any, w: Float[Array, " u"]) -> Float[Array, " u"]:
         """w, which depends on args as R(args, w) = 0 says."""
         return implicit_root(self.residual, self.change, args, w)
 
 
-def refined(A: SparseMatrix, factors: Factors, b: Float[Array, " u"]) -> Float[Array, " u"]:
-    """A⁻¹ b, what is left put right once."""
-    x = solution(A.places, factors, b)
-    return x + solution(A.places, factors, b - A @ x)
-
-
 def sparse_root_near(equations: SparseEquations, args: Any, guess: Float[Array, " u"]) -> Root:
-    """The root that Newton's method finds from a guess; found only where J is regular there, so that it is the only one near."""
+    """The root that Newton's method finds from a guess; found only where it is the only one near, but for multipliers of rows that depend
+    on each other.
+    """
     fixed = jax.lax.stop_gradient(args)
 
     def changes(w):
-        A = equations.invertible(equations.jacobian(fixed, w))
-        factors = factorised(A)
-        return lambda w: -refined(A, factors, equations.residual(fixed, w))
+        A = equations.negative(equations.jacobian(fixed, w))
+        factors = newton_factors(A)
+        return lambda w: refined(A.__matmul__, A.places, factors, equations.residual(fixed, w))
 
     w = newton(changes, jax.lax.stop_gradient(guess))
     J, R = equations.jacobian(fixed, w), equations.residual(fixed, w)
-    return Root(w, is_root(J, R, w) & is_regular(equations.invertible(J)))
+    return Root(w, is_root(J, R, w) & is_regular(equations.negative(J)))
 
 
 def is_regular(A: SparseMatrix) -> Bool[Array, ""]:
-    """Whether A⁻¹ makes no huge numbers of numbers at random, and solves with them."""
-    size, eps = abs(A), jnp.finfo(A.values.dtype).eps
+    """Whether A⁻¹ makes no huge numbers of numbers at random, and solves with them; where rows of multipliers depend on each other, these
+    numbers are forces alone.
+    """
+    size, eps, factors = abs(A), jnp.finfo(A.values.dtype).eps, newton_factors(A)
     signs = jnp.asarray(np.random.default_rng(0).choice([-1.0, 1.0], A.shape[0]), A.values.dtype)
     b = signs * (size @ jnp.ones_like(signs))
-    x = refined(A, factorised(A), b)
+    b = jnp.where(factors.regular | (np.arange(b.size) < A.places.last), b, 0)
+    x = refined(A.__matmul__, A.places, factors, b)
     return (jnp.max(jnp.abs(x)) < eps**-GROWTH) & jnp.all(jnp.abs(A @ x - b) <= eps**0.5 * (size @ jnp.abs(x)))

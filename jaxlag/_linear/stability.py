@@ -48,7 +48,7 @@ def _by_inertia(found: Curvature) -> str:
     if not found.symmetric:
         return f"{ELSEWHERE}: its forces have no potential"
     if not found.certain:
-        return "not judged: the pivots of so many coordinates are within rounding"
+        return "not judged: the pivots of so many coordinates are within rounding, as where constraints depend on each other"
     return "unstable" if found.falling > 0 else "neutral" if found.not_rising > 0 else "stable"
 
 

@@ -18,7 +18,8 @@ from .structured_inertia import StructuredInertia, by_inertia, is_positive, root
 from .structured_inertia import factorised as structure_factorised
 
 Rows = Float[Array, "m n"] | SparseMatrix
-FEW = 16  # rows, up to which M⁻¹Gᵀ is computed where M is full but has a structure
+FEW = 16  # rows, from which on sparse ones are better kept so beside a sparse M
+MOST_FULL = 2000  # coordinates, of which M may be needed with all its numbers
 
 
 class Sound(NamedTuple):
@@ -63,7 +64,7 @@ def saddle_point(M: lx.AbstractLinearOperator, G: Rows, f, c, reach: Float[Array
     if isinstance(G, SparseMatrix):
         return _sparse_saddle_point(M, G, f, c)
     if not isinstance(M, lx.DiagonalLinearOperator):
-        return _saddle_point(M, G, f, c, reach)
+        return _with_all_numbers_where_singular(M, G, lambda M: _saddle_point(M, G, f, c, reach))
     if not c.size and f.shape[0] >= MANY:
         return _free(M, f, c)
     heavy = M.diagonal > jnp.finfo(f.dtype).eps ** 0.25 * jnp.max(jnp.abs(M.diagonal))
@@ -76,11 +77,18 @@ def _for_rows(M, G):
     """M and G as they are solved with: with as many of their zeros as that needs."""
     if isinstance(M, lx.DiagonalLinearOperator):
         return M, G
-    if not isinstance(M, StructuredInertia) or G.shape[0] <= FEW:
-        return M, dense(G)
-    if isinstance(G, SparseMatrix) and not M.sums and block_saddle_point.whole(M.slopes.places, G.places) is not None:
+    is_sparse = isinstance(M, StructuredInertia) and isinstance(G, SparseMatrix) and G.shape[0] > FEW and not M.sums
+    if is_sparse and block_saddle_point.whole(M.slopes.places, G.places) is not None:
         return M.slopes, G
-    return lx.MatrixLinearOperator(M.as_matrix()), dense(G)
+    return M, dense(G)
+
+
+def _with_all_numbers_where_singular(M, G, run):
+    """run(M), where M is kept by its structure if it is positive itself: many constraints may hold what has no inertia."""
+    if not isinstance(M, StructuredInertia) or G.shape[0] <= FEW or M.size > MOST_FULL:
+        return run(M)
+    positive = is_positive(M, structure_factorised(jax.lax.stop_gradient(M)))
+    return jax.lax.cond(everywhere(positive), lambda: run(M), lambda: run(lx.MatrixLinearOperator(M.as_matrix())))
 
 
 def _free(M: lx.DiagonalLinearOperator, f, c) -> SaddlePoint:
@@ -114,15 +122,18 @@ def _way(M):
 def saddle_solver(M: lx.AbstractLinearOperator, G: Rows, f, c, reach: Float[Array, " n"] | None = None) -> Callable:
     """(f, c) ↦ (x, λ) as of `saddle_point`, for other vectors f and c; what G barely holds is held as it is for these."""
     M, G = _for_rows(M, G)
-    if isinstance(G, SparseMatrix):
-        factors = _way(M).factorised(*jax.lax.stop_gradient((M, G)))
-    else:
-        factors = _factorised(*jax.lax.stop_gradient((M, G, f[:, None], c[:, None], reach)))
-    solve, _ = _solver(M, G, factors)
 
-    def solution(f, c):
-        x, multipliers = solve(f[:, None], c[:, None])
-        return x[:, 0], multipliers[:, 0]
+    def solution(f_other, c_other):
+        def by(M):
+            if isinstance(G, SparseMatrix):
+                factors = _way(M).factorised(*jax.lax.stop_gradient((M, G)))
+            else:
+                factors = _factorised(*jax.lax.stop_gradient((M, G, f[:, None], c[:, None], reach)))
+            solve, _ = _solver(M, G, factors)
+            x, multipliers = solve(f_other[:, None], c_other[:, None])
+            return x[:, 0], multipliers[:, 0]
+
+        return _with_all_numbers_where_singular(M, G, by)
 
     return solution
 
@@ -230,6 +241,11 @@ def is_determined(M: lx.AbstractLinearOperator, G: Rows) -> Bool[Array, ""]:
     M, G = jax.lax.stop_gradient(_for_rows(M, G))
     if isinstance(G, SparseMatrix):
         return _way(M).is_determined(M, _way(M).factorised(M, G))
+    return _with_all_numbers_where_singular(M, G, lambda M: _is_definite(M, G))
+
+
+def _is_definite(M, G):
+    """The same of rows with all their zeros; of M that is kept by its structure, everywhere."""
     if isinstance(M, StructuredInertia):
         return is_positive(M, structure_factorised(M))
     if isinstance(M, lx.DiagonalLinearOperator) and not len(G) and M.diagonal.size >= MANY:

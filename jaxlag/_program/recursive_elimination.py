@@ -8,6 +8,7 @@ Source: Featherstone, Int. J. Robotics Res. 2 (1983) 13; Rodriguez, IEEE J. Robo
 """
 
 import functools
+from collections.abc import Callable
 from typing import NamedTuple
 
 import jax
@@ -77,24 +78,35 @@ def _eliminated(line: Line, carry: tuple[Array, Array], given: Float[Array, " g"
 def by_root(line: Line, factors: Factors, F: Float[Array, "n k"]) -> Float[Array, "b a k"]:
     """R⁻ᵀF where M = Rᵀ R is the matrix of the whole form in x."""
 
+    @scalarised
     def turn(beta, given):
         (L, K, by_x, by_before), f = given
         e = jax.scipy.linalg.solve_triangular(L, f + by_x.T @ beta, lower=True)
         return by_before.T @ beta - K.T @ e, e
 
-    padded = jnp.concatenate([F, jnp.zeros_like(F[:1])])[line.at]
-    beta = jnp.zeros((line.handed.size, F.shape[1]), F.dtype)
-    return lax.scan(scalarised(turn, limit=WRITTEN_OUT), beta, (factors[:4], padded), reverse=True)[1]
+    def of_one(f):
+        beta = jnp.zeros(line.handed.size, f.dtype)
+        return lax.scan(turn, beta, (factors[:4], jnp.append(f, 0)[line.at]), reverse=True)[1]
+
+    return of_columns(of_one, F)
 
 
 def by_factor(line: Line, factors: Factors, F: Float[Array, "n k"]) -> Float[Array, "n k"]:
     """M⁻¹F: what makes the form least."""
 
+    @scalarised
     def turn(handed, given):
         (L, K, by_x, by_before), e = given
         x = jax.scipy.linalg.solve_triangular(L, e - K @ handed, lower=True, trans=1)
         return by_x @ x + by_before @ handed, x
 
-    handed = jnp.zeros((line.handed.size, F.shape[1]), F.dtype)
-    _, x = lax.scan(scalarised(turn, limit=WRITTEN_OUT), handed, (factors[:4], by_root(line, factors, F)))
-    return x.reshape(line.at.size, F.shape[1])[line.back]
+    def of_one(e):
+        handed = jnp.zeros(line.handed.size, e.dtype)
+        return lax.scan(turn, handed, (factors[:4], e))[1].ravel()[line.back]
+
+    return of_columns(of_one, by_root(line, factors, F))
+
+
+def of_columns(function: Callable, F: Float[Array, "*n k"]) -> Float[Array, "*m k"]:
+    """A function of one column of each."""
+    return function(F[..., 0])[..., None] if F.shape[-1] == 1 else jax.vmap(function, -1, -1)(F)

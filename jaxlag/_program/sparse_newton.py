@@ -58,10 +58,11 @@ def factors_along(push: Callable, places: Places, like: Float[Array, "n *b"]) ->
     directions = jnp.asarray(np.arange(max(color) + 1)[:, None] == color, like.dtype)
     directions = jnp.broadcast_to(directions.reshape(*directions.shape, *[1] * (like.ndim - 1)), (len(directions), *like.shape))
     values = jax.vmap(push)(directions)[color[places.columns], places.rows]
-    return lax.stop_gradient(_of_each(lambda values: _factorised(SparseMatrix(values, places)), like)(values))
+    return lax.stop_gradient(_of_each(lambda values: newton_factors(SparseMatrix(values, places)), like)(values))
 
 
-def _factorised(A: SparseMatrix) -> NewtonFactors:
+def newton_factors(A: SparseMatrix) -> NewtonFactors:
+    """Those of a matrix whose rows that come last, if any, are the negative of columns: [K −Gᵀ; −G 0]."""
     (n, _), last = A.shape, A.places.last
     if last is None or last == n:
         return NewtonFactors(factorised(A), jnp.ones(n, A.values.dtype), jnp.array(True))
@@ -84,20 +85,19 @@ def by_factors(places: Places, factors: NewtonFactors, b: Float[Array, "n *b"]) 
     return _of_each(lambda factors, b: factors.units * solution(places, factors.of, factors.units * b), b)(factors, b)
 
 
+def refined(matvec: Callable, places: Places, factors: NewtonFactors, b: Float[Array, "n *b"]) -> Float[Array, "n *b"]:  # noqa: F821
+    """A⁻¹ b, what is left put right: once, or where rows depend on each other until it is."""
+    times = jnp.where(jnp.all(factors.regular), 1, REFINEMENTS)
+    turn = lambda _, x: x + by_factors(places, factors, b - matvec(x))
+    return lax.fori_loop(0, times, turn, by_factors(places, factors, b))
+
+
 def linear_solution(push: Callable, places: Places, b: Float[Array, "n *b"]) -> Float[Array, "n *b"]:  # noqa: F821
     """x with push(x) = b, what is left put right once; linear in b, and differentiated as such."""
     factors = factors_along(push, places, b)
-
-    def refined(factors):
-        def solve(matvec, b):
-            times = jnp.where(jnp.all(factors.regular), 1, REFINEMENTS)
-            turn = lambda _, x: x + by_factors(places, factors, b - matvec(x))
-            return lax.fori_loop(0, times, turn, by_factors(places, factors, b))
-
-        return solve
-
     turned = factors._replace(of=_of_each(transposed, b)(factors.of))
-    return lax.custom_linear_solve(push, b, refined(factors), refined(turned))
+    solve = lambda factors: lambda matvec, b: refined(matvec, places, factors, b)
+    return lax.custom_linear_solve(push, b, solve(factors), solve(turned))
 
 
 def _of_each(function: Callable, like: Array) -> Callable:

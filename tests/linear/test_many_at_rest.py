@@ -206,6 +206,45 @@ def test_a_rod_given_twice_is_treated_with_all_zeros(jit):
     np.testing.assert_allclose(at.multipliers["again"], at.multipliers["rods"][0], rtol=1e-8)
 
 
+AGAIN = jl.System(weight, holonomic={"rods": rods, "again": lambda q, l, end: rods(q, l, end)[3:40]})
+
+
+@pytest.mark.slow
+def test_many_rods_given_twice():
+    """More than are treated with all zeros: each of two equal rows has half the tension. Derivatives as of the chain without them."""
+    n = 250
+    rest = lambda system, l: jl.equilibrium(system, arc(n, 0.6 * n), params_of(n, l=l))
+    at, plain = rest(AGAIN, 1.0), rest(RODS, 1.0)
+    np.testing.assert_allclose(at.q, hanging(n, 1.3, np.ones_like), atol=1e-9)
+    shared = at.multipliers["rods"].at[3:40].add(at.multipliers["again"])
+    np.testing.assert_allclose(shared, plain.multipliers["rods"], rtol=1e-9)
+    np.testing.assert_allclose(at.multipliers["again"], at.multipliers["rods"][3:40], rtol=1e-9)
+    assert at.stability.startswith("not judged")
+    seen = lambda system: lambda l: jnp.append(rest(system, l).q[n // 2], rest(system, l).multipliers["rods"][50])
+    expected = jax.jacfwd(seen(RODS))(1.0)
+    for way in (jax.jacfwd, jax.jacrev):
+        np.testing.assert_allclose(way(seen(AGAIN))(1.0), expected, rtol=1e-7)
+    of_half = jax.jacfwd(lambda l: rest(AGAIN, l).multipliers["again"][0])(1.0)
+    np.testing.assert_allclose(2 * of_half, jax.jacfwd(lambda l: rest(RODS, l).multipliers["rods"][3])(1.0), rtol=1e-7)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "holonomic",
+    [
+        {"rods": rods, "longer": lambda q, l, end: rods(q, 1.01 * l, end)[:40]},
+        {
+            "rods": lambda q: jnp.sum(jnp.diff(q, axis=0) ** 2, axis=1) - 1,
+            "again": lambda q: jnp.sum(jnp.diff(q, axis=0) ** 2, axis=1)[:9] - 1,
+        },
+    ],
+    ids=["that contradict each other", "without a hook"],
+)
+def test_rods_given_twice_that_find_no_rest(holonomic):
+    with pytest.raises(ValueError, match="`q` must be near an equilibrium, but none was found"):
+        jl.equilibrium(jl.System(weight, holonomic=holonomic), arc(250, 150.0), params_of(250, l=1.0))
+
+
 def biggest_and_count(n):
     """Of the program that looks for rest."""
     return largest_array_and_count(jax.make_jaxpr(lambda l: rods_at_rest(l, n).q)(1.0))

@@ -322,19 +322,27 @@ def test_rods_on_a_sledge_turned_against_one_another():
     assert np.max(np.abs(M @ qddot - pull) / (np.abs(M) @ np.abs(qddot))) < 1e-14
 
 
-def test_a_chain_held_at_its_end():
-    """Two rows of all angles; M, G and the forces by hand."""
+@pytest.mark.parametrize("pins, lightest", [(1, 1.0), (20, 1.0), (20, 0.0)])
+def test_a_chain_held_at_some_links(pins, lightest):
+    """Two rows of all angles before it for each; M, G and the forces by hand. Among many pins, two links are held that have no mass."""
     q, v, given = state(80)
-    end = lambda q, l: jnp.stack([jnp.sum(l * jnp.sin(q)), -jnp.sum(l * jnp.cos(q))])
-    held = jl.System(lagrangian, holonomic={"pin": end})
+    given["m"][-2:] *= lightest
+    held_at = np.array([79]) if pins == 1 else np.append(np.arange(3, 76, 4), 79)
+    ends = lambda q, l: jnp.stack([jnp.cumsum(l * jnp.sin(q))[held_at], -jnp.cumsum(l * jnp.cos(q))[held_at]])
+    held = jl.System(lagrangian, holonomic={"pins": ends})
     M, f = by_hand(q, v, given)
-    l = given["l"]
-    G = np.stack([l * np.cos(q), l * np.sin(q)])
-    gamma = np.stack([-l * np.sin(q), l * np.cos(q)]) @ v**2
-    x = np.linalg.solve(np.block([[M, -G.T], [G, np.zeros((2, 2))]]), np.append(f, -gamma))
+    before, l = np.tril(np.ones((80, 80)))[held_at], given["l"]
+    G = np.vstack([before * l * np.cos(q), before * l * np.sin(q)])
+    gamma = np.concatenate([before @ (-l * np.sin(q) * v**2), before @ (l * np.cos(q) * v**2)])
+    rows = len(G)
+    x = np.linalg.solve(np.block([[M, -G.T], [G, np.zeros((rows, rows))]]), np.append(f, -gamma))
     found = jl.acceleration(held, q, v, given)
-    close(found.qddot, x[:80], 1e-9)
-    close(found.multipliers["pin"], x[80:], 1e-9)
+    close(found.qddot, x[:80], 1e-8)
+    close(found.multipliers["pins"].ravel(), x[80:], 1e-8)
+    h = 1e-6
+    ours = lambda g: jnp.sum(jl.acceleration(held, q, v, given | {"g": g}).multipliers["pins"])
+    expected = (ours(GRAVITY + h) - ours(GRAVITY - h)) / (2 * h)
+    np.testing.assert_allclose([jax.grad(ours)(GRAVITY), jax.jacfwd(ours)(GRAVITY)], expected, rtol=1e-5)
 
 
 @pytest.mark.parametrize("n", [90])
