@@ -80,7 +80,8 @@ def examine(system: System, q: PyTree, qdot: PyTree, params: PyTree = None, *, t
     $$ \text{degrees of freedom} = n - \mathrm{rank}\,G, \qquad N^T M N > 0, \qquad \dot q\cdot\frac{\partial D}{\partial\dot q} \ge 0,
        \qquad \tau = 1/|\lambda_i| \text{ of the linearised motion} $$
 
-    N spans the null space of G: the motions that the constraints allow.
+    N spans the null space of G: the motions that the constraints allow. All matrices are taken with their zeros here, whatever is solved
+    without: 1000 coordinates take half a minute and a gigabyte.
 
     **Arguments:** as `acceleration`. Any consistent units.
 

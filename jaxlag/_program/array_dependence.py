@@ -83,7 +83,7 @@ class _Reader:
         name = equation.primitive.name
         if name in (*CALLS, *CALLS_WITH_DERIVATIVE_RULE):
             return self.run(called_program(equation), operands)
-        if all(x.rows is None for x in operands) and name != "scan":
+        if all(x.rows is None for x in operands) and (name != "scan" or not any(map(_is_whole, equation.outvars))):
             return self._constant(equation, operands)
         if name in ELEMENTWISE or name in POWERS:
             moved = self._selected(equation, operands) if name == "select_n" else None
@@ -276,6 +276,11 @@ def _by_batch_and_sum(x: Value, summed: tuple[int, ...], batch: tuple[int, ...])
 
 def _pairs(rows: np.ndarray, columns: np.ndarray, shape: tuple[int, int]) -> scipy.sparse.csr_matrix:
     return scipy.sparse.csr_matrix((np.ones(rows.size, bool), (rows, columns)), shape)
+
+
+def _is_whole(atom: Any) -> bool:
+    """Whether its numbers may be places."""
+    return not jax.dtypes.issubdtype(atom.aval.dtype, np.inexact)
 
 
 def _is_loop(equation: Any) -> bool:

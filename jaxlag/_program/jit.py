@@ -141,15 +141,17 @@ def numpy_for(*trees: PyTree) -> Any:
 
 def seen(tree: PyTree) -> PyTree | None:
     """The values as Python may look at them: of what is differentiated its value, of a batch the first; None where `jit` hides them."""
-    leaves, structure = jax.tree.flatten(tree)
-    leaves = [_seen(leaf) for leaf in leaves]
-    return None if _has_tracers(leaves) else jax.tree.unflatten(structure, leaves)
+    return _looked_at(tree, _seen)
 
 
 def values(tree: PyTree) -> PyTree | None:
     """The values as Python may look at them, of what is differentiated too; None where `jit` hides them, or there is a batch of them."""
+    return _looked_at(tree, lambda leaf: jax.lax.stop_gradient(leaf) if isinstance(leaf, jax.core.Tracer) else leaf)
+
+
+def _looked_at(tree, look):
     leaves, structure = jax.tree.flatten(tree)
-    leaves = [jax.lax.stop_gradient(leaf) if isinstance(leaf, jax.core.Tracer) else leaf for leaf in leaves]
+    leaves = [look(leaf) for leaf in leaves]
     return None if _has_tracers(leaves) else jax.tree.unflatten(structure, leaves)
 
 

@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from .array_dependence import dependence
-from .constants import ELEMENTWISE, as_function, fold_by_jax, is_numeric
+from .constants import ELEMENTWISE, as_function, fold_by_jax, has_extended_dtype, is_numeric
 from .expressions import TooLong
 from .sparse_jacobian import entries
 from .sparse_matrix import SparseMatrix, colors
@@ -117,7 +117,8 @@ class _Cuts:
         """The rule of running sums; all else is as it was."""
         name, p = equation.primitive.name, equation.params
         arrays, depends = [array for array, _ in operands], any(moves for _, moves in operands)
-        if self.needs_numbers and not depends and all(map(is_numeric, arrays)):  # something may be multiplied by it, or picked
+        is_known = not depends and all(map(is_numeric, arrays)) and not any(map(has_extended_dtype, equation.outvars))
+        if self.needs_numbers and is_known:  # something may be multiplied by it, or picked
             return [(array, False) for array in fold_by_jax(equation, arrays)]
         if name == "dot_general" and (product := _as_running_sum(arrays, [moves for _, moves in operands], p)) is not None:
             return [(self.cut(*product), True)]

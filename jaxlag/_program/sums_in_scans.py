@@ -13,7 +13,7 @@ import numpy as np
 from jax.extend import core
 from jaxtyping import Array
 
-from .constants import is_numeric
+from .constants import has_extended_dtype, is_numeric
 from .walker import CALLS, called_program, walk
 
 
@@ -66,20 +66,23 @@ class Turn(NamedTuple):
         axes = [None] * i + [0] * (len(operands) - i)
         return jax.vmap(core.jaxpr_as_fun(self.body), axes, axis_size=self.length)(*operands[:i], *carries, *operands[j:])
 
-    def in_turn(self, operands: list, given: list[bool]) -> dict[int, Array]:
-        """Those carries before each turn that follow from the operands `given` alone, by one turn after the other."""
+    def in_turn(self, operands: list, given: list[bool], known: dict[int, Array]) -> dict[int, Array]:
+        """Beside those that are `known`, the carries before each turn that follow from the operands `given`, one turn after the other."""
         i, j = self.constants, self.constants + self.carries
         reached = self.reached_from([not of for of in given])
-        which = [k for k in range(i, j) if not reached[k]]
+        which = [k for k in range(i, j) if not reached[k] and k not in known]
         operands = [x if of else np.zeros(np.shape(x), jnp.result_type(x)) for x, of in zip(operands, given, strict=True)]
 
         def turn(carry, rows):
-            there = dict(zip(which, carry, strict=True))
-            outputs = core.jaxpr_as_fun(self.body)(*operands[:i], *(there.get(k, operands[k]) for k in range(i, j)), *rows)
+            given, known = rows
+            there = dict(enumerate(operands)) | known | dict(zip(which, carry, strict=True))
+            outputs = core.jaxpr_as_fun(self.body)(*(there[k] for k in range(j)), *given)
             return [outputs[k - i] for k in which], carry
 
-        start = [jnp.asarray(operands[k]) for k in which]
-        return dict(zip(which, jax.lax.scan(turn, start, operands[j:], self.length, self.reverse)[1], strict=True)) if which else {}
+        if not which:
+            return known
+        start, rows = [jnp.asarray(operands[k]) for k in which], (operands[j:], known)
+        return known | dict(zip(which, jax.lax.scan(turn, start, rows, self.length, self.reverse)[1], strict=True))
 
 
 def _constant(_: Any) -> Term:
@@ -104,17 +107,17 @@ def _term(equation: Any, operands: list[Term]) -> list[Term]:
 
 def in_running_sums(equation: Any, operands: list, depends: list[bool], summed: Callable) -> list[tuple[Array, bool]] | None:
     """The results of a scan, and whether they depend on what those of its operands do that `depends` says, with carries by
-    `summed(summands, reverse)`; None where a carry that depends on it is no running sum.
+    `summed(summands, reverse)`; None where no carry depends on it, or one that is no running sum.
     """
     turn = Turn.of(equation)
     i, terms, moves = turn.constants, turn.terms, turn.reached_from(depends)
     waiting = [k for k in range(i, i + turn.carries) if moves[k]]
-    if not all(k in terms[k - i].beside for k in waiting):
+    if not waiting or not all(k in terms[k - i].beside for k in waiting) or any(map(has_extended_dtype, equation.invars)):
         return None
     operands = [np.asarray(x, atom.aval.dtype) if is_numeric(x) else x for x, atom in zip(operands, equation.invars, strict=True)]
     with jax.ensure_compile_time_eval():
-        known = turn.in_turn(operands, [is_numeric(x) and not of for x, of in zip(operands, depends, strict=True)])
-    before, finals = turn.in_turn(operands, [not of for of in depends]) | known, {}
+        known = turn.in_turn(operands, [is_numeric(x) and not of for x, of in zip(operands, depends, strict=True)], {})
+    before, finals = turn.in_turn(operands, [not of for of in depends], known), {}
     while waiting:
         k = next((k for k in waiting if not terms[k - i].beside[k].intersection(waiting)), None)
         if k is None:

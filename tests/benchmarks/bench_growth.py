@@ -7,7 +7,8 @@ of 30 calls, each length in a process of its own; 1 s of motion of 200 links and
 gradient in the mass of each link; rest between two hooks, with the forces left; the lowest modes where it hangs. Beside the rods: the
 same chain, at rest, as a tree of hinges in MuJoCo, which nests no more than 1024 bodies; without the forces in the hinges. Its
 accelerations of the points are compared with those of the rods. And bodies in the plane, their centers of mass beside their joints, by
-three coordinates each: beside SciPy's `splu` of the whole saddle point.
+three coordinates each: beside SciPy's `splu` of the whole saddle point. And the chain in angles written link by link in a `scan`, and
+one with a sixteenth of its links held, beside the whole saddle point in NumPy.
 """
 
 import subprocess
@@ -21,6 +22,8 @@ LENGTHS, MOTIONS, HINGES, HANGING, BODIES = (
     (64, 256, 1024),
     (64, 256, 1024, 4096),
 )
+
+ONCE = ("hinges", "rest", "modes", "bodies", "pinned")  # not for each way to write the chain
 
 
 def chain(n):
@@ -69,6 +72,24 @@ def chain_in_angles(n):
     return jl.System(lagrangian), jnp.linspace(0.3, 1.2, n), {"m": 1.0, "g": 9.81, "l": 1.0}
 
 
+def chain_by_scan(n):
+    """The same, written link by link."""
+    import jax.numpy as jnp
+    from jax import lax
+
+    import jaxlag as jl
+
+    def lagrangian(q, qdot, m, g, l):
+        def link(carry, given):
+            (vx, vy, down, total), (q, w, m) = carry, given
+            vx, vy, down = vx + l * jnp.cos(q) * w, vy + l * jnp.sin(q) * w, down + l * jnp.cos(q)
+            return (vx, vy, down, total + 0.5 * m * (vx**2 + vy**2) + m * g * down), None
+
+        return lax.scan(link, (0.0, 0.0, 0.0, 0.0), (q, qdot, jnp.broadcast_to(m, q.shape)))[0][3]
+
+    return jl.System(lagrangian), jnp.linspace(0.3, 1.2, n), {"m": 1.0, "g": 9.81, "l": 1.0}
+
+
 def by_hand_in_angles(q, v, params):
     """q̈ by Featherstone's recursion: inertia and force of what hangs on each link, then the accelerations from the hook on."""
     import jax.numpy as jnp
@@ -96,7 +117,7 @@ def by_hand_in_angles(q, v, params):
     return lax.scan(outwards, (zero, zero), (given, inertias))[1], None
 
 
-CHAINS = {"places": (chain, by_hand), "angles": (chain_in_angles, by_hand_in_angles)}
+CHAINS = {"places": (chain, by_hand), "angles": (chain_in_angles, by_hand_in_angles), "scan": (chain_by_scan, by_hand_in_angles)}
 
 
 def timed(function, *given, times=30):
@@ -322,21 +343,50 @@ def bodies(n, kind):
     print(f"{n:>7} bodies{1e3 * each:>12.3f}{1e3 * hand:>12.3f}{each / hand:>8.2f}{first:>9.2f}{'':>9}{off:>11.1e}")
 
 
+def pinned(n, kind):
+    """Accelerations of the chain in angles with some links held at a height; beside the same by all numbers of M in NumPy."""
+    import jax
+    import jax.numpy as jnp
+    import numpy as np
+
+    import jaxlag as jl
+
+    system, q, params = chain_in_angles(n)
+    held = np.linspace(n // 20, n - 1, n // 16).astype(int)
+    heights = lambda q, l: jnp.cumsum(l * jnp.cos(q))[held]
+    there = np.asarray(heights(q, params["l"]))
+    system = jl.System(dict(system.lagrangian), holonomic={"pins": lambda q, l: heights(q, l) - there})
+    first, each, found = timed(jax.jit(lambda q, v: jl.acceleration(system, q, v, params)), q, 0.1 * q[::-1])
+    beyond, before = np.arange(n, 0.0, -1), np.tril(np.ones((n, n)))[held]
+
+    def by_hand(q, v):
+        shared = np.minimum(beyond[:, None], beyond)
+        turn = q[:, None] - q
+        f = -(shared * np.sin(turn)) @ v**2 - params["g"] * beyond * np.sin(q)
+        G, wanted = -before * np.sin(q), before @ (np.cos(q) * v**2)
+        whole = np.block([[shared * np.cos(turn), -G.T], [G, np.zeros((held.size, held.size))]])
+        return np.linalg.solve(whole, np.concatenate([f, wanted]))
+
+    _, hand, expected = timed(by_hand, np.asarray(q), np.asarray(0.1 * q[::-1]), times=10)
+    off = float(np.abs(found.qddot - expected[:n]).max() / np.abs(expected[:n]).max())
+    print(f"{n:>7} pinned{1e3 * each:>12.3f}{1e3 * hand:>12.3f}{each / hand:>8.2f}{first:>9.2f}{'':>9}{off:>11.1e}")
+
+
 def main():
     if len(sys.argv) == 4:
         import jax
 
         jax.config.update("jax_enable_x64", True)
         kinds = {"acceleration": accelerations, "hinges": hinges, "motion": motion, "gradient": gradient, "rest": rest}
-        kinds |= {"modes": modes, "bodies": bodies}
+        kinds |= {"modes": modes, "bodies": bodies, "pinned": pinned}
         return kinds[sys.argv[1]](int(sys.argv[2]), sys.argv[3])
     most = int(sys.argv[1]) if len(sys.argv) > 1 else LENGTHS[-1]
     print(f"{'links':>14}{'jaxlag ms':>12}{'by hand ms':>12}{'ratio':>8}{'first s':>9}{'by hand':>9}{'difference':>11}", flush=True)
     parts = {"acceleration": LENGTHS, "hinges": HINGES, "motion": MOTIONS, "gradient": MOTIONS[:1], "rest": HANGING}
-    parts |= {"modes": HANGING, "bodies": BODIES}
+    parts |= {"modes": HANGING, "bodies": BODIES, "pinned": HANGING[1:]}
     for kind, lengths in parts.items():
         for n in lengths:
-            for coordinates in () if n > most else ("places",) if kind in ("hinges", "rest", "modes", "bodies") else CHAINS:
+            for coordinates in () if n > most else ("places",) if kind in ONCE else CHAINS:
                 subprocess.run([sys.executable, __file__, kind, str(n), coordinates], check=True)
 
 

@@ -171,8 +171,20 @@ def ending_in(q, qdot, m, l, g):
     return jnp.sum(0.5 * m * v**2) + jnp.sum(qdot**2) + g * jnp.sum(jnp.cos(q))
 
 
+def with_a_random_key(q, qdot, m, l, g):
+    """A carry of which there are no zeros."""
+
+    def link(carry, x):
+        key, v = carry
+        key, part = jax.random.split(key)
+        return (key, v := v + x * jax.random.uniform(part)), v
+
+    v = jax.lax.scan(link, (jax.random.key(0), 0.0), l * jnp.cos(q) * qdot)[1]
+    return jnp.sum(0.5 * m * (v**2 + qdot**2)) + g * jnp.sum(jnp.cos(q))
+
+
 SCANS = {function: True for function in (by_scan, from_rows, backwards, by_numbers, turned)}
-SCANS |= {function: False for function in (dying_away, on_one_another, doubled, ending_in)}
+SCANS |= {function: False for function in (dying_away, on_one_another, doubled, ending_in, with_a_random_key)}
 
 
 @pytest.mark.parametrize("written", SCANS)
