@@ -81,8 +81,8 @@ def _with_multipliers(equations: SparseEquations, given: Given, w: Array) -> Arr
     J, n = equations.jacobian(given, w), given.q.size
     of_q = np.arange(w.size) < n
     within = of_q[J.places.rows] & of_q[J.places.columns]
-    A = SparseMatrix(jnp.where(within, 0, J.values), J.places).plus_diagonal(jnp.asarray(of_q, w.dtype))
-    balance = refined(A.__matmul__, A.places, newton_factors(A), jnp.where(of_q, -equations.residual(given, w), 0))
+    A = equations.matrix(SparseMatrix(jnp.where(within, 0, J.values), J.places)).plus_diagonal(jnp.asarray(of_q, w.dtype))
+    balance = refined(A.__matmul__, A.places, newton_factors(A), jnp.where(of_q, equations.residual(given, w), 0))
     return w + jnp.where(of_q | ~jnp.all(jnp.isfinite(balance)), 0, balance)
 
 

@@ -48,14 +48,19 @@ class SparseEquations:
         pattern = self.places.pattern()
         return SparseMatrix(entries(push, colors(pattern), pattern, w).values, self.places)
 
-    def negative(self, J: SparseMatrix) -> SparseMatrix:
-        """−J, with ones for what is alone."""
-        return (-J).plus_diagonal(jnp.asarray(self.alone, J.values.dtype))
+    def oriented(self, R: Float[Array, " u"]) -> Float[Array, " u"]:
+        """R, the forces the other way around: of J = [−K Gᵀ; G 0] that makes [K −Gᵀ; G 0]."""
+        return jnp.where(np.arange(R.size) < self.places.last, -R, R)
+
+    def matrix(self, J: SparseMatrix) -> SparseMatrix:
+        """J, oriented, with ones for what is alone."""
+        turned = SparseMatrix(jnp.where(J.places.rows < J.places.last, -J.values, J.values), J.places)
+        return turned.plus_diagonal(jnp.asarray(self.alone, J.values.dtype))
 
     def change(self, args: Any, w: Float[Array, " u"], R: Float[Array, " u"]) -> Float[Array, " u"]:
         """−J⁻¹ R, to be differentiated."""
         _, push = jax.linearize(lambda w: self.residual(args, w), w)
-        return linear_solution(lambda x: jnp.asarray(self.alone, x.dtype) * x - push(x), self.places, R)
+        return linear_solution(lambda x: self.oriented(push(x)) + jnp.asarray(self.alone, x.dtype) * x, self.places, -self.oriented(R))
 
     def differentiable_root(self, args: Any, w: Float[Array, " u"]) -> Float[Array, " u"]:
         """w, which depends on args as R(args, w) = 0 says."""
@@ -69,13 +74,13 @@ def sparse_root_near(equations: SparseEquations, args: Any, guess: Float[Array, 
     fixed = jax.lax.stop_gradient(args)
 
     def changes(w):
-        A = equations.negative(equations.jacobian(fixed, w))
+        A = equations.matrix(equations.jacobian(fixed, w))
         factors = newton_factors(A)
-        return lambda w: refined(A.__matmul__, A.places, factors, equations.residual(fixed, w))
+        return lambda w: refined(A.__matmul__, A.places, factors, -equations.oriented(equations.residual(fixed, w)))
 
     w = newton(changes, jax.lax.stop_gradient(guess))
     J, R = equations.jacobian(fixed, w), equations.residual(fixed, w)
-    return Root(w, is_root(J, R, w) & is_regular(equations.negative(J)))
+    return Root(w, is_root(J, R, w) & is_regular(equations.matrix(J)))
 
 
 def is_regular(A: SparseMatrix) -> Bool[Array, ""]:

@@ -44,7 +44,7 @@ def sparse_places(pattern: scipy.sparse.csr_matrix, last: int | None = None, spa
 
 class NewtonFactors(NamedTuple):
     """Those of a matrix in `units` in which its numbers are near one; where rows that come last depend on each other, in so far as
-    they are not `regular`, with a −δ in place of their zeros: what is left of a solution puts it right.
+    they are not `regular`, with a δ in place of their zeros: what is left of a solution puts it right.
     """
 
     of: Factors
@@ -62,7 +62,7 @@ def factors_along(push: Callable, places: Places, like: Float[Array, "n *b"]) ->
 
 
 def newton_factors(A: SparseMatrix) -> NewtonFactors:
-    """Those of a matrix whose rows that come last, if any, are the negative of columns: [K −Gᵀ; −G 0]."""
+    """Those of [K −Gᵀ; G 0]: with a δ > 0 in place of the 0, what is left of it when K is eliminated, δ + G K⁻¹Gᵀ, is positive if K is."""
     (n, _), last = A.shape, A.places.last
     if last is None or last == n:
         return NewtonFactors(factorised(A), jnp.ones(n, A.values.dtype), jnp.array(True))
@@ -72,7 +72,7 @@ def newton_factors(A: SparseMatrix) -> NewtonFactors:
     length = summed_by(A.places, (A.values * picked(units, columns)) ** 2)
     units = jnp.where(is_last, lax.rsqrt(jnp.where(length > 0, length, 1)), units)
     scaled = SparseMatrix(A.values * picked(units, rows) * picked(units, columns), A.places)
-    shift = jnp.where(is_last, -(jnp.finfo(units.dtype).eps ** SHIFT), 0.0).astype(units.dtype)
+    shift = jnp.where(is_last, jnp.finfo(units.dtype).eps ** SHIFT, 0.0).astype(units.dtype)
     probe = signs((n,), units.dtype)
     factors, shifted = shifted_where_singular(
         lambda shift: factorised(scaled.plus_diagonal(shift)), lambda factors: solution(A.places, factors, probe), shift
