@@ -26,7 +26,7 @@ from .._program.block_tridiagonal import pairs_in_a_column
 from .._program.block_tridiagonal_lu import Factors as Blocks
 from .._program.block_tridiagonal_lu import factorised as by_blocks
 from .._program.block_tridiagonal_lu import order, positive_eigenvalues, solution
-from .._program.shifted_factors import REFINEMENTS, SHIFT, scales, shifted_where_singular, signs
+from .._program.shifted_factors import SHIFT, put_right, scales, shifted_where_singular, signs
 from .._program.sparse_jacobian import SPARSE
 from .._program.sparse_matrix import Places, SparseMatrix, picked, summed_by
 from .pseudo_inverse import everywhere
@@ -125,9 +125,7 @@ def solver(M: SparseMatrix, G: SparseMatrix, factors: Factors) -> tuple[Callable
     def once(given):
         return scale * jax.vmap(lambda b: solution(how.places, factors.of, b), in_axes=1, out_axes=1)(scale * given)
 
-    def refined(matvec, given):
-        times = jnp.where(factors.regular, EXACT, REFINEMENTS)
-        return lax.fori_loop(0, times, lambda _, found: found + once(given - matvec(found)), once(given))
+    refined = lambda matvec, given: put_right(once, matvec, given, EXACT, ~factors.regular)
 
     def solve(f, c):
         x, pull = apart(lax.custom_linear_solve(by_matrix, jnp.concatenate([f, c]), refined, symmetric=True))

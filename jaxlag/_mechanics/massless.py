@@ -217,7 +217,7 @@ def _by_newton(flat: Flat, z, rows, equations: Callable, t, q, v) -> tuple[Array
         start = jnp.concatenate([given, jnp.zeros_like(like[k:])]), jnp.zeros_like(given), jnp.array(True), jnp.array(0)
         w, left, _, _ = jax.lax.while_loop(lambda carry: carry[2] & (carry[3] < ITERATIONS), newton, start)
         scale = jnp.maximum(jnp.max(jnp.abs(force(given))), jnp.max(jnp.abs(force(jnp.zeros_like(given)))))
-        solved = jnp.max(jnp.abs(left)) <= jnp.finfo(v.dtype).eps ** 0.5 * scale
+        solved = jnp.all(jnp.abs(left) <= jnp.finfo(v.dtype).eps ** 0.5 * scale)
         return w, (solved & resists(args, w[:k]), linear(args, w).solution().sound.satisfied)
 
     def resists(args, w):

@@ -15,7 +15,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float
 
 from .._program.block_tridiagonal import by_factor, elimination, factor
-from .._program.shifted_factors import REFINEMENTS, SHIFT, shifted_where_singular, signs
+from .._program.shifted_factors import SHIFT, put_right, shifted_where_singular, signs
 from .._program.sparse_matrix import SparseMatrix, picked, summed_by
 from .pseudo_inverse import FOLLOWS, everywhere
 
@@ -66,10 +66,7 @@ def solver(M: lx.DiagonalLinearOperator, G: SparseMatrix, factors: Factors) -> t
         scaled = factors.D[:, :, None] * by_factor(factors.of, factors.D[:, :, None] * blocks)
         return picked(scaled.reshape(-1, R.shape[1]), back)
 
-    def refined(matvec, R):
-        times = jnp.where(factors.regular, 0, REFINEMENTS)
-        return lax.fori_loop(0, times, lambda _, X: X + once(R - matvec(X)), once(R))
-
+    refined = lambda matvec, R: put_right(once, matvec, R, 0, ~factors.regular)
     by_rows = lambda R: lax.custom_linear_solve(S, R, refined, symmetric=True)
 
     def solve(f, c):

@@ -41,7 +41,8 @@ def factor(line: Line, entries: Float[Array, " e"]) -> Factors:
     turn = scalarised(functools.partial(_eliminated, line), limit=WRITTEN_OUT)
     _, (L, K, pivots) = lax.scan(turn, (P, P[0]), given, reverse=True)
     by_x, by_before = jax.vmap(lambda given: _by_parts(line, _matrices(line, given)))(given)
-    return Factors(L, K, by_x[:, line.handed], by_before[:, line.handed], jnp.min(pivots))
+    pivot = jnp.where(jnp.any(jnp.isnan(pivots)), jnp.nan, jnp.min(pivots))  # a minimum of thousands leaves NaN out on a CPU
+    return Factors(L, K, by_x[:, line.handed], by_before[:, line.handed], pivot)
 
 
 def _matrices(line: Line, given: Float[Array, " g"]) -> list[Array]:

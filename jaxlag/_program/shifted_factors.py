@@ -11,7 +11,7 @@ from jaxtyping import Array, Bool, Float
 
 SHIFT = 0.35  # exponent of eps: what is added then, in units in which the matrix has numbers near one
 GROWTH = 0.85  # exponent of 1/eps: what the inverse makes of a number then; that of a straight chain of m links makes m²/8 of it
-REFINEMENTS = 12  # times that a solution is put right then
+REFINEMENTS = 12, 400  # times that a solution is put right then, at least and at most: a straight chain of 1000 links takes 40
 LIGHT = 0.25  # exponent of eps: a number on the diagonal beside the largest, below which it sets no scale
 
 
@@ -19,7 +19,7 @@ def shifted_where_singular(factored: Callable, probed: Callable, shift: Array, i
     """Factors without a shift, or with it where the inverse makes too much of a vector at random; and whether that is so. They stand in
     the program once, but where making them `is_work` no more than adding the shift.
     """
-    is_singular = lambda factors: ~(jnp.max(jnp.abs(probed(factors))) < jnp.finfo(shift.dtype).eps ** -GROWTH)
+    is_singular = lambda factors: ~jnp.all(jnp.abs(probed(factors)) < jnp.finfo(shift.dtype).eps ** -GROWTH)
     if not is_work:
         shifted = is_singular(factored(jnp.zeros_like(shift)))
         return factored(jnp.where(shifted, shift, 0)), shifted
@@ -34,6 +34,29 @@ def shifted_where_singular(factored: Callable, probed: Callable, shift: Array, i
     start = nothing, jnp.array(True), jnp.array(False)
     factors, _, shifted = lax.while_loop(lambda carry: carry[1], attempt, start)
     return factors, shifted
+
+
+def put_right(once: Callable, matvec: Callable, b: Array, least: int, shifted: Bool[Array, ""]) -> Array:
+    """A⁻¹ b by `once(b)`, which is near it, and by what is left of that: `least` times, and where the factors are `shifted` some times, and
+    then as long as the changes shrink and are more than rounding. NaN where they still do after all that.
+    """
+    (few, most), largest = REFINEMENTS, lambda x: jnp.max(jnp.abs(x), initial=0.0)
+
+    def turn(carry):
+        x, change, _, i = carry
+        new = once(b - matvec(x))
+        return x + new, largest(new), change, i + 1
+
+    def going_on(carry):
+        x, change, before, i = carry
+        shrinking = (change < before) & (change > 4 * jnp.finfo(b.dtype).eps * largest(x))
+        return (i < least) | (shifted & ((i < few) | (shrinking & (i < most))))
+
+    unknown = jnp.asarray(jnp.inf, b.dtype)
+    x, change, before, i = lax.while_loop(going_on, turn, (once(b), unknown, unknown, 0))
+    to_come = change**2 / jnp.where(before > change, before - change, 1)  # of a geometric series
+    is_found = ~shifted | (i < most) | (to_come <= jnp.finfo(b.dtype).eps ** 0.5 * largest(x))
+    return jnp.where(is_found, x, jnp.nan)
 
 
 def scales(diagonal: Float[Array, " n"]) -> Float[Array, " n"]:

@@ -13,7 +13,7 @@ from jaxtyping import Array, Bool, Float
 from .array_dependence import dependence
 from .block_tridiagonal_lu import Factors, factorised, order, solution, transposed
 from .expressions import TooLong
-from .shifted_factors import REFINEMENTS, SHIFT, scales, shifted_where_singular, signs
+from .shifted_factors import SHIFT, put_right, scales, shifted_where_singular, signs
 from .sparse_jacobian import SPARSE
 from .sparse_matrix import Places, SparseMatrix, colors, picked, summed_by
 
@@ -87,9 +87,7 @@ def by_factors(places: Places, factors: NewtonFactors, b: Float[Array, "n *b"]) 
 
 def refined(matvec: Callable, places: Places, factors: NewtonFactors, b: Float[Array, "n *b"]) -> Float[Array, "n *b"]:  # noqa: F821
     """A⁻¹ b, what is left put right: once, or where rows depend on each other until it is."""
-    times = jnp.where(jnp.all(factors.regular), 1, REFINEMENTS)
-    turn = lambda _, x: x + by_factors(places, factors, b - matvec(x))
-    return lax.fori_loop(0, times, turn, by_factors(places, factors, b))
+    return put_right(lambda b: by_factors(places, factors, b), matvec, b, 1, ~jnp.all(factors.regular))
 
 
 def linear_solution(push: Callable, places: Places, b: Float[Array, "n *b"]) -> Float[Array, "n *b"]:  # noqa: F821

@@ -369,6 +369,15 @@ def test_a_bar_of_finite_elements(n):
     close(jl.acceleration(jl.System(energy), q, v, {"m": m}).qddot, np.linalg.solve(M, force), 1e-12)
 
 
+@pytest.mark.parametrize("n", [80, 5000])
+def test_a_mass_below_zero_is_refused(n):
+    """Of thousands, too: there XLA's minimum on a CPU leaves out NaN."""
+    q, v, given = state(n)
+    given["m"][n // 2] = -10.0 * n
+    with pytest.raises(ValueError, match="must give every direction inertia"):
+        jl.acceleration(CHAIN, q, v, given)
+
+
 def test_a_chain_without_mass_at_its_end_is_refused():
     q, v, given = state(80)
     with pytest.raises(ValueError, match="must give every direction inertia"):

@@ -158,6 +158,28 @@ def test_a_straight_chain_of_many_links_is_no_redundant_one():
     np.testing.assert_allclose(found.x, 0, atol=1e-8)
 
 
+@pytest.mark.parametrize("links", [1000, 10_000])
+def test_a_straight_chain_of_many_links_with_some_stated_twice(links):
+    """S of a straight chain is all but singular itself. Of a thousand links, each of two equal rods has half the force of one stated once;
+    of ten thousand it is said that none is found.
+    """
+    x = jnp.ravel(jnp.outer(jnp.arange(1.0, links + 1), jnp.array([np.sin(0.3), -np.cos(0.3)])))
+    rods = lambda x: jnp.sum(jnp.diff(x.reshape(-1, 2), axis=0, prepend=0) ** 2, axis=1)
+    twice = lambda x: jnp.concatenate([rods(x), rods(x)[3:40]])
+    M, f = lx.DiagonalLinearOperator(jnp.ones(x.size)), jnp.tile(jnp.array([0.0, -9.81]), links)
+    (_, once), (_, more) = jacobian(rods, x), jacobian(twice, x)
+    plain = saddle_point(M, once, f, jnp.zeros(links))
+    found = jax.jit(lambda f: saddle_point(M, more, f, jnp.zeros(links + 37)))(f)
+    assert found.sound.satisfied == (links == 1000)
+    if links > 1000:
+        return
+    np.testing.assert_allclose(found.x, plain.x, rtol=0, atol=1e-10 * np.abs(plain.multipliers).max())
+    size = np.abs(plain.multipliers).max()
+    np.testing.assert_allclose(found.multipliers[links:], found.multipliers[3:40], rtol=0, atol=1e-8 * size)
+    shared = found.multipliers[:links].at[3:40].add(found.multipliers[links:])
+    np.testing.assert_allclose(shared, plain.multipliers, rtol=0, atol=1e-8 * size)
+
+
 def test_in_single_precision(single_precision):
     jax.clear_caches()  # which know places as 64-bit integers
     function, x, masses, f, a = (y if callable(y) else y.astype("float32") for y in problem("tree"))
