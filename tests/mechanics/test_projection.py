@@ -288,7 +288,7 @@ EXAMPLES = {
     "vehicle": Example(vehicle.system, vehicle.q0, vehicle.qdot0, vehicle.params, 20.0),
 }
 CONSTRAINED = [name for name, x in EXAMPLES.items() if x.system.constraints]
-LONG = ("five bars", "two bars", "ladder", "cart", "disc")  # to compile
+TO_COMPILE = ("five bars", "two bars", "ladder", "cart", "disc")  # what takes long
 
 
 def run(name, q0, qdot0, end, **changes):
@@ -360,7 +360,7 @@ def test_constraint_forces_are_orthogonal_to_every_allowed_velocity(name):
             assert np.max(np.abs(allowed @ force[i]), initial=0.0) <= 1e-13 * largest
 
 
-@pytest.mark.parametrize("name", [pytest.param(name, marks=pytest.mark.slow if name in LONG else ()) for name in CONSTRAINED])
+@pytest.mark.parametrize("name", [pytest.param(name, marks=pytest.mark.slow if name in TO_COMPILE else ()) for name in CONSTRAINED])
 def test_constraints_at_rest_do_no_work_and_moving_ones_do(name):
     x, found, motion = EXAMPLES[name], seen(name), motion_of(name)
     speed = np.linalg.norm(flat(motion.qdot), axis=1)
