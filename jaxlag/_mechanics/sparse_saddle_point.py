@@ -16,7 +16,7 @@ from jaxtyping import Array, Bool, Float
 
 from .._program.block_tridiagonal import by_factor, elimination, factor
 from .._program.shifted_factors import SHIFT, put_right, shifted_where_singular, signs
-from .._program.sparse_matrix import SparseMatrix, picked, summed_by
+from .._program.sparse_matrix import SparseMatrix, picked, row_sums, summed_by
 from .pseudo_inverse import FOLLOWS, everywhere
 
 
@@ -94,8 +94,11 @@ def masses(M: lx.DiagonalLinearOperator) -> Float[Array, " n"]:
 
 
 def is_satisfied(G: SparseMatrix, c, x, free) -> Bool[Array, ""]:
-    """Whether G x = c, as far as rounding lets it be, beside the motion without constraints: what rows that follow from others ask for
-    follows too.
+    """Whether G x = c, each row in its own units, as far as rounding lets it be beside the motion without constraints: what rows that
+    follow from others ask for follows too.
     """
-    scale = jnp.abs(c) + abs(G) @ (jnp.abs(x) + jnp.abs(free))
-    return jnp.all(jnp.abs(G @ x - c) <= jnp.finfo(x.dtype).eps ** FOLLOWS * jnp.max(scale, axis=0, initial=0.0, keepdims=True))
+    size = row_sums(G)[:, None]
+    unit = jnp.where(size > 0, 1 / jnp.where(size > 0, size, 1), 1)
+    scale = unit * (jnp.abs(c) + abs(G) @ (jnp.abs(x) + jnp.abs(free)))
+    allowed = jnp.finfo(x.dtype).eps ** FOLLOWS * jnp.max(scale, axis=0, initial=0.0, keepdims=True)
+    return jnp.all(unit * jnp.abs(G @ x - c) <= allowed)

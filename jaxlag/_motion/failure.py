@@ -5,6 +5,7 @@ import numpy as np
 
 from .._mechanics.friction_elements import unread_friction
 from .._mechanics.singular_directions import explained
+from .._program.jit import values
 from .results import OF_THE_INPUT, OF_THE_STEPS, has_failed, reason_of
 from .trajectory import Trajectory
 
@@ -23,7 +24,8 @@ def raise_failure(trajectory: Trajectory, start: tuple | None = None) -> None:
         q0, qdot0, states = start
         of = trajectory.provenance
         raise ValueError(explained(reason, of.system, q0, qdot0, of.params, trajectory.ts[0], states))
-    samples, coordinate = trajectory.ts.shape[-1], np.asarray(jax.tree.leaves(trajectory.q)[0])
+    known = values(trajectory.q)  # also of what is differentiated
+    samples, coordinate = trajectory.ts.shape[-1], np.asarray(jax.tree.leaves(trajectory.q if known is None else known)[0])
     reached = np.isfinite(coordinate.reshape(-1, samples, coordinate.size // trajectory.ts.size)[..., 0]).sum(1).min()
     numerics = (
         "Allow more `max_steps`, inspect what was computed with `throw=False`, or use a solver for stiff systems, "

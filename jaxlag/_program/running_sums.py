@@ -82,8 +82,13 @@ def lifted(function: Callable, x: Float[Array, " n"]) -> Lifted | None:
     def slopes(z):
         return jnp.concatenate(jax.grad(between, has_aux=True)(z))
 
+    def turned(at_and_along):
+        """How the summands change, along a direction of which nothing is known: of one of ones some products would be seen to be zero."""
+        at, along = jnp.split(at_and_along, 2)
+        return jax.jvp(lambda z: between(z)[1], (at,), (along,))[1]
+
     try:
-        turning = dependence(lambda z: jax.jvp(lambda z: between(z)[1], (z,), (jnp.ones_like(z),))[1], z)
+        turning = dependence(turned, jax.ShapeDtypeStruct((2 * z.size,), z.dtype))[:, : z.size]
         pattern = dependence(slopes, z)
     except TooLong:
         return None
@@ -106,6 +111,7 @@ class _Cuts:
 
     def run(self, closed: Any, x: Array) -> Array:
         """The result."""
+        self.dtype = x.dtype  # of what is cut: numbers of another kind stay as they are
         self.needs_numbers = bool({"dot_general", "scan"}.intersection(primitive_names(closed)))
         return self.within(closed, [(x, True)])[0][0]
 
@@ -120,15 +126,16 @@ class _Cuts:
         is_known = not depends and all(map(is_numeric, arrays)) and not any(map(has_extended_dtype, equation.outvars))
         if self.needs_numbers and is_known:  # something may be multiplied by it, or picked
             return [(array, False) for array in fold_by_jax(equation, arrays)]
-        if name == "dot_general" and (product := _as_running_sum(arrays, [moves for _, moves in operands], p)) is not None:
+        same = equation.outvars and equation.outvars[0].aval.dtype == self.dtype
+        if name == "dot_general" and same and (product := _as_running_sum(arrays, [moves for _, moves in operands], p)) is not None:
             return [(self.cut(*product), True)]
         if depends and name in CALLS:
             return self.within(called_program(equation), operands)
-        if depends and name == "cumsum" and arrays[0].shape[p["axis"]] >= MIN_LENGTH:
+        if depends and name == "cumsum" and arrays[0].dtype == self.dtype and arrays[0].shape[p["axis"]] >= MIN_LENGTH:
             return [(self.cut(arrays[0], RunningSum(arrays[0].shape, p["axis"], p["reverse"])), True)]
         if depends and name == "scan" and p["length"] >= MIN_LENGTH:
             along = lambda summands, reverse: self.cut(summands, RunningSum(summands.shape, 0, reverse))
-            if (found := in_running_sums(equation, arrays, [moves for _, moves in operands], along)) is not None:
+            if (found := in_running_sums(equation, arrays, [moves for _, moves in operands], along, self.dtype)) is not None:
                 return found
         if depends and name == "broadcast_in_dim":
             array = jnp.expand_dims(arrays[0], [d for d in range(len(p["shape"])) if d not in p["broadcast_dimensions"]])
@@ -142,7 +149,7 @@ class _Cuts:
     def repeated(self, array: Array, shape: tuple[int, ...]) -> Array:
         """Broadcast to a shape; along the axis that grows most by a running sum of the array and zeros."""
         growth = [of if had == 1 else 1 for had, of in zip(array.shape, shape, strict=True)]
-        if max(growth, default=1) >= MIN_LENGTH:
+        if max(growth, default=1) >= MIN_LENGTH and array.dtype == self.dtype:
             axis = int(np.argmax(growth))
             summands = jnp.concatenate([array, jnp.repeat(jnp.zeros_like(array), shape[axis] - 1, axis)], axis)
             array = self.cut(summands, RunningSum(summands.shape, axis, False))

@@ -105,17 +105,19 @@ def _term(equation: Any, operands: list[Term]) -> list[Term]:
     return [found] * len(equation.outvars)
 
 
-def in_running_sums(equation: Any, operands: list, depends: list[bool], summed: Callable) -> list[tuple[Array, bool]] | None:
+def in_running_sums(equation: Any, operands: list, depends: list[bool], summed: Callable, dtype: Any) -> list[tuple[Array, bool]] | None:
     """The results of a scan, and whether they depend on what those of its operands do that `depends` says, with carries by
-    `summed(summands, reverse)`; None where no carry depends on it, or one that is no running sum.
+    `summed(summands, reverse)`; None where no carry depends on it, or one that is no running sum, or of another kind of numbers.
     """
     turn = Turn.of(equation)
     i, terms, moves = turn.constants, turn.terms, turn.reached_from(depends)
     waiting = [k for k in range(i, i + turn.carries) if moves[k]]
     if not waiting or not all(k in terms[k - i].beside for k in waiting) or any(map(has_extended_dtype, equation.invars)):
         return None
-    operands = [np.asarray(x, atom.aval.dtype) if is_numeric(x) else x for x, atom in zip(operands, equation.invars, strict=True)]
+    if any(equation.invars[k].aval.dtype != dtype for k in waiting):
+        return None
     with jax.ensure_compile_time_eval():
+        operands = [jnp.asarray(x, atom.aval.dtype) if is_numeric(x) else x for x, atom in zip(operands, equation.invars, strict=True)]
         known = turn.in_turn(operands, [is_numeric(x) and not of for x, of in zip(operands, depends, strict=True)], {})
     before, finals = turn.in_turn(operands, [not of for of in depends], known), {}
     while waiting:
@@ -126,7 +128,7 @@ def in_running_sums(equation: Any, operands: list, depends: list[bool], summed: 
         summands, first = turn.side_by_side(operands, before)[k - i], operands[k]
         if any(k in term.of for at, term in enumerate(terms) if at != k - i):
             at_first = np.eye(1, turn.length, turn.length - 1 if turn.reverse else 0).reshape(-1, *[1] * (summands.ndim - 1))
-            after = summed(summands + at_first.astype(summands.dtype) * first, turn.reverse)
+            after = summed(summands + at_first.astype(summands.dtype) * first[None], turn.reverse)
             before[k], finals[k] = turn.shifted(first, after)
         else:  # it matters as a whole
             finals[k] = first + jnp.sum(summands, axis=0)

@@ -183,6 +183,57 @@ def with_a_random_key(q, qdot, m, l, g):
     return jnp.sum(0.5 * m * (v**2 + qdot**2)) + g * jnp.sum(jnp.cos(q))
 
 
+def of_neighbours(q, qdot, m, l, g):
+    """No sums: squares of differences, which do not change where all rates change alike."""
+    d = jnp.diff(qdot.reshape(-1, 2), axis=0)
+    return 0.5 * m[0] * jnp.sum(qdot**2) + jnp.cumsum(jnp.einsum("ij,ij->i", d, d))[-1] + g * jnp.sum(jnp.cos(q))
+
+
+def of_neighbours_by_scan(q, qdot, m, l, g):
+    d = jnp.diff(qdot.reshape(-1, 2), axis=0)
+    total = jax.lax.scan(lambda total, d: ((total := total + d @ d), total), 0.0, d)[1][-1]
+    return 0.5 * m[0] * jnp.sum(qdot**2) + total + g * jnp.sum(jnp.cos(q))
+
+
+def counted(q, qdot, m, l, g):
+    """A carry of whole numbers that follows the rates."""
+    turn = lambda c, x: ((c[0] + jnp.where(x > 0, 1, 0), c[1] + x), c)
+    count, v = jax.lax.scan(turn, (0, 0.0), l * jnp.cos(q) * qdot)[1]
+    return jnp.sum(0.5 * m * v**2) + jnp.sum((1 + count) * qdot**2) + g * jnp.sum(jnp.cos(q))
+
+
+def in_the_complex_plane(q, qdot, m, l, g):
+    v = jax.jvp(lambda q: jnp.cumsum(l * jnp.exp(1j * q)), (q,), (qdot,))[1]
+    return jnp.sum(0.5 * m * (v.real**2 + v.imag**2)) + g * jnp.sum(jnp.cos(q))
+
+
+def one_or_the_other(q, qdot, m, l, g):
+    """A choice of which one number decides for all."""
+    v = jnp.where(qdot[0] > 0, jnp.cumsum(l * jnp.cos(q) * qdot), qdot)
+    return jnp.sum(0.5 * m * v**2) + jnp.sum(qdot**2) + g * jnp.sum(jnp.cos(q))
+
+
+def with_a_function_of_its_own(q, qdot, m, l, g):
+    """Known rows, given to a function with a derivative rule."""
+
+    def link(v, given):
+        known, x = given
+        return (v := v + jax.nn.relu(known) * x), v
+
+    v = jax.lax.scan(link, 0.0, (np.linspace(-1.0, 1.0, q.size), l * jnp.cos(q) * qdot))[1]
+    return jnp.sum(0.5 * m * (v**2 + qdot**2)) + g * jnp.sum(jnp.cos(q))
+
+
+OTHERS = [of_neighbours, of_neighbours_by_scan, counted, in_the_complex_plane, one_or_the_other, with_a_function_of_its_own]
+
+
+@pytest.mark.parametrize("written", OTHERS)
+def test_other_sums_and_other_numbers(written):
+    """Whatever is seen in them."""
+    q, v, given = state(80)
+    check_inertia(written, jnp.asarray(q), jnp.asarray(v), given)
+
+
 SCANS = {function: True for function in (by_scan, from_rows, backwards, by_numbers, turned)}
 SCANS |= {function: False for function in (dying_away, on_one_another, doubled, ending_in, with_a_random_key)}
 
