@@ -101,6 +101,7 @@ WINGS = {  # each imports only from those above it, and each file of a wing only
     ],
     "_motion": [
         "protocol",
+        "unreached",
         "variational",
         "derivative_rule",
         "tableaux",

@@ -116,9 +116,17 @@ def _by_values(values, U, held, D):
     size = jnp.where(held, jax.lax.rsqrt(jnp.where(held, values, 1)), 0)
     # Least norm in the units given: take out of range and domain what lies in the null space of S, spanned by V.
     V = jnp.where(held[None, :], 0, D[:, None] * U)
-    gram = jnp.linalg.cholesky(V.T @ V + jnp.diag(held | (jnp.sum(V**2, axis=0) == 0)).astype(D.dtype))
-    out = jnp.eye(len(D), dtype=D.dtype) - V @ jax.scipy.linalg.cho_solve((gram, True), V.T)
+    out = jnp.eye(len(D), dtype=D.dtype) - V @ _inverse_of_columns(V)
     return out @ (D[:, None] * U * size[None, :])
+
+
+def _inverse_of_columns(V):
+    """V⁺. Of two columns, one of them zero, by their squares; of more, these could lie so near one another that squares hide it."""
+    if len(V) > 2:
+        return jnp.linalg.pinv(V)
+    squares = jnp.sum(V**2, axis=0)
+    gram = jnp.linalg.cholesky(V.T @ V + jnp.diag(squares == 0).astype(V.dtype))
+    return jax.scipy.linalg.cho_solve((gram, True), V.T)
 
 
 @jax.custom_jvp

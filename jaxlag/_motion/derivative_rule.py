@@ -11,6 +11,7 @@ from jax.flatten_util import ravel_pytree
 
 from .._mechanics.pseudo_inverse import everywhere
 from .._program.jit import compiled, jitted
+from .unreached import rows_reached, with_unreached
 from .variational import derived, pushforward, split_varying
 
 # Up to this many perturbed numbers the Jacobian comes whole out of one vectorised forward pass; beyond it a tangent is
@@ -61,14 +62,14 @@ def differentiable(of: DifferentiableMap) -> Callable:
             y, aux = solution(inputs, ts)
         elif size <= FORWARD_LIMIT:
             (y, J), aux = differentiable(WithJacobian(of))((varying, constant), ts)
-            dx = ravel_pytree(d_inputs)[0]
-            change = _product(J, dx)
+            change = _product(J, y, ravel_pytree(d_inputs)[0])
         else:
             y, aux = solution(inputs, ts)
-            change = _jacobian_product(of, varying, constant, ts, y, ravel_pytree(d_inputs)[0])
+            dx = ravel_pytree(d_inputs)[0]
+            change = with_unreached(_jacobian_product(of, varying, constant, ts, y, dx), y, dx)
         if d_ts is not None:
             shift = jax.tree.map(lambda rate: _shift(rate, d_ts), drifted(of, inputs, ts, y))
-            change = shift if change is None else jax.tree.map(jnp.add, change, shift)
+            change = with_unreached(shift if change is None else jax.tree.map(jnp.add, change, shift), y, d_ts)
         return (y, aux), (change, jax.tree.map(lambda _: None, aux))
 
     return solution
@@ -80,8 +81,8 @@ def _shift(rate, d_ts):
 
 
 @jitted  # one program for all parts of y; its transpose is one, too
-def _product(J: Any, dx: Any) -> Any:
-    return jax.tree.map(lambda rows: rows @ dx, J)
+def _product(J: Any, y: Any, dx: Any) -> Any:
+    return with_unreached(jax.tree.map(lambda rows, y: rows_reached(rows, y) @ dx, J, y), y, dx)
 
 
 @compiled
@@ -148,7 +149,7 @@ def differentiable_batch(solve: Callable, drift: Callable, push: Callable) -> Ca
         members = jax.tree.leaves(inputs[1])[0].shape[-1]
 
         def direction(e):
-            of_own = zip(jnp.split(e[x.size :], np.cumsum(sizes)[:-1]), flat, strict=True)
+            of_own = zip(jnp.split(e[x.size :], np.cumsum(sizes))[:-1], flat, strict=True)  # behind the last is nothing
             own = [jnp.broadcast_to(part.reshape(*leaf.shape[:-1], 1), leaf.shape).astype(leaf.dtype) for part, leaf in of_own]
             return unravel(e[: x.size].astype(x.dtype)), jax.tree.unflatten(structure, own)
 
@@ -161,10 +162,11 @@ def differentiable_batch(solve: Callable, drift: Callable, push: Callable) -> Ca
             directions = jax.vmap(direction, out_axes=-1)(jnp.eye(count, dtype=ts.dtype))
             (y, J), aux = push(inputs, directions, ts)
             dx = jnp.broadcast_to(ravel_pytree(d_inputs[0])[0][:, None], (x.size, members))
-            change = jnp.einsum("...mp,pm->...m", J, jnp.concatenate([dx, joined(jax.tree.leaves(d_inputs[1]))]))
+            dx = jnp.concatenate([dx, joined(jax.tree.leaves(d_inputs[1]))])
+            change = with_unreached(jnp.einsum("...mp,pm->...m", rows_reached(J, y), dx), y, dx)
         if d_ts is not None:
             shift = drift(inputs, ts, y) * d_ts[:, None, None]
-            change = shift if change is None else change + shift
+            change = with_unreached(shift if change is None else change + shift, y, d_ts)
         return (y, aux), (change, jax.tree.map(lambda _: None, aux))
 
     return motions

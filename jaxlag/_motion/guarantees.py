@@ -9,6 +9,7 @@ from jaxtyping import Array, Bool, Float
 from .first_order import EquationsOfMotion
 from .results import RESULTS
 from .sample import Evidence, Sample
+from .unreached import nan_unless
 
 
 def verified(
@@ -37,7 +38,7 @@ def verified(
         reached = jnp.where(jnp.any(broken), jnp.minimum(reached, ts[first]), reached)
 
     def masked(leaf):
-        return jnp.where(there.reshape(-1, *[1] * (leaf.ndim - 1)), leaf, jnp.nan) if jnp.issubdtype(leaf.dtype, jnp.floating) else leaf
+        return nan_unless(there.reshape(-1, *[1] * (leaf.ndim - 1)), leaf) if jnp.issubdtype(leaf.dtype, jnp.floating) else leaf
 
     return jax.tree.map(masked, sample), result, reached
 

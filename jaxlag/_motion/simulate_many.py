@@ -233,7 +233,7 @@ def _motions_and_variations(equations, options, inputs, directions, ts):
     last_t, last_y = stats["last"]
     ys, change = ys[..., 0], ys[..., 1:]
     ys, aux = _with_status(ys, result, stats | {"last": (last_t, last_y[..., 0])}, start)
-    return (ys, jnp.where(jnp.isfinite(ys)[..., None], change, 0)), aux
+    return (ys, change), aux
 
 
 def _initialised(equations, inputs, ts):

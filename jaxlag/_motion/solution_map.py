@@ -138,7 +138,7 @@ class SolutionMap:
             function = with_more(function, of_order.params)
         is_motion = np.zeros(ys.shape[states.ndim :], bool)
         is_motion[(0,) * len(directions)] = True
-        return function((jnp.where(is_motion, states.reshape(known.shape), jnp.where(known, ys, 0)), inputs.params))
+        return function((jnp.where(is_motion, states.reshape(known.shape), jnp.where(known, ys, jnp.nan)), inputs.params))
 
     def drift(self, inputs: Inputs, ts: Array, samples: Samples) -> Samples:
         """The change of each sample with its own time."""

@@ -42,6 +42,19 @@ def test_pseudo_inverse_of_rows_in_different_units():
     np.testing.assert_allclose(pseudo_inverse(jnp.asarray(S)), np.linalg.pinv(S, rcond=1e-13, hermitian=True), rtol=1e-5)
 
 
+@pytest.mark.parametrize("seed", range(6))
+def test_rows_stated_twice_whose_units_are_far_apart(seed):
+    """Ten decades: x as of each row once, in one unit, by NumPy."""
+    rng = np.random.default_rng(seed)
+    M, G, f, c = random_problem(rng, 12, 8)
+    units = 10.0 ** rng.uniform(-5, 5, 8)
+    more, asked = np.vstack([units[:, None] * G, 2 * units[:3, None] * G[:3]]), np.append(units * c, 2 * units[:3] * c[:3])
+    found = saddle_point(lx.MatrixLinearOperator(jnp.asarray(M)), *map(jnp.asarray, (more, f, asked)))
+    whole = np.block([[M, -G.T], [G, np.zeros((8, 8))]])
+    np.testing.assert_allclose(found.x, np.linalg.solve(whole, np.append(f, c))[:12], rtol=1e-9, atol=1e-9)
+    assert found.sound.determined and found.sound.satisfied
+
+
 def test_pseudo_inverse_derivatives_at_constant_rank():
     """Directions within the matrices of rank 2, against central differences of NumPy's pinv; second order too."""
     rng = np.random.default_rng(4)

@@ -65,6 +65,13 @@ def solved(rows, x, masses, f, a):
     return saddle_point(lx.DiagonalLinearOperator(masses), G, f, G @ a)
 
 
+@jax.jit
+def solved_in_units(x, units, masses, f, a):
+    """Rods of a chain in units of their own, and ten of them twice."""
+    _, G = jacobian(lambda x: jnp.concatenate([units * chain(x), 2 * units[:10] * chain(x)[:10]]), x)
+    return saddle_point(lx.DiagonalLinearOperator(masses), G, f, G @ a)
+
+
 @pytest.mark.parametrize("name", SYSTEMS)
 def test_as_by_dense_matrices(name):
     function, x, masses, f, a = problem(name)
@@ -156,6 +163,20 @@ def test_a_straight_chain_of_many_links_is_no_redundant_one():
     assert found.sound.satisfied
     np.testing.assert_allclose(-2 * found.multipliers, np.arange(n, 0, -1.0), rtol=1e-9)
     np.testing.assert_allclose(found.x, 0, atol=1e-8)
+
+
+@pytest.mark.parametrize("decades", [0, 2, 4, 5])
+def test_rods_stated_twice_whose_units_are_far_apart(decades):
+    """It is right, or it is said that it is not."""
+    for seed in range(50):
+        function, x, masses, f, a = problem("chain", seed)
+        units = 10 ** jnp.asarray(np.random.default_rng(seed).uniform(-decades, decades, LINKS - 1))
+        found = solved_in_units(x, units, masses, f, a)
+        G = np.asarray(jax.jacobian(function)(x))
+        expected = by_hand(G, masses, f, G @ a)[0]
+        assert decades or found.sound.satisfied
+        if found.sound.satisfied:
+            np.testing.assert_allclose(found.x, expected, rtol=0, atol=1e-7 * np.abs(expected).max())
 
 
 @pytest.mark.parametrize("links", [1000, 10_000])
