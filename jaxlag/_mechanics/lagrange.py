@@ -16,13 +16,15 @@ from .._model.system import System
 from .._model.validation import at_state
 from .._program.sparse_jacobian import MANY, jacobian
 from .._program.sparse_matrix import SparseMatrix, dense
-from .structured_inertia import structured_inertia
+from .structured_inertia import MOST_FULL, structured_inertia
 
 
 def inertia(flat: Flat, t, q, v) -> tuple[lx.AbstractLinearOperator, Float[Array, " n"]]:
     """M and the force of the Lagrangian alone, ∂L/∂q − (∂²L/∂q̇∂q) q̇ − ∂²L/∂q̇∂t."""
     momentum = jax.grad(flat.lagrangian, argnums=2)
     M = structured_inertia(lambda v: flat.lagrangian(t, q, v), v) if v.size >= MANY else jacobian(lambda v: momentum(t, q, v), v)[1]
+    if flat.massless and MANY <= v.size <= MOST_FULL:  # it is not positive itself, but where constraints hold what has no mass
+        M = lx.MatrixLinearOperator(M.as_matrix())
     _, carried = jax.jvp(lambda t, q: momentum(t, q, v), (t, q), (jnp.ones_like(t), v))
     return M, jax.grad(flat.lagrangian, argnums=1)(t, q, v) - carried
 

@@ -14,12 +14,11 @@ from .._program.sparse_jacobian import MANY
 from .._program.sparse_matrix import SparseMatrix, dense
 from . import block_saddle_point, sparse_saddle_point
 from .pseudo_inverse import Inverse, Request, applied, by_rows, everywhere, inverse_of
-from .structured_inertia import StructuredInertia, by_inertia, is_positive, root_of_inverse
+from .structured_inertia import MOST_FULL, StructuredInertia, by_inertia, is_positive, root_of_inverse
 from .structured_inertia import factorised as structure_factorised
 
 Rows = Float[Array, "m n"] | SparseMatrix
 FEW = 16  # rows, from which on sparse ones are better kept so beside a sparse M
-MOST_FULL = 2000  # coordinates, of which M may be needed with all its numbers
 
 
 class Sound(NamedTuple):

@@ -19,6 +19,8 @@ from .._program.running_sums import RunningSum, lifted
 from .._program.sparse_jacobian import jacobian
 from .._program.sparse_matrix import SparseMatrix
 
+MOST_FULL = 2000  # coordinates, of which M may be needed with all its numbers
+
 
 class StructuredInertia(lx.AbstractLinearOperator):
     """M by the slopes of L and of the summands between its running sums."""

@@ -204,3 +204,26 @@ def test_what_constraints_hold_is_left_to_them():
     found = jl.acceleration(crank, {"z": 2.0, "y": 4.0}, {"z": 1.0, "y": 4.0})
     np.testing.assert_allclose([found.multipliers["rod"], found.qddot["z"]], [4.0, -16.0], rtol=1e-12)
     np.testing.assert_allclose(found.qddot["y"], 2 + 2 * 2 * -16.0, rtol=1e-12)
+
+
+def of_points(v):
+    return 0.5 * jnp.sum(v[:-1] ** 2)
+
+
+def of_coupled_points(v):
+    return 0.5 * jnp.sum(v[:-1] ** 2) + 0.25 * jnp.sum(jnp.diff(v[:-1]) ** 2)
+
+
+@pytest.mark.parametrize("kinetic", [of_points, of_coupled_points])
+@pytest.mark.parametrize("wheels", [1, 20])
+def test_many_coordinates_of_which_constraints_hold_one_without_mass(kinetic, wheels):
+    """Gears along a row of points, the last without mass: against NumPy on the whole saddle point."""
+    n = 72
+    lagrangian = lambda q, qdot: kinetic(qdot) - 0.5 * jnp.sum(jnp.diff(q) ** 2)
+    gears = lambda q, qdot: qdot[-wheels:] - (1 + q[-wheels:] ** 2) * qdot[-wheels - 1 : -1]
+    q = jnp.asarray(np.random.default_rng(0).uniform(0, 1, n))
+    found = jl.acceleration(jl.System(lagrangian, nonholonomic={"gears": gears}), q, jnp.zeros(n))
+    M, G = jax.hessian(kinetic)(q), jax.jacobian(gears, 1)(q, jnp.zeros(n))
+    whole = np.block([[M, -G.T], [G, np.zeros((wheels, wheels))]])
+    expected = np.linalg.solve(whole, np.append(jax.grad(lagrangian)(q, jnp.zeros(n)), np.zeros(wheels)))
+    np.testing.assert_allclose(np.append(found.qddot, found.multipliers["gears"]), expected, rtol=0, atol=1e-12)
