@@ -50,10 +50,9 @@ class System:
     - `events`: by name, `Event(when, then)`: what happens where a function of the state passes through zero, or at given times;
       `with_events(...)` gives the system with others.
 
-    **Fields:** `lagrangian`, `dissipation`, `force`, `holonomic`, `unilateral` and `nonholonomic`, each a tuple of (name, function), so that
-    `dict(system.lagrangian)` gives it to another system;
-    `restitution` and `laws`, tuples of (name, number or function) and of (name, law); `one_sided`, a tuple of names; `states` and `events`,
-    tuples of (name, state) and of (name, event).
+    **Fields:** `lagrangian`, `dissipation`, `force`, `holonomic`, `unilateral` and `nonholonomic`, each a tuple of (name, function), which
+    `dict(system.lagrangian)` gives to another system; `restitution` and `laws`, tuples of (name, number or function) and of (name, law);
+    `one_sided`, a tuple of names; `states` and `events`, tuples of (name, state) and of (name, event).
 
     Any consistent set of units. Functions may return plain numbers, integers or lists, which become floating arrays. A system is
     immutable, hashable and compared by its functions. Create it once: one created again from new functions is compiled again. What was
