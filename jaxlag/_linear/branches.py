@@ -21,10 +21,15 @@ class Spectrum(NamedTuple):
         """In another order."""
         return Spectrum(self.at, self.values[order], self.vectors[:, order], self.rounding[order])
 
+    def growing(self, least: np.ndarray) -> np.ndarray:
+        """Which eigenvalues grow by more than rounding, and than `least`; of a pair both or none."""
+        return self.values.real > np.maximum(least, self.rounding_of_pairs)
+
     @property
-    def signs(self) -> np.ndarray:
-        """Of the real parts; 0 where rounding decides."""
-        return np.where(np.abs(self.values.real) <= self.rounding, 0, np.sign(self.values.real)).astype(int)
+    def rounding_of_pairs(self) -> np.ndarray:
+        """What rounding does to each eigenvalue or to its conjugate, whichever is more."""
+        other = np.argmin(np.abs(self.values[:, None].conj() - self.values[None, :]), axis=1)
+        return np.maximum(self.rounding, self.rounding[other])
 
 
 class Transition(NamedTuple):
@@ -75,18 +80,21 @@ def followed(spectrum_at: Callable[[float], Spectrum], values: np.ndarray) -> tu
 
 
 def _transitions(spectrum_at: Callable, before: Spectrum, after: Spectrum) -> Iterator[Transition]:
-    """Between two spectra, one after the other: each where the number of growing eigenvalues changes."""
-    count = lambda spectrum: np.sum(spectrum.signs > 0)
-    size = np.max(np.abs([before.values, after.values]), initial=0.0)
+    """Between two spectra, one after the other: each where the number of growing eigenvalues changes.
+
+    With bounds of rounding for each branch that are those of both ends at least: in between they flicker, and would be crossed twice.
+    """
+    bound = np.maximum(before.rounding_of_pairs, after.rounding_of_pairs)
+    count = lambda spectrum: np.sum(spectrum.growing(bound))
     ends = before.at, after.at
     while count(before) != count(after):
         low, high = before, after
         while (middle := (low.at + high.at) / 2) not in (low.at, high.at):
-            between = spectrum_at(middle)
+            between = continued(low, spectrum_at(middle))
             low, high = (between, high) if count(between) == count(before) else (low, between)
         grows = bool(count(high) > count(low))
-        growing = high if grows else low
-        near = np.abs(growing.values.real) <= 1e-5 * size
-        for which in np.flatnonzero((growing.signs > 0) & near & (growing.values.imag >= -growing.rounding)):
+        growing, other = (high, low) if grows else (low, high)
+        crosses = growing.growing(bound) & ~other.growing(bound) & (growing.values.imag >= -bound)
+        for which in np.flatnonzero(crosses):
             yield Transition(high.at, int(which), grows, growing, max(ends, key=lambda end: abs(end - high.at)))
         before = high

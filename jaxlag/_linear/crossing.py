@@ -14,6 +14,7 @@ from .._model.system import System
 from .._program.jit import compiled
 from .branches import Transition
 from .matrices import Choice, matrices
+from .zero_eigenvalues import Core
 
 STEPS = 5  # of Newton's method, from a crossing that was bracketed to where rounding decides
 MEET = 1e-5  # yᴴx of unit vectors below which two eigenvalues meet in one eigenvector
@@ -66,7 +67,7 @@ def _eigenvectors(A: np.ndarray, value: complex) -> tuple[np.ndarray, np.ndarray
 def moving(
     point: Float[Array, ""],
     A: np.ndarray,
-    core: np.ndarray,
+    core: Core,
     value: complex,
     of: tuple[Choice, System, Any],
     state: Callable[[Any], PyTree],
@@ -77,9 +78,8 @@ def moving(
     dp = −Re(yᴴ dA x/yᴴx)/Re(yᴴ A' x/yᴴx). Where two eigenvalues meet in one eigenvector, yᴴx = 0, and yᴴ (dA + A' dp) x = 0 keeps them
     together.
     """
-    y, x = _eigenvectors(A[np.ix_(core, core)], value)
-    weights = np.zeros(A.shape, complex)
-    weights[np.ix_(core, core)] = np.outer(y, x)
+    y, x = _eigenvectors(core.taken(A), value)
+    weights = core.weights(y, x)
     known, along = jax.jvp(state, (point,), (jnp.ones_like(point),))
     parts = _projected(np.stack([weights.real, weights.imag]).astype(A.dtype), *of, known)
     slopes = [np.asarray(part[0]) + 1j * np.asarray(part[1]) for part in parts]

@@ -35,9 +35,9 @@ def minimum_near(V: Callable, g: Callable, q: Float[Array, " n"], moving: Any) -
         curvature, directions = jnp.linalg.eigh(P @ (K + K.T) @ P / 2)
         largest = jnp.max(jnp.abs(curvature), initial=0.0)
         along = directions.T @ (P @ slope)
-        floor = eps**0.5 * largest + jnp.max(jnp.abs(along), initial=0.0) * 1e-3 + eps
-        step = -directions @ (along / jnp.maximum(jnp.abs(curvature), floor))
         reach = 1 + jnp.max(jnp.abs(q))
+        floor = eps**0.5 * largest + jnp.max(jnp.abs(along), initial=0.0) * 1e-3 / reach + eps
+        step = -directions @ (along / jnp.maximum(jnp.abs(curvature), floor))
         flat = jnp.max(jnp.abs(step), initial=0.0) <= eps**0.5 * reach
         falls = curvature[0] < -(eps**0.5) * largest
         step = jnp.where(flat & falls, step + 0.1 * reach * directions[:, 0], step)

@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Array, Complex, Float
 
 POINTS = 32  # of an integral around an eigenvalue
+TURNS = 60  # of the scaling of a matrix
 
 
 class Eigen(NamedTuple):
@@ -27,9 +28,9 @@ def eigen(A: Float[Array, "d d"]) -> Eigen:
     """
     if not len(A):
         return Eigen(jnp.zeros(0, _complex(A)), jnp.zeros((0, 0), _complex(A)))
-    scale, size = _balanced(A)
-    balanced = A * scale[None, :] / scale[:, None]
-    values, vectors = jnp.linalg.eig(jnp.where(jnp.abs(balanced) <= len(A) * jnp.finfo(A.dtype).eps * size, 0, balanced))
+    scale, size = balanced(A)
+    scaled = A * scale[None, :] / scale[:, None]
+    values, vectors = jnp.linalg.eig(jnp.where(jnp.abs(scaled) <= len(A) * jnp.finfo(A.dtype).eps * size, 0, scaled))
     vectors = scale[:, None] * vectors
     values = jnp.where(jnp.abs(values) <= rounding(A, vectors), 0, values)
     order = jnp.lexsort((values.imag, jnp.abs(values)))
@@ -91,7 +92,7 @@ def are_repeated(values: Array, bound: Array) -> Array:
 def rounding(A: Float[Array, "d d"], vectors: Complex[Array, "d d"]) -> Float[Array, " d"]:
     """How far rounding moves each eigenvalue: what it moves A, times the sensitivity of the eigenvalue, ‖y‖ ‖x‖/|yᴴx|."""
     A, vectors = jax.lax.stop_gradient((A, vectors))
-    scale, size = _balanced(A)
+    scale, size = balanced(A)
     vectors = vectors / scale[:, None]
     vectors = vectors / jnp.linalg.norm(vectors, axis=0, keepdims=True)
     U, s, Vh = jnp.linalg.svd(vectors)
@@ -111,19 +112,21 @@ def _largest(vectors):
     return jnp.argmax(size >= (1 - 1e-6) * jnp.max(size, axis=0, keepdims=True), axis=0)[None, :]
 
 
-def _balanced(A):
-    """A diagonal scaling D, in powers of two, after which rows and columns of D⁻¹AD are about the same size, and the largest entry."""
+def balanced(A: Float[Array, "d d"]) -> tuple[Float[Array, " d"], Float[Array, ""]]:
+    """A diagonal scaling D, in powers of two, after which rows and columns of D⁻¹AD are about the same size, and the largest entry.
+
+    With their diagonal: what is coupled one way only could be scaled for ever, and is until the coupling is no larger than that.
+    """
     A = jnp.abs(jax.lax.stop_gradient(A))
-    off = A * (1 - jnp.eye(len(A), dtype=A.dtype))
 
     def turn(_, scale):
-        scaled = off * scale[None, :] / scale[:, None]
+        scaled = A * scale[None, :] / scale[:, None]
         row, column = jnp.sum(scaled, axis=1), jnp.sum(scaled, axis=0)
         known = (row > 0) & (column > 0)
         ratio = jnp.where(known, row, 1) / jnp.where(known, column, 1)
         return scale * jnp.exp2(jnp.round(jnp.log2(ratio) / 4))
 
-    scale = jax.lax.fori_loop(0, 20, turn, jnp.ones(len(A), A.dtype))
+    scale = jax.lax.fori_loop(0, TURNS, turn, jnp.ones(len(A), A.dtype))
     return scale, jnp.max(A * scale[None, :] / scale[:, None])
 
 

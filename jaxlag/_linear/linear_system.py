@@ -12,9 +12,19 @@ from .._model.numbers import number, numbers
 from .._model.state_values import Layout
 from .._program.jit import compiled, is_concrete
 from .eigenvalues import eigen
-from .modes import Modes, SecondOrder, damping_ratios, is_conservative, normalised, of_first_order, of_second_order
+from .modes import (
+    Modes,
+    SecondOrder,
+    damping_ratios,
+    is_conservative,
+    normalised,
+    of_first_order,
+    of_second_order,
+    undamped,
+    with_derivatives_of,
+)
 from .origin import Origin
-from .response import Bode, bode, free_motion, frequencies, frequency_response, held, in_discrete_steps, zeros
+from .response import Bode, bode, free_motion, frequencies, frequency_response, held, in_discrete_steps, spectral_density, zeros
 from .tangent_space import Partition
 
 
@@ -95,8 +105,12 @@ class LinearSystem(eqx.Module):
         order = self.second_order
         conservative = order is not None and is_conservative(order)
         found = of_second_order(order) if conservative else of_first_order(self.A, self.sample_time)
-        d, n = len(found.vectors), self.coordinates.q.size
-        vectors = normalised(found.vectors, self.basis[:n, :d] @ found.vectors, self.mass if normalise == "mass" else None)
+        n, mass = self.coordinates.q.size, self.mass if normalise == "mass" else None
+        scaled = lambda found: found._replace(vectors=normalised(found.vectors, self.basis[:n, : len(found.vectors)] @ found.vectors, mass))
+        found = scaled(found)
+        if conservative and not is_concrete(order):  # differentiated: by what would damp or turn them, too
+            found = with_derivatives_of(found, scaled(undamped(of_first_order(self.A, None))))
+        d, vectors = len(found.vectors), found.vectors
         q, z, forces = self.basis[:n, :d] @ vectors, self.basis[2 * n :, :d] @ vectors, self.constraint_forces[:, :d] @ vectors
         shaped = lambda layout, columns: jax.vmap(lambda x: _unravelled(layout, x))(columns.T)
         at = self.coordinates
@@ -117,16 +131,9 @@ class LinearSystem(eqx.Module):
         matrix, or one of either for each of `omega`, as measured. In the convention of S: two-sided and per rad/time, or one-sided and
         per Hz.
         """
-        response, density = self.frequency_response(omega), jnp.asarray(density)
-        S = (
-            density
-            if density.ndim >= 2
-            else jnp.asarray(density)[..., None, None]
-            * jnp.broadcast_to(jnp.eye(response.shape[-1]), (*density.shape, *response.shape[-1:] * 2))
-        )
-        if S.shape[-1] != response.shape[-1] or (S.ndim == 3 and len(S) != len(response)):
-            raise ValueError(f"`density` must be one number or matrix, or one for each ω, but has shape {density.shape}. Match its axes.")
-        return response @ jnp.broadcast_to(S, (len(response), *S.shape[-2:])) @ _transposed(response.conj())
+        response = self.frequency_response(omega)
+        S = spectral_density(density, len(response), response.shape[-1])
+        return response @ S @ _transposed(response.conj())
 
     def step_response(self, ts: Any) -> Float[Array, "t p m"]:
         """Outputs at the times `ts` (0 or later, increasing) after each input has become 1 at t = 0, from rest."""
@@ -204,7 +211,12 @@ class LinearSystem(eqx.Module):
             )
 
     def _steps(self, ts):
-        steps = np.asarray(_times(ts)) / np.asarray(self.sample_time)
+        ts = _times(ts)
+        if not is_concrete((ts, self.sample_time)) or not len(ts):
+            raise ValueError(
+                "`ts` must hold known times, one or more, but is empty, or hidden by `jit`, or the sample time is. Call it outside."
+            )
+        steps = np.asarray(ts) / np.asarray(self.sample_time)
         if np.any(np.abs(steps - np.round(steps)) > 1e-6):
             raise ValueError("`ts` must be multiples of the sample time, but are not. In discrete time there is nothing in between.")
         return np.round(steps).astype(int)
@@ -212,7 +224,7 @@ class LinearSystem(eqx.Module):
 
 def _times(ts):
     ts = numbers(ts, "`ts`")
-    if ts.ndim != 1 or (is_concrete(ts) and (np.any(np.asarray(ts) < 0) or np.any(np.diff(ts) < 0))):
+    if ts.ndim != 1 or (is_concrete(ts) and not (np.all(np.asarray(ts) >= 0) and np.all(np.diff(ts) >= 0))):
         raise ValueError("`ts` must be a list of times from 0 on, increasing, but is not. Count time from the step.")
     return ts
 

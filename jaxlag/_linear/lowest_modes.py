@@ -37,9 +37,10 @@ def lowest_modes(system: System, q: Any, params: PyTree = None, *, count: int = 
     less than half as many as there are degrees of freedom; `shift`: a real number in 1/time, some part of the lowest frequency, needed
     where a body is free to move or K is singular for another reason. Any consistent units.
 
-    **Returns:** `Modes`, the lowest first; without damping it is checked by the inertia of the matrices that none was left out (a warning
-    says so where that is not certain). The eigenvalues are differentiable once, in `params` and `q`, those of repeated ones as their mean
-    without damping; derivatives of shapes, and of repeated eigenvalues with damping, are NaN.
+    **Returns:** `Modes`, the smallest |λ − `shift`| first; without damping the lowest ω² = −λ², so that what grows fastest comes first, and
+    the inertia of the matrices tells that none was left out (a warning says so where that is not certain). The eigenvalues are
+    differentiable once, in `params` and `q`, those of repeated ones as their mean without damping; derivatives of shapes, and of repeated
+    eigenvalues with damping, are NaN.
 
     **Raises:** `ValueError` where q is not at rest, where the matrix is singular, where modes were not found, and under `jit` and `vmap`,
     which hide the numbers; for systems with dry friction, nonholonomic constraints, contacts, events or states beside q.
@@ -116,10 +117,10 @@ class _Slopes(NamedTuple):
         slopes = self._slopes(dtype) @ jnp.asarray(found.same / np.sum(found.same, axis=1), dtype)
         if not found.conservative:
             return _with_slopes(values, slopes * np.where(np.sum(found.same, axis=1) > 1, np.nan, 1.0))
-        squares = _with_slopes(values.imag**2 - values.real**2, -slopes.real)
-        there = squares != 0
-        omega = jnp.sqrt(jnp.where(there, jnp.abs(squares), 1)) * there
-        return jnp.where(squares < 0, omega, 1j * omega)
+        squares = _with_slopes(-(values**2), -slopes)  # complex: they may come to be damped
+        there, grows = squares != 0, squares.real < 0
+        omega = jnp.sqrt(jnp.where(there, jnp.where(grows, -squares, squares), 1)) * there
+        return jnp.where(grows, omega, 1j * omega)
 
     def _slopes(self, dtype: Any) -> Complex[Array, " k"]:
         """−yᵀ P(λ) x, which has the derivatives of the eigenvalues; by λ, too: with c = ∂(yᵀ P x)/∂λ and G w = c it is c dλ = wᵀ dE."""

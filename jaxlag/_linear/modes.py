@@ -2,6 +2,7 @@
 
 import dataclasses
 import itertools
+from collections.abc import Iterator
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -12,6 +13,7 @@ from jaxtyping import Array, Bool, Complex, Float, PyTree
 
 from .._program.jit import compiled, is_concrete
 from .eigenvalues import are_repeated, eigen, rounding, symmetric_eigen
+from .not_differentiated import without_derivative
 from .origin import Origin
 
 
@@ -71,8 +73,14 @@ class Modes(eqx.Module):
     def __len__(self) -> int:
         return self.eigenvalues.shape[-1]
 
+    def __iter__(self) -> Iterator["Modes"]:
+        return (self[i] for i in range(len(self.eigenvalues)))
+
     def __getitem__(self, which: Any) -> "Modes":
         """Some of the modes."""
+        first = which[0] if isinstance(which, tuple) and which else which
+        if isinstance(first, int | np.integer) and not -len(self.eigenvalues) <= first < len(self.eigenvalues):
+            raise IndexError(f"`modes[{first}]` must be one of {len(self.eigenvalues)} modes, counted from 0.")
         origin, of_many = self.origin, self.eigenvalues.ndim - 1
         if of_many > 0:  # all modes of one system have one origin
             origin = jax.tree.map(lambda x: x[which[:of_many] if isinstance(which, tuple) else which], origin)
@@ -145,6 +153,30 @@ def of_first_order(A: Float[Array, "d d"], sample_time: Any) -> Found:
     return Found(found.values[upper], found.vectors[:, upper], found.stable[upper], found.repeated[upper])
 
 
+def undamped(found: Found) -> Found:
+    """Of the modes of first order of an undamped system those that `of_second_order` finds, in its order, by positions alone: of ±ω the
+    growing one, of two zeros one.
+    """
+    values = np.asarray(jax.lax.stop_gradient(found.values))
+    still = np.flatnonzero(values == 0)
+    chosen = np.sort(np.concatenate([still[: len(still) // 2], np.flatnonzero((values.imag > 0) | (values.real > 0))]))
+    positions = found.vectors[: len(found.vectors) // 2]
+    return Found(found.values[chosen], positions[:, chosen], found.stable[chosen], found.repeated[chosen])
+
+
+def with_derivatives_of(found: Found, other: Found) -> Found:
+    """Modes without damping, with the derivatives of `other`, which knows what would damp or turn them; shapes stay real."""
+    if found.values.shape != other.values.shape:  # what was told from rounding in one of both was not in the other
+        values, vectors = (without_derivative(x, other.values) for x in found[:2])
+        return found._replace(values=values, vectors=vectors)
+
+    def of(x, other):
+        other = other if jnp.iscomplexobj(x) else other.real
+        return jax.lax.stop_gradient(x) + (other - jax.lax.stop_gradient(other))
+
+    return found._replace(values=of(found.values, other.values), vectors=of(found.vectors, other.vectors))
+
+
 @compiled
 def _of_first_order(A, sample_time):
     values, vectors = eigen(A)
@@ -175,7 +207,7 @@ def is_conservative(system: SecondOrder) -> bool:
 def damping_ratios(values: Array) -> Array:
     """−Re λ/|λ|, and 0 of λ = 0."""
     size = _size(values)
-    return jnp.where(values.real != 0, -values.real / jnp.where(size > 0, size, 1), 0.0)
+    return 0 - values.real / jnp.where(size > 0, size, 1)
 
 
 def normalised(vectors: Array, shapes: Array, mass: Array | None) -> Array:

@@ -9,6 +9,7 @@ from jaxtyping import Array, Complex, Float
 
 from .._model.numbers import numbers
 from .._program.jit import compiled, is_concrete
+from .eigenvalues import balanced
 
 
 class Bode(NamedTuple):
@@ -105,17 +106,53 @@ def in_discrete_steps(A: Array, B: Array, C: Array, D: Array, steps: np.ndarray,
     return jax.lax.scan(lambda x, _: (A @ x + B, C @ x + D), x0, length=int(np.max(steps)) + 1)[1][steps]
 
 
+def spectral_density(given: Any, count: int, inputs: int) -> Complex[Array, "w m m"] | Float[Array, "w m m"]:
+    """That of the inputs at each frequency, from one number or matrix, or one for each."""
+    try:
+        density = jnp.asarray(given)
+    except (TypeError, ValueError):
+        raise TypeError(f"`density` must be numbers, but is {given!r}. Pass one number or matrix, or one for each ω.") from None
+    square = density if density.ndim >= 2 else density[..., None, None] * jnp.eye(inputs)[(None,) * density.ndim]
+    if square.ndim > 3 or square.shape[-2:] != (inputs, inputs) or (square.ndim == 3 and len(square) != count):
+        raise ValueError(f"`density` must be one number or matrix, or one for each ω, but has shape {density.shape}. Match its axes.")
+    if is_concrete(density) and not np.all(np.diagonal(np.asarray(square), axis1=-2, axis2=-1).real >= 0):
+        raise ValueError(
+            "`density` must be zero or more for each input, but one is negative or NaN. It is a mean square for each frequency."
+        )
+    return jnp.broadcast_to(square, (count, inputs, inputs))
+
+
 def zeros(A: Any, B: Any, C: Any, D: Any) -> np.ndarray:
     """Invariant zeros: where [A − s, B; C, D] loses rank, by reduction to a system of the same zeros with a regular D.
 
     Source: Emami-Naeini & Van Dooren, Automatica 18 (1982) 415-430.
     """
-    A, B, C, D = (np.asarray(x, float) for x in (A, B, C, D))
+    A, B, C, D = _in_units(*(np.asarray(x, float) for x in (A, B, C, D)))
     size = max(np.max(np.abs(np.block([[A, B], [C, D]])), initial=0.0), np.finfo(float).tiny)
     tolerance = 100 * sum(A.shape) * np.finfo(float).eps * size
     A, B, C, D = _with_full_rows(A, B, C, D, tolerance)
     A, C, B, D = (x.T for x in _with_full_rows(A.T, C.T, B.T, D.T, tolerance))  # of the dual system
     return np.linalg.eigvals(A - B @ np.linalg.solve(D, C)).astype(complex) if len(A) else np.zeros(0, complex)
+
+
+def _in_units(A, B, C, D):
+    """The same system with other units of its states, inputs and outputs, in which rows and columns are about the same size."""
+    (n, m), p = B.shape, len(C)
+    closed = np.block(
+        [[A, B, np.zeros((n, p))], [np.zeros((m, n + m)), np.ones((m, p))], [C, D, np.zeros((p, p))]]
+    )  # outputs lead to inputs
+    units = np.asarray(balanced(jnp.asarray(closed))[0])
+    closed = closed * units[None, :] / units[:, None]
+    A, size = closed[:n, :n], np.max(np.abs(closed[:n, :n]), initial=0.0) or 1.0
+    into, out_of = closed[np.r_[:n, n + m : n + m + p], n : n + m], closed[n + m :, :n]
+    into = into * size / _or_one(np.max(np.abs(into), axis=0, keepdims=True, initial=0.0))
+    both = np.concatenate([out_of, into[n:]], axis=1)
+    both = both * size / _or_one(np.max(np.abs(both), axis=1, keepdims=True, initial=0.0))
+    return A, into[:n], both[:, :n], both[:, n:]
+
+
+def _or_one(x):
+    return np.where(x > 0, x, 1)
 
 
 def _with_full_rows(A, B, C, D, tolerance):

@@ -93,7 +93,7 @@ class Equations:
 
     def __init__(self, search: Search, system: System, q: PyTree, params: PyTree, values: PyTree, at: Given, flat: Flat):
         self.search, self.system, self.like = search, system, Layout.of(q).shapes
-        self.rest = eqx.partition(params, eqx.is_inexact_array)[1]
+        self.rest = eqx.partition(params, eqx.is_array)[1]
         self.unravel_states = ravel_pytree(values)[1]
         self.moving = np.setdiff1d(np.arange(at.q.size), search.fixed).astype(int)
         self.running = np.array(search.running, int)
@@ -136,7 +136,7 @@ def steady_state(search: Search, system: System, t: Any, q: PyTree, qdot: PyTree
     """The steady state near a guess."""
     flat, t, q0, v0 = checked(system, t, q, qdot, params, states)
     values = start_values(system, states, t, q, qdot, params)
-    given = Given(eqx.filter(params, eqx.is_inexact_array), t, q0, v0)
+    given = Given(eqx.filter(params, eqx.is_array), t, q0, v0)
     equations = Equations(search, system, q, params, values, given, flat)
     start = jax.lax.stop_gradient(q0)
     if search.stable:

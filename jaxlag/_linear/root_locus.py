@@ -25,7 +25,7 @@ from .linear_system import LinearSystem
 from .linearise import linearise
 from .matrices import Choice, matrices
 from .not_differentiated import without_derivative
-from .zero_eigenvalues import always_zero, coupled, without_zeros
+from .zero_eigenvalues import Core
 
 
 class RootLocus(eqx.Module):
@@ -97,12 +97,10 @@ def root_locus(
     known = seen(family.params)
     matrix = functools.cache(lambda at: np.asarray(family.matrix(at, known)))
     grid = [matrix(at) for at in finer(values)]
-    core = coupled(grid)
-    part = np.ix_(core, core)
-    zeros = always_zero([A[part] for A in grid])
-    shown, transitions = followed(lambda at: _spectrum(at, matrix(at)[part], zeros), values)
+    core = Core.of(grid)
+    shown, transitions = followed(lambda at: _spectrum(at, *core.without_zeros(matrix(at))), values)
     family.refuse_unsteady(float(values[-1]), known)
-    crossings = [_crossing(family, matrix, core, zeros, transition) for transition in transitions]
+    crossings = [_crossing(family, matrix, core, transition) for transition in transitions]
     eigenvalues = np.stack([at.values for at in shown])
     eigenvalues = np.concatenate([eigenvalues, np.zeros((len(values), len(grid[0]) - eigenvalues.shape[1]))], axis=1)
     return RootLocus(over, jnp.asarray(values), without_derivative(jnp.asarray(eigenvalues), family.params), tuple(crossings))
@@ -178,9 +176,8 @@ def given_state(q: Any, qdot: Any, t: Any, params: PyTree) -> tuple[PyTree, PyTr
     return state(q, jax.tree.map(lambda x: 0.0 * jnp.asarray(x), q) if qdot is None else qdot)
 
 
-def _spectrum(at: float, A: np.ndarray, zeros: list[int]) -> Spectrum:
-    """All eigenvalues but those that are zero at every value."""
-    A, basis = without_zeros(A, zeros)
+def _spectrum(at: float, A: np.ndarray, basis: np.ndarray) -> Spectrum:
+    """That of a matrix, in the coordinates of the basis."""
     values, vectors, bound = map(np.asarray, eigen_and_rounding(A))
     return Spectrum(at, values, basis @ vectors, bound)
 
@@ -192,16 +189,15 @@ def eigen_and_rounding(A: Float[Array, "d d"]) -> tuple[Array, Array, Array]:
     return values, vectors, rounding(A, vectors)
 
 
-def _crossing(family: _Family, matrix: Callable, core: np.ndarray, zeros: list[int], transition: Transition) -> Crossing:
+def _crossing(family: _Family, matrix: Callable, core: Core, transition: Transition) -> Crossing:
     """A transition, with its derivative in `params`."""
-    part = np.ix_(core, core)
     comes_to_zero = abs(transition.eigenvalue.imag) <= 10 * transition.spectrum.rounding[transition.which]
     at, value = transition.at, transition.eigenvalue
-    if not (zeros and comes_to_zero):
-        at, value = located(lambda at: matrix(at)[part], transition)
+    if not (core.zeros and comes_to_zero):
+        at, value = located(lambda at: core.taken(matrix(at)), transition)
     point = jnp.asarray(at)
     if not is_concrete(family.params):
-        if zeros and comes_to_zero:
+        if core.zeros and comes_to_zero:
             raise ValueError(
                 f"`params` must not be differentiated at {family.over} = {at:g}, but are: an eigenvalue comes to zero there beside others "
                 "that are always zero. Take differences."

@@ -109,7 +109,9 @@ def _undamped(matrices: Matrices, count: int, shift: float) -> Found:
     for attempt in range(ATTEMPTS):
         start = np.random.default_rng(attempt).normal(size=matrices.K.shape[0])
         with searching():
-            squares, vectors = eigsh(matrices.K, min(k, most), matrices.M, sigma=sigma, v0=start)
+            squares, vectors = eigsh(
+                matrices.K, min(k, most), matrices.M, sigma=sigma, v0=start, ncv=_basis(min(k, most), matrices.freedoms)
+            )
         order = np.argsort(squares, kind="stable")
         squares, vectors = squares[order], vectors[:, order]
         if not _left_out(matrices, squares, count):
@@ -128,6 +130,11 @@ def _undamped(matrices: Matrices, count: int, shift: float) -> Found:
     omega = np.sqrt(np.abs(squares))
     values = np.where(squares < 0, omega, 1j * omega)
     return Found(values, vectors + 0j, (vectors / size) + 0j, same, True)
+
+
+def _basis(k: int, most: int) -> int:
+    """How many vectors Arnoldi's method keeps: of no more there are where constraints leave few degrees of freedom."""
+    return min(max(2 * k + 1, 20), most)
 
 
 def _left_out(matrices: Matrices, squares: np.ndarray, count: int) -> bool:
@@ -167,7 +174,7 @@ def _damped(matrices: Matrices, count: int, shift: float, symmetric: bool) -> Fo
     for seed in range(2):
         start = np.random.default_rng(seed).normal(size=A.shape[0])
         with searching():
-            values, z = eigs(A, k, B, sigma=shift, v0=start)
+            values, z = eigs(A, k, B, sigma=shift, v0=start, ncv=_basis(k, 2 * matrices.freedoms))
         upper = np.flatnonzero(values.imag >= -matrices.equal * np.abs(values))
         order = upper[np.argsort(np.abs(values[upper] - shift), kind="stable")][:count]
         found.append((values[order], z[np.ix_(of_modes, order)]))

@@ -12,6 +12,8 @@ from .._model.system import System
 from .rest import Curvature, Rest
 
 ELSEWHERE = "by the eigenvalues of `linearise`"
+NOISE = 0.75  # exponent of eps (1.8e-12 in double precision): a stiffness beside the largest, by what has inertia 1, that counts as none
+TURNS = 30  # each halves what is left of a scaling, in decades
 
 
 def stability(system: System, found: Rest) -> tuple[Array | None, str]:
@@ -29,18 +31,53 @@ def stability(system: System, found: Rest) -> tuple[Array | None, str]:
     M, by_q = found.slopes
     n, eps = len(M), float(np.finfo(M.dtype).eps)
     K, G = -by_q[:n], by_q[n:]
-    N = tangent_basis(G[np.any(G, axis=1)], eps)
-    K, M = N.T @ K @ N, N.T @ M @ N
-    if np.max(np.abs(K - K.T), initial=0.0) > eps**0.5 * np.max(np.abs(K), initial=0.0):
+    G, units = G[np.any(G, axis=1)], _units(M, K)
+    in_units = lambda A: A * units[:, None] * units[None, :]
+    N, plain = tangent_basis(G * units, eps), tangent_basis(G, eps)
+    along = lambda A: N.T @ in_units(A) @ N
+    if np.max(np.abs(along(K - K.T)), initial=0.0) > eps**0.5 * np.max(np.abs(along(K)), initial=0.0):
         return None, f"{ELSEWHERE}: its forces have no potential"
-    values, directions = np.linalg.eigh((M + M.T) / 2)
-    if np.all(values > 100 * n * eps * np.max(values, initial=0.0)):
-        root = directions / np.sqrt(values)
-        K = root.T @ K @ root
-    stiffness = np.linalg.eigvalsh((K + K.T) / 2)
-    dust = eps**0.625 * np.max(np.abs(stiffness), initial=0.0)
-    kind = "unstable" if np.any(stiffness < -dust) else "neutral" if np.any(stiffness <= dust) else "stable"
-    return jnp.asarray(stiffness), kind
+    inertias, directions = np.linalg.eigh(along(M + M.T) / 2)
+    if np.all(inertias > 100 * n * eps * np.max(inertias, initial=0.0)):
+        root = directions / np.sqrt(inertias)
+        stiffness = np.linalg.eigvalsh(root.T @ along(K + K.T) @ root / 2)
+    else:
+        stiffness = np.linalg.eigvalsh(plain.T @ (K + K.T) @ plain / 2)
+    return jnp.asarray(stiffness), _kind(in_units(K + K.T) / 2, G * units, eps)
+
+
+def _units(M: np.ndarray, K: np.ndarray) -> np.ndarray:
+    """Units of the coordinates in which the inertia of each is 1, and the stiffness of those without inertia as large as the largest."""
+    mass, size = np.diagonal(M), np.max(np.abs(K), axis=1, initial=0.0)
+    has_mass = mass > 0
+    squares = np.abs(np.diagonal(K))[has_mass] / mass[has_mass]
+    largest = np.max(squares, initial=0.0) or 1.0
+    light = np.where(size > 0, np.sqrt(largest / np.where(size > 0, size, 1)), 1)
+    return np.where(has_mass, 1 / np.sqrt(np.where(has_mass, mass, 1)), light)
+
+
+def _kind(K: np.ndarray, G: np.ndarray, eps: float) -> str:
+    """What the signs of K on the null space of G say. They do not depend on units: a soft coordinate beside a stiff one has its own."""
+    K = np.where(np.abs(K) <= eps**NOISE * np.max(np.abs(K), initial=0.0), 0, K)
+    units = _equilibrating(K)
+    N = tangent_basis(G * units, eps)
+    K = N.T @ (K * np.outer(units, units)) @ N
+    units = _equilibrating(K)
+    values = np.linalg.eigvalsh(K * np.outer(units, units))
+    dust = eps**0.625 * np.max(np.abs(values), initial=0.0)
+    return "unstable" if np.any(values < -dust) else "neutral" if np.any(values <= dust) else "stable"
+
+
+def _equilibrating(K: np.ndarray) -> np.ndarray:
+    """D such that the largest number in each row of D K D is one, or zero.
+
+    Source: Ruiz, A scaling algorithm to equilibrate both rows and columns norms in matrices, RAL-TR-2001-034.
+    """
+    units = np.ones(len(K))
+    for _ in range(TURNS):
+        size = np.max(np.abs(K * np.outer(units, units)), axis=1, initial=0.0)
+        units = units / np.sqrt(np.where(size > 0, size, 1))
+    return units
 
 
 def _by_inertia(found: Curvature) -> str:
@@ -58,6 +95,10 @@ def undecided(found: Rest, names: Sequence[str]) -> tuple[str, ...]:
         return ()
     if isinstance(found.slopes, Curvature):
         return tuple(name for name, alone in zip(names, found.slopes.undecided, strict=True) if alone)
-    size = np.max(np.abs(found.slopes.by_q), axis=0, initial=0.0)
-    dust = 100 * len(size) * np.finfo(size.dtype).eps * np.max(size, initial=0.0)
+    M, by_q = found.slopes
+    units, n = _units(M, by_q[: len(M)]), len(M)
+    forces, rows = np.abs(by_q[:n] * np.outer(units, units)), np.abs(by_q[n:] * units)
+    largest = np.max(forces, initial=0.0) or 1.0, np.max(rows, axis=1, keepdims=True, initial=0.0)
+    size = np.max(np.concatenate([forces / largest[0], rows / np.where(largest[1] > 0, largest[1], 1)]), axis=0, initial=0.0)
+    dust = 100 * n * np.finfo(size.dtype).eps
     return tuple(name for name, x in zip(names, size, strict=True) if x <= dust)

@@ -12,7 +12,7 @@ from .._model.state_values import sampled
 from .._model.system import System
 from .parameter_plane import ParameterPlane
 from .root_locus import eigen_and_rounding
-from .zero_eigenvalues import always_zero, coupled, without_zeros
+from .zero_eigenvalues import Core
 
 
 @dataclasses.dataclass(frozen=True, repr=False)
@@ -105,10 +105,8 @@ def stability_map(
 
 def _fastest(grid: list[np.ndarray], idle: int) -> list[complex]:
     """Of each matrix the eigenvalue that grows fastest, without those that are zero in all matrices."""
-    core = coupled(grid)
-    grid = [A[np.ix_(core, core)] for A in grid]
-    zeros = always_zero(grid)
-    reduced = np.stack([without_zeros(A, zeros)[0] for A in grid])
+    core = Core.of(grid)
+    reduced = np.stack([core.without_zeros(A)[0] for A in grid])
     if not reduced.shape[1]:
         return [0j] * len(grid)
     padded = np.concatenate([reduced, np.repeat(reduced[:1], idle, axis=0)])  # a program for each grid, not for each number of points

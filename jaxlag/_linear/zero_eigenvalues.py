@@ -1,11 +1,47 @@
 """Eigenvalues that are zero whatever a parameter is: taken out, so that one that comes to zero is told from them."""
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
+import jax.numpy as jnp
 import numpy as np
 
+from .eigenvalues import balanced
 
-def coupled(matrices: Sequence[np.ndarray]) -> np.ndarray:
+
+class Core(NamedTuple):
+    """Of matrices that depend on parameters, in units in which rows and columns are about the same size: the states on which something
+    depends, and how many zeros all matrices have then.
+    """
+
+    scale: np.ndarray  # units of all states
+    states: np.ndarray
+    zeros: list[int]
+
+    @classmethod
+    def of(cls, matrices: Sequence[np.ndarray]) -> "Core":
+        """In the units of the largest entries."""
+        scale = np.asarray(balanced(jnp.asarray(np.max(np.abs(matrices), axis=0)))[0])
+        scaled = [A * scale[None, :] / scale[:, None] for A in matrices]
+        states = _coupled(scaled)
+        return cls(scale, states, _always_zero([A[np.ix_(states, states)] for A in scaled]))
+
+    def taken(self, A: np.ndarray) -> np.ndarray:
+        """These states, in these units."""
+        return (A * self.scale[None, :] / self.scale[:, None])[np.ix_(self.states, self.states)]
+
+    def without_zeros(self, A: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """`taken(A)` in the quotient by its zeros; and a basis of what is left, as columns."""
+        return _without_zeros(self.taken(A), self.zeros)
+
+    def weights(self, left: np.ndarray, right: np.ndarray) -> np.ndarray:
+        """W such that Σ W A is yᵀ A x of `taken(A)`."""
+        weights = np.zeros((len(self.scale), len(self.scale)), complex)
+        weights[np.ix_(self.states, self.states)] = np.outer(left, right)
+        return weights * self.scale[None, :] / self.scale[:, None]
+
+
+def _coupled(matrices: Sequence[np.ndarray]) -> np.ndarray:
     """The states on which something depends in one of the matrices: the others have eigenvalues of zero."""
     sizes = np.max(np.abs(matrices), axis=0)
     dust = len(sizes) * np.finfo(sizes.dtype).eps * np.max(sizes, axis=1, keepdims=True, initial=0.0)
@@ -15,7 +51,7 @@ def coupled(matrices: Sequence[np.ndarray]) -> np.ndarray:
     return core
 
 
-def always_zero(matrices: Sequence[np.ndarray]) -> list[int]:
+def _always_zero(matrices: Sequence[np.ndarray]) -> list[int]:
     """How many eigenvectors of zero all matrices have; how many then, in the quotient by these; and so on."""
     counts = []
     while matrices[0].size:
@@ -24,11 +60,11 @@ def always_zero(matrices: Sequence[np.ndarray]) -> list[int]:
         if not count:
             break
         counts.append(count)
-        matrices = [without_zeros(A, [count])[0] for A in matrices]
+        matrices = [_without_zeros(A, [count])[0] for A in matrices]
     return counts
 
 
-def without_zeros(A: np.ndarray, counts: Sequence[int]) -> tuple[np.ndarray, np.ndarray]:
+def _without_zeros(A: np.ndarray, counts: Sequence[int]) -> tuple[np.ndarray, np.ndarray]:
     """A in the quotient by its null space, again and again, with so many dimensions each; and a basis of what is left, as columns."""
     basis = np.eye(len(A))
     for count in counts:

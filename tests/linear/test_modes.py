@@ -465,3 +465,61 @@ def test_the_printed_modes_are_a_table():
 def test_normalisation_must_be_one_of_two():
     with pytest.raises(ValueError, match="`normalise` must be 'largest' or 'mass', but is 'size'"):
         by_hand.linearised(UNDAMPED).modes(normalise="size")
+
+
+# Derivatives where nothing is damped: by what damps, turns or drives
+
+TURNED = jl.System(
+    lambda q, qdot, w: 0.5 * qdot @ qdot - 0.5 * (q[0] ** 2 + 4 * q[1] ** 2) + w * (q[0] * qdot[1] - q[1] * qdot[0]),
+    dissipation=lambda qdot, b: 0.5 * b * (qdot[0] ** 2 + 3 * qdot[1] ** 2),
+    force=lambda q, p: p * jnp.stack([q[1], -q[0]]),
+)
+NEITHER = {"w": 0.0, "b": 0.0, "p": 0.0}
+
+
+def turned(**changed):
+    return jl.linearise(TURNED, np.zeros(2), params=NEITHER | changed).modes()
+
+
+@pytest.mark.parametrize("derivative", [jax.jacfwd, jax.jacrev])
+def test_damping_ratios_where_there_is_no_damping(derivative):
+    """ζ = b/2mω."""
+    np.testing.assert_allclose(derivative(lambda b: turned(b=b).damping_ratio)(0.0), [0.5, 0.75], rtol=1e-9)
+    np.testing.assert_allclose(derivative(lambda b: turned(b=b).eigenvalues.real)(0.0), [-0.5, -1.5], rtol=1e-9)
+
+
+@pytest.mark.parametrize("name, expected", [("w", [-4 / 3, 8 / 3]), ("p", [1 / 3, -1 / 6])])
+def test_second_derivatives_by_what_turns_an_undamped_system(name, expected):
+    """Of λ⁴ + (5 + 4w²) λ² + 4 + p² = 0."""
+    frequency = lambda x: turned(**{name: x}).angular_frequency
+    np.testing.assert_allclose(jax.jacfwd(jax.jacfwd(frequency))(0.0), expected, rtol=1e-7)
+
+
+def test_shapes_of_an_undamped_system_are_real_and_move_with_what_drives_it():
+    """q̂ = (1, x₂) with (ω² − 4) x₂ = p, at ω = 1."""
+    assert turned().shapes.dtype == float
+    np.testing.assert_allclose(jax.jacfwd(lambda p: turned(p=p).shapes)(0.0)[0], [0, -1 / 3], atol=1e-12)
+
+
+def test_derivatives_of_an_undamped_system_that_is_free_to_move():
+    """Two masses and the spring between them: the modes under `grad` are those without it."""
+    system = jl.System(lambda q, qdot, c: 0.5 * qdot @ qdot - 0.5 * c * (q[1] - q[0]) ** 2)
+    frequency = lambda c: jl.linearise(system, np.zeros(2), params={"c": c}).modes().angular_frequency
+    np.testing.assert_allclose(jax.jacfwd(frequency)(2.0), [0, 0.5], atol=1e-12)
+    assert jax.grad(lambda c: frequency(c)[1])(2.0) == pytest.approx(0.5, rel=1e-12)
+
+
+def test_a_fit_of_damping_that_starts_without():
+    """ζ = 0.05 measured: b = 2 m ω ζ = 0.4."""
+    system = jl.System(lambda q, qdot: qdot**2 - 4 * q**2, dissipation=lambda qdot, b: 0.5 * b * qdot**2)
+    measured = jl.ModalTest([1 / np.pi], 0.0, damping_ratio=[0.05], sigma=1e-3, damping_sigma=1e-3)
+    found = jl.fit(system, measured, {"b": 0.0}, free=("b",))
+    assert found.params["b"] == pytest.approx(0.4, rel=1e-6)
+
+
+def test_modes_are_a_sequence():
+    modes = turned()
+    assert [float(mode.angular_frequency) for mode in modes] == pytest.approx([1, 2])
+    assert float(modes[-1].angular_frequency) == pytest.approx(2)
+    with pytest.raises(IndexError, match="must be one of 2 modes"):
+        modes[2]
