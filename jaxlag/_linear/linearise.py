@@ -9,6 +9,7 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import PyTree
 
+from .._mechanics.consistent_state import consistent_state
 from .._model.flat import Flat, StatesAt, bind
 from .._model.injection import check_function
 from .._model.numbers import number
@@ -66,7 +67,8 @@ def linearise(
     Dry friction: what sticks is held, what slips keeps its sliding force. With `Sampled` states of one period the result is in discrete
     time, exactly. Any consistent units.
 
-    **Returns:** a `LinearSystem`. Differentiable in `q`, `qdot`, `params`, `states`.
+    **Returns:** a `LinearSystem`. Differentiable in `q`, `qdot`, `params`, `states`; a state that is given as numbers moves with its
+    constraints, as a pendulum's with the length of its rod.
 
     **Raises:** `ValueError` where the state accelerates or A changes along the motion, where it is not on its constraints, at a singular
     position, and where a name stands for nothing.
@@ -84,8 +86,8 @@ def linearise(
     pendulum.modes().angular_frequency  # √(g/l) = 2.215
     ```
     """
-    along = isinstance(q, Trajectory)
-    if hasattr(q, "qdot"):  # an equilibrium, an instant, a trajectory
+    along, found_before = isinstance(q, Trajectory), hasattr(q, "qdot")
+    if found_before:  # an equilibrium, an instant, a trajectory
         t, states = getattr(q, "ts" if along else "t", t), q.states if states is None else states
         q, qdot = q.q, q.qdot
     without_contacts(system, "`linearise`")
@@ -94,6 +96,8 @@ def linearise(
     dtype = jax.tree.leaves(q)[0].dtype
     t = jnp.asarray(t, dtype) if along else number(t, "`t`", dtype, cure="Pass one time, or a `Trajectory`.")
     params, states = parameters(params, q), given_states(system, states, q)
+    if system.constraints and not found_before and not is_concrete((t, q, qdot, params, states)):
+        q, qdot = _with_constraints(system, t, q, qdot, params, states)
     first = jax.tree.map(lambda x: x[0], (t, q, qdot, states)) if along else (t, q, qdot, states)
     near = _Near(system, first, params)
     choice = near.choice(inputs, outputs, independent)
@@ -104,6 +108,13 @@ def linearise(
     if not (along or frozen):
         refuse_unsteady(found, lambda step: of(*moved_on(first, step)), near.names)
     return _linear_system(near, choice, found, q, qdot, None if along else Origin.of(t, q, qdot, params))
+
+
+def _with_constraints(system: System, t: Any, q: PyTree, qdot: PyTree, params: PyTree, states: PyTree) -> tuple[PyTree, PyTree]:
+    """The state as it is given, with derivatives that keep it on its constraints."""
+    nearest = consistent_state(system, q, qdot, params, t=t, states=states)
+    fixed = jax.lax.stop_gradient
+    return jax.tree.map(lambda x, nearest: fixed(x) + (nearest - fixed(nearest)), (q, qdot), nearest)
 
 
 class _Near:

@@ -523,3 +523,15 @@ def test_modes_are_a_sequence():
     assert float(modes[-1].angular_frequency) == pytest.approx(2)
     with pytest.raises(IndexError, match="must be one of 2 modes"):
         modes[2]
+
+
+@pytest.mark.parametrize("transformed", [jax.jacfwd, jax.jacrev, lambda f: jax.jit(jax.jacfwd(f))])
+def test_a_state_in_numbers_moves_with_its_constraints(transformed):
+    """ω = √(g/l) of a pendulum that hangs at (0, −2): by the length of its rod."""
+    ready = jl.linearise(RODS, np.array([[0.0, -2.0]]), params=SINGLE | {"l": 2.0})
+
+    def frequency(l):
+        linear = jl.linearise(RODS, np.array([[0.0, -2.0]]), params=SINGLE | {"l": l}, independent=ready)
+        return jnp.max(jnp.abs(linear.eigenvalues))
+
+    np.testing.assert_allclose(transformed(frequency)(2.0), -0.5 * np.sqrt(9.81 / 2.0) / 2.0, rtol=1e-9)
