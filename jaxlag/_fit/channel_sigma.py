@@ -28,6 +28,14 @@ def too_short(problem: Problem) -> list[str]:
     return [name for name, z in measured.items() if z.size <= problem.size - gaps] if len(measured) > 1 else []
 
 
+def predicted_exactly(problem: Problem, found: Linearisation) -> dict[str, int]:
+    """Of several channels those without noise, but not all, with the number of their measurements: none speaks of the noise of others."""
+    measured = _by_channel(problem, lambda batch, _: batch.values)
+    residuals = _by_channel(problem, lambda batch, k: jax.tree.map(np.subtract, batch.values, found.batches[k].channels))
+    exact = {name: r.size for name, r in residuals.items() if r.size and np.sqrt(np.mean(r**2)) <= FLOOR * _spread(measured[name])}
+    return exact if len(exact) < len(residuals) else {}
+
+
 def weighted_by_spread(problem: Problem) -> Problem:
     """The problem with each channel divided by the spread of its measurements, so that its minimum does not depend on units."""
     if _is_alone(problem):

@@ -32,6 +32,7 @@ HOPELESS = 1e8  # damping from which on no step is expected to lower the cost
 SHORT = 0.3  # standard errors; the cost of so short a step is as expected, unless there is a kink
 SLIGHT = 0.1  # standard errors; a cost that falls less than by such a step has not fallen
 PATIENCE = 5  # short damped steps without such a fall, after which the iteration ends
+CLEAR = 0.375  # exponent of eps (1.3e-6 in double precision): singular values of the Jacobian, its columns of norm one, that count
 FLAT = 1e-4  # cosine of residuals and columns of the Jacobian below which the gradient counts as zero, or that of a `SLIGHT` step
 
 
@@ -56,7 +57,7 @@ class Trial(NamedTuple):
 
     y: Any
     change: Any  # J Δy of the step to y
-    free_change: Any  # |J Δy|² of the step that is held back only by the active bounds
+    free_change: Any  # |J Δy|² of the undamped step that is held back only by the active bounds
     active: Any  # bounds at which y lies and towards which the cost falls
 
 
@@ -77,11 +78,13 @@ def levenberg_marquardt(
     tolerance: float,
     bounds: tuple[Any, Any] | None = None,
     progress: Callable[[int, float], None] | None = None,
+    size: Any = np.inf,
 ) -> Outcome:
     """Minimises ½|r(y)|² within `bounds`. `linearise(y)` returns r, its Jacobian, and anything else that is wanted at the best y.
 
-    Ends where the next step would change no parameter by more than `tolerance` of its standard error: |J Δy| ≤ tolerance · σ̂, with
-    σ̂² = |r|² / `freedom`. Where y has a batch axis, so has all that `linearise` takes and returns.
+    Ends where the next step of Gauss and Newton would change no parameter by more than `tolerance` of its standard error: |J Δy| ≤
+    tolerance · σ̂, with σ̂² = |r|² / `freedom`; or by no more than rounding, a part of the `size` of what r is a difference of. Where y has a
+    batch axis, so has all that `linearise` takes and returns.
 
     **Source:** Moré, The Levenberg-Marquardt algorithm, Lecture Notes in Mathematics 630 (1978); Madsen, Nielsen & Tingleff,
     Methods for Non-Linear Least Squares Problems (2004), section 3.2; for the bounds Bertsekas, SIAM J. Control Optim. 20 (1982) 221.
@@ -90,7 +93,7 @@ def levenberg_marquardt(
     box = [np.broadcast_to(np.asarray(bound, y.dtype), y.shape) for bound in bounds or (-np.inf, np.inf)]
     now, trial = initialise(y, linearise(y), box)
     costs = [now.cost]
-    step, limits = 0, (np.full(y.shape[:-1], tolerance, y.dtype), np.full(y.shape[:-1], freedom, y.dtype))
+    step, limits = 0, [np.broadcast_to(np.asarray(limit, y.dtype), y.shape[:-1]) for limit in (tolerance, freedom, size)]
     try:
         for step in range(1, max_steps + 1):
             now, trial = update(now, trial, linearise(trial.y), box, *limits)
@@ -143,22 +146,29 @@ def _propose(now, bounds):
     descent = optx.DampedNewtonDescent()
 
     def solve_anew(last):
-        step, fixed, _, free_change = last
+        step, fixed, _ = last
         step = jnp.where(fixed, step, 0)
         info = optx.FunctionInfo.ResidualJac(now.residuals + J @ step, lx.MatrixLinearOperator(jnp.where(fixed[None], 0, J)))
         others, _ = descent.step(1 / now.damping, descent.query(now.y, info, None))  # type: ignore[arg-type]
         step = jnp.where(fixed, step, others)
         crossing = (step < lower) | (step > upper)
-        free_change = jnp.where(jnp.isnan(free_change), jnp.sum((J @ step) ** 2), free_change)  # of the first solution
-        return jnp.clip(step, lower, upper), fixed | crossing, jnp.any(crossing), free_change
+        return jnp.clip(step, lower, upper), fixed | crossing, jnp.any(crossing)
 
-    first = jnp.zeros_like(now.y), active, jnp.asarray(True), jnp.full_like(now.cost, jnp.nan)
-    step, _, _, free_change = jax.lax.while_loop(lambda last: last[2], solve_anew, first)
-    return Trial(jnp.clip(now.y + step / scale, *bounds), J @ step, free_change, active)
+    first = jnp.zeros_like(now.y), active, jnp.asarray(True)
+    step, _, _ = jax.lax.while_loop(lambda last: last[2], solve_anew, first)
+    return Trial(jnp.clip(now.y + step / scale, *bounds), J @ step, _in_range(jnp.where(active[None], 0, J), now.residuals), active)
+
+
+def _in_range(J, r):
+    """The square of the part of r that J can take away: however slowly a damped step does so along a valley of the cost."""
+    Q, R = jnp.linalg.qr(J)
+    U, values, _ = jnp.linalg.svd(R, full_matrices=False)
+    clear = values > jnp.finfo(r.dtype).eps ** CLEAR * jnp.max(values, initial=0.0)
+    return jnp.sum(jnp.where(clear, (r @ Q) @ U, 0) ** 2)
 
 
 @compiled
-def _update(now, trial, linearised, bounds, tolerance, freedom):
+def _update(now, trial, linearised, bounds, tolerance, freedom, size):
     """Takes the trial where it is better, adapts the damping, and proposes the next."""
     r, J, aux = linearised
     before, after = now.cost, _cost(r)
@@ -175,7 +185,7 @@ def _update(now, trial, linearised, bounds, tolerance, freedom):
     as_expected = (before - after) > 0.25 * expected
     damping = now.damping * jnp.where(better, jnp.where(as_expected, 0.1, 1.0), 10.0)
     damping = jnp.clip(damping, *DAMPING_LIMITS)
-    status = _status(now, trial, taken, newton_like, tolerance, freedom)
+    status = _status(now, trial, taken, newton_like, tolerance, freedom, size)
     short = (jnp.sum(trial.change**2) <= SHORT**2 * per_error) & jnp.isfinite(after)
     across = jnp.where(taken, jnp.where(short & ~as_expected, now.jacobian, J), jnp.where(short, J, now.across))
     fell = now.mark - jnp.where(taken, after, before) > SLIGHT**2 / 2 * per_error
@@ -189,10 +199,12 @@ def _update(now, trial, linearised, bounds, tolerance, freedom):
     return now, _propose(now, bounds)
 
 
-def _status(now, trial, taken, newton_like, tolerance, freedom):
+def _status(now, trial, taken, newton_like, tolerance, freedom, size):
     """Whether the iteration goes on, judged by the step that was tried from `now`."""
     norms = _norms(now.jacobian)  # the present ones: those at the start may be larger by many powers of ten
-    least = jnp.finfo(now.residuals.dtype).eps ** 0.625 * jnp.max(norms)  # below the rounding of what is integrated
+    least = jnp.finfo(now.residuals.dtype).eps ** 0.625 * jnp.minimum(
+        jnp.max(norms, initial=0.0), size
+    )  # the rounding of what is integrated
     short = trial.free_change <= jnp.maximum(tolerance**2 * 2 * now.cost / jnp.maximum(freedom, 1), least**2)
     cosines = jnp.where((norms > 0) & ~trial.active, now.residuals @ now.jacobian / jnp.where(norms > 0, norms, 1), 0)
     flat = jnp.linalg.norm(cosines) <= jnp.maximum(FLAT, SLIGHT / jnp.sqrt(jnp.maximum(freedom, 1))) * jnp.sqrt(2 * now.cost)

@@ -14,7 +14,17 @@ from .channel_sigma import sigmas_of, weighted_by_residuals, weighted_by_spread
 from .experiment_batch import with_sigma
 from .levenberg_marquardt import INTERRUPTED, STEP_LIMIT, Iterate, Outcome, levenberg_marquardt
 from .multiple_shooting import join
-from .problem import Problem, failure_of, held_by_jax, linearise, linearise_each, linearise_starts, without_jacobian
+from .problem import (
+    Problem,
+    failure_of,
+    held_by_jax,
+    linearise,
+    linearise_each,
+    linearise_starts,
+    size_of,
+    sizes_of_each,
+    without_jacobian,
+)
 
 SIGMA_ROUNDS = 10  # at most, of estimating sigma and the unknowns in turn,
 ROBUST_ROUNDS = 3  # with a robust loss, whose sigma need not settle,
@@ -62,7 +72,8 @@ def minimise_each(problem: Problem, *, estimate_sigma: bool, **limits: Any) -> t
             found = linearise_each(problem, xs)
             return found.residuals, found.jacobian, found
 
-        return levenberg_marquardt(residuals, xs, bounds=bounds, **limits)
+        sizes = np.sqrt(sum(part**2 for part in sizes_of_each(problem.batches[0])))
+        return levenberg_marquardt(residuals, xs, bounds=bounds, size=sizes, **limits)
 
     if estimate_sigma:
         problem = _each_weighted(problem, [weighted_by_spread(one) for one, _ in each_apart(problem)])
@@ -116,7 +127,7 @@ def _from_one_start(problem, x, limits):
         found = linearise(held, x)
         return found.residuals, found.jacobian, found
 
-    outcome = levenberg_marquardt(residuals, x, bounds=problem.bounds, **limits)
+    outcome = levenberg_marquardt(residuals, x, bounds=problem.bounds, size=size_of(problem), **limits)
     reason = failure_of(outcome.best.aux)
     if reason:
         raise ValueError(f"{AT_THE_START}, but ended with: {reason} Start from other parameters.")
@@ -132,7 +143,7 @@ def _from_many_starts(problem, starts, limits):
         found = linearise_starts(problem, xs)
         return found.residuals, found.jacobian, found
 
-    outcome = levenberg_marquardt(residuals, xs, bounds=problem.bounds, **limits)
+    outcome = levenberg_marquardt(residuals, xs, bounds=problem.bounds, size=size_of(problem), **limits)
     cost = np.nan_to_num(outcome.costs[-1], nan=np.inf)
     if not np.isfinite(cost).any():
         raise ValueError("`starts` must include one whose motion can be computed, but none can. Narrow the bounds.")

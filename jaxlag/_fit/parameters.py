@@ -60,8 +60,9 @@ class Free:
         start = xnp.concatenate([xnp.zeros(0), *flat])
         start = start.astype(jax.dtypes.canonicalize_dtype(start.dtype))
         lower, upper = _pair_for_each_entry(bounds, "bounds", free, entries, (-np.inf, np.inf))
-        mean, deviation = _pair_for_each_entry(priors, "priors", free, entries, (0.0, np.inf))
-        _check(start, lower, upper, deviation, entries)
+        mean, deviation = _pair_for_each_entry(priors, "priors", free, entries, (np.nan, np.inf))
+        mean = np.where(deviation == np.inf, 0, mean)  # of none
+        _check(start, lower, upper, mean, deviation, entries)
         for i, leaf in enumerate(every):
             if i not in chosen and is_unknown(leaf):
                 raise ValueError(f"`params` must be known where they are not free, but {names[i]!r} is NaN. Give it a value, or free it.")
@@ -173,7 +174,7 @@ def _pair_for_each_entry(given, argument, free, entries, default):
     return pair
 
 
-def _check(start, lower, upper, deviation, entries):
+def _check(start, lower, upper, mean, deviation, entries):
     if isinstance(start, jax.core.Tracer):
         return
     for i in np.flatnonzero(~(lower < upper)):
@@ -182,6 +183,8 @@ def _check(start, lower, upper, deviation, entries):
         raise ValueError(
             f"`priors` of {entries[i]!r} must have a positive standard deviation, but it is {deviation[i]:g}. Give how uncertain it is."
         )
+    for i in np.flatnonzero(~np.isfinite(mean)):
+        raise ValueError(f"`priors` of {entries[i]!r} must have a finite mean, but it is {mean[i]:g} or left out. Give the expected value.")
     theta = np.asarray(start)
     for i in np.flatnonzero(~((lower <= theta) & (theta <= upper)) & ~np.isnan(theta)):
         raise ValueError(

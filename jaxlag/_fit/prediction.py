@@ -48,8 +48,8 @@ def predicted(problem: Problem, x: np.ndarray, covariance: Any, experiment: Expe
     """What the experiment should show at the unknowns x, whose covariance is known; `t` of the ends θ̂ ± t · standard error."""
     free = problem.free
     model = dataclasses.replace(problem.model, loss=None)
-    single = Problem.of(model, free, [with_zero_values(model, free, experiment)])
     y = jnp.asarray(x[: free.size])
+    single = Problem.of(model, free, [with_zero_values(model, free, experiment, y)])
     found = linearise(single, jnp.concatenate([y, jnp.zeros(single.size - free.size)]))
     reason = failure_of(found)
     if reason:

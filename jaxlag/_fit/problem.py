@@ -215,16 +215,36 @@ def _linearise_each(problem, xs):
     return map_batch(of_one, batch, xs, dataclasses.replace(problem, batches=()))
 
 
-def with_zero_values(model: Model, free: Free, experiment: Experiment) -> Experiment:
-    """The experiment with measurements of zero and a sigma of one: its residuals are what its sensors see."""
+def size_of(problem: Problem) -> float:
+    """The norm of all that is measured, in units of its noise; infinite where there are tests, whose measurements are of another kind."""
+    if problem.tests or not problem.batches:
+        return np.inf
+    return float(np.sqrt(sum(np.sum(part**2) for batch in problem.batches for part in sizes_of_each(batch))))
+
+
+def sizes_of_each(batch: ExperimentBatch) -> list[np.ndarray]:
+    """For each channel the norm of what each member has measured, in units of its noise."""
+    leaves = zip(jax.tree.leaves(batch.values), jax.tree.leaves(batch.sigma), strict=True)
+    scaled = (np.asarray(z) / np.asarray(s) for z, s in leaves)
+    return [np.sqrt(np.nansum(part.reshape(len(part), -1)[: len(batch.members)] ** 2, axis=1)) for part in scaled]
+
+
+def with_zero_values(model: Model, free: Free, experiment: Experiment, y: Any = 0.0) -> Experiment:
+    """The experiment with measurements of zero and a sigma of one: its residuals are what its sensors see, and the times of as many events
+    as happen with θ(y).
+    """
     bare = eqx.tree_at(lambda e: (e.values, e.sigma), experiment, (None, None), is_leaf=lambda x: x is None)
     (batch,) = batches_of(model.system, free.params, [bare])
     one = jax.tree.map(lambda x: x[0] if eqx.is_array(x) else x, batch)
-    seen = eqx.filter_eval_shape(lambda e: model.predicted(free.params, e, jnp.zeros(batch.unknowns))[0], one)
-    zeros = jax.tree.map(lambda s: jnp.zeros(s.shape, s.dtype), seen)
+    of = lambda e: model.predicted(free.insert(free.theta(y)), e, jnp.zeros(batch.unknowns))[0]
+    if experiment.events:
+        zeros = jax.tree.map(lambda seen: jnp.where(jnp.isfinite(seen), 0, jnp.nan), eqx.filter_jit(of)(one))
+    else:
+        zeros = jax.tree.map(lambda s: jnp.zeros(s.shape, s.dtype), eqx.filter_eval_shape(of, one))
     return eqx.tree_at(lambda e: e.values, bare, zeros, is_leaf=lambda x: x is None)
 
 
+TOO_FEW = "fewer events happen than were measured, or what is observed is not finite."
 NOT_STEADY = "no steady state was found near which a test could be predicted, or a measured mode does not oscillate there."
 
 
@@ -234,5 +254,5 @@ def failure_of(found: Linearisation) -> str | None:
         return NOT_STEADY
     for part in found.batches:
         if not np.all(np.isfinite(np.asarray(part.residuals))):
-            return reason_of(part.result)
+            return reason_of(part.result) or TOO_FEW
     return None

@@ -4,7 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from .levenberg_marquardt import levenberg_marquardt
-from .problem import Problem, linearise
+from .problem import Problem, linearise, size_of
 
 FAR = 50  # times the linearised interval, within which an end is looked for
 
@@ -35,19 +35,25 @@ def profile_end(
             found = linearise(problem, fixed.at[kept].set(rest))
             return found.residuals, found.jacobian[:, kept], found
 
-        limits = {"freedom": freedom, "max_steps": 50, "tolerance": 1e-4, "bounds": bounds}
-        best = levenberg_marquardt(residuals, jnp.asarray(others), **limits).best
-        rise = float(jnp.sum(best.residuals**2) / 2) - least
-        others = np.asarray(best.y) if np.isfinite(rise) else others
+        if kept.size:
+            limits = {"freedom": freedom, "max_steps": 50, "tolerance": 1e-4, "bounds": bounds, "size": size_of(problem)}
+            best = levenberg_marquardt(residuals, jnp.asarray(others), **limits).best
+            rise = float(jnp.sum(best.residuals**2) / 2) - least
+            others = np.asarray(best.y) if np.isfinite(rise) else others
+        else:
+            rise = float(jnp.sum(linearise(problem, fixed).residuals ** 2) / 2) - least
         return min(np.sqrt(max(2 * rise, 0)) / unit, FAR * quantile) - quantile
 
     bound_of_theta = float((free.lower if side < 0 else free.upper)[i])
     first = side * quantile * sigma * deviation
     limit = float(problem.bounds[side > 0][i]) - x[i]
     if np.isfinite(limit):
-        if limit == 0 or excess(limit) <= 0:
+        inner, outer = 0.0, side * min(abs(first), abs(limit))  # outwards: from far away others would come to another minimum
+        while (below := outer == 0 or excess(outer) <= 0) and abs(outer) < min(abs(limit), FAR * abs(first)):
+            inner, outer = outer, side * min(2 * abs(outer), abs(limit))
+        if below:
             return bound_of_theta
-        found = optimize.root_scalar(excess, bracket=(0.0, limit), method="brentq", rtol=1e-4)
+        found = optimize.root_scalar(excess, bracket=(inner, outer), method="brentq", rtol=1e-4)
     else:
         found = optimize.root_scalar(excess, x0=0.0, x1=first, method="secant", rtol=1e-4, maxiter=20)
     if not (found.converged and 0 < found.root * side < FAR * abs(first)):

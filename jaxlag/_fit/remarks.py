@@ -81,6 +81,13 @@ def on_too_short(names: Sequence[str]) -> list[str]:
     return [f"{shown} {have} too few measurements for {own}: each channel is weighted by its spread; give `sigma`"]
 
 
+def on_exact(channels: Mapping[str, int]) -> list[str]:
+    """Channels without noise, with the number of their measurements."""
+    return [
+        f"{name} is predicted exactly, and its {count} measurements say nothing of the noise of others" for name, count in channels.items()
+    ]
+
+
 def on_inputs(ended: Mapping[str, tuple[float, float]]) -> list[str]:
     """Inputs with the times of their last sample and of that of the record."""
     return [f"{name} ends at t = {end:g} and keeps its value to the end of the record at {last:g}" for name, (end, last) in ended.items()]

@@ -75,7 +75,8 @@ class Fit:
     - `sigma`: σ̂, in units of the given sigma; where none was given, in units of the measurements, the geometric mean of those of the
       channels. `sigmas`: for each experiment, one for each channel, estimated or given; structured like a row of its values. `absolute`:
       whether sigma was given.
-    - `cost`: ½ Σ r² at the estimates; `measurements`: N; `unknown_count`: determined unknowns, the p parameters and those of experiments.
+    - `cost`: ½ Σ r² at the estimates; `measurements`: N; `unknown_count`: determined unknowns, the p parameters and those of experiments;
+      `exact`: how many of the measurements are those of channels that are predicted exactly.
     - `converged`; `reason`: why the iteration ended; `steps`: how many it took; `costs`: the cost at the start and after each step.
     - `led_in`: by which steps the start was found, where it was not `params` (`Regress`).
     - `problem`, `x`, `x_covariance`: the least-squares problem, all its unknowns at the minimum, and their covariance over σ̂².
@@ -126,11 +127,12 @@ class Fit:
     inflation: Float[np.ndarray, " p"]
     correlated: int
     led_in: tuple[str, ...] = ()
+    exact: int = 0
 
     @property
     def freedom(self) -> int:
-        """Degrees of freedom: measurements minus determined unknowns."""
-        return max(self.measurements - self.unknown_count, 0)
+        """Degrees of freedom: measurements minus determined unknowns, and minus those of channels that are predicted exactly."""
+        return max(self.measurements - self.exact - self.unknown_count, 0)
 
     @property
     def white_standard_errors(self) -> dict[str, PyTree]:

@@ -10,7 +10,7 @@ import jax
 import numpy as np
 
 from .autocorrelation import independent_samples
-from .channel_sigma import too_short
+from .channel_sigma import predicted_exactly, too_short
 from .channels import channels_of
 from .experiment import Experiment
 from .experiment_statistics import ended_inputs, own_estimates, predictions_of, with_estimates
@@ -22,7 +22,7 @@ from .minimum import Minimum
 from .multiple_shooting import Segments
 from .parameter_stability import different_halves
 from .problem import Problem
-from .remarks import NO_ERRORS, UNRELATED_SIZE, on_bounds, on_halves, on_inputs, on_misfit, on_too_short, on_undetermined
+from .remarks import NO_ERRORS, UNRELATED_SIZE, on_bounds, on_exact, on_halves, on_inputs, on_misfit, on_too_short, on_undetermined
 from .result import Fit
 from .uncertainty import Uncertainty, uncertainty_of, undetermined_parameters
 
@@ -53,8 +53,10 @@ def _noise(minimum: Minimum, uncertainty: Uncertainty) -> Fields:
     r, beside = np.append(minimum.measured, minimum.of_tests), minimum.problem.beside
     unknown_count = minimum.x.size - uncertainty.known.null.shape[1] - len(np.asarray(minimum.found.gaps_jacobian))
     squares = np.sum(np.asarray(minimum.found.residuals)[: beside + minimum.flat.size] ** 2)
-    sigma = _sigma(r, minimum.problem, max(minimum.measurements - unknown_count, 0))
+    exact = 0 if minimum.absolute else sum(predicted_exactly(minimum.problem, minimum.found).values())
+    sigma = _sigma(r, minimum.problem, max(minimum.measurements - exact - unknown_count, 0))
     return {
+        "exact": exact,
         "measurements": minimum.measurements,
         "unknown_count": unknown_count,
         "absolute": minimum.absolute,
@@ -152,7 +154,9 @@ def _remarks(minimum, uncertainty, sigma, channels):
 
 
 def _on_sigma(minimum):
-    return [] if minimum.absolute else on_too_short(too_short(minimum.problem))
+    if minimum.absolute:
+        return []
+    return [*on_too_short(too_short(minimum.problem)), *on_exact(predicted_exactly(minimum.problem, minimum.found))]
 
 
 def _end(minimum: Minimum) -> Fields:

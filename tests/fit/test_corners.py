@@ -1,0 +1,138 @@
+"""Corners of fits in which numbers came out wrong without a word: narrow valleys, units, channels without noise, few events, bounds."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from oscillator import START, SYSTEM, TIMES, TRUE, noisy, position
+from scipy.optimize import least_squares
+
+import jaxlag as jl
+
+SIGMA = 0.01
+
+
+@pytest.mark.parametrize("away", [3.0, 30.0])
+def test_along_a_narrow_valley(away):
+    """Two gains whose correlation is −1 + 4e-9, from beside their minimum: χ² is that of linear least squares."""
+    system = jl.System(lambda qdot: 0.5 * qdot**2, force=lambda t, a, b: a + (1 + 1e-4 * t) * b)
+    ts = np.linspace(0, 2, 40)
+    z = 1.5 * ts**2 + 1e-3 * np.random.default_rng(0).standard_normal(40)
+    A = np.stack([ts**2 / 2, ts**2 / 2 + 1e-4 * ts**3 / 6], axis=1) / 1e-3
+    (best, squares, _, _), covariance = np.linalg.lstsq(A, z / 1e-3, rcond=None), np.linalg.inv(A.T @ A)
+    values, directions = np.linalg.eigh(covariance)
+    start = best + away * np.sqrt(values[-1]) * directions[:, -1]
+    experiment = jl.Experiment(ts, z, 0.0, 0.0, sigma=1e-3)
+    fit = jl.fit(system, experiment, {"a": start[0], "b": start[1]}, free=("a", "b"), rtol=1e-10, atol=1e-12)
+    assert fit.converged
+    np.testing.assert_allclose(2 * fit.cost, squares[0], rtol=1e-6)
+    found = np.array([fit.estimates["a"], fit.estimates["b"]])
+    assert np.linalg.norm((found - best) / np.sqrt(np.diag(covariance))) < 1e-2
+
+
+@pytest.mark.parametrize("unit", [1.0, 1e9])
+def test_an_unknown_start_in_any_units(unit):
+    """Seconds and nanoseconds: as SciPy on the closed form."""
+    z = noisy(0)
+    expected = least_squares(lambda x: (position(TIMES, *x) - z) / SIGMA, [4.2, 0.3, 1.0, 0.0], xtol=1e-14, ftol=1e-14).x
+    experiment = jl.Experiment(TIMES * unit, z, 1.0, 0.0, sigma=SIGMA, unknown=("q0", "qdot0"))
+    start = {"m": 1.0, "c": 3.0 / unit**2, "b": 0.6 / unit}
+    found = jl.fit(SYSTEM, experiment, start, free=("c", "b"), rtol=1e-9, atol=1e-12 / unit)
+    assert found.converged
+    np.testing.assert_allclose([found.estimates["c"] * unit**2, found.estimates["b"] * unit], expected[:2], rtol=1e-5)
+
+
+@pytest.mark.parametrize("scale", [1.0, 1e11])
+def test_a_parameter_that_starts_at_zero_in_any_units(scale):
+    system = jl.System(
+        lambda q, qdot, m, c: 0.5 * m * qdot**2 - 0.5 * c * q**2, dissipation=lambda qdot, b, scale: 0.5 * b * scale * qdot**2
+    )
+    z = noisy(1)
+    expected = least_squares(lambda x: (position(TIMES, 4.0, *x) - z) / SIGMA, [0.3], xtol=1e-14, ftol=1e-14).x
+    params = TRUE | {"b": 0.0, "scale": scale}
+    found = jl.fit(system, jl.Experiment(TIMES, z, 1.0, 0.0, sigma=SIGMA), params, free=("b",), rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(found.estimates["b"] * scale, expected, rtol=1e-5)
+
+
+@pytest.mark.parametrize("count", [1, 3])
+def test_channels_that_are_predicted_exactly(count):
+    """They say nothing of the noise of x: the standard error is that of x alone."""
+    alone, quiet = jl.Experiment(TIMES, {"x": noisy(2)}, 1.0, 0.0, observe=lambda q: {"x": q}), np.zeros((len(TIMES), count))
+    beside = jl.Experiment(TIMES, {"x": noisy(2), "y": quiet}, 1.0, 0.0, observe=lambda q: {"x": q, "y": jnp.zeros(count)})
+    one, both = (jl.fit(SYSTEM, e, TRUE | {"c": 4.1}, free=("c",)) for e in (alone, beside))
+    np.testing.assert_allclose(both.estimates["c"], one.estimates["c"], rtol=1e-6)
+    np.testing.assert_allclose(both.standard_errors["c"], one.standard_errors["c"], rtol=1e-4)
+    assert both.freedom == one.freedom
+    assert any("predicted exactly" in remark for remark in both.remarks)
+
+
+@pytest.mark.parametrize("upper", [1.0, 100.0, 1e6])
+def test_profiles_between_wide_bounds(upper):
+    """They are those without bounds."""
+    experiment = jl.Experiment(TIMES, noisy(3), 1.0, 0.0, sigma=SIGMA)
+    plain = jl.fit(SYSTEM, experiment, START, free=("c", "b"))
+    bounded = jl.fit(SYSTEM, experiment, START, free=("c", "b"), bounds={"b": (0, upper), "c": (0, max(upper, 10))})
+    for name in ("b", "c"):
+        expected, found = (fit.interval(name, profile=True) for fit in (plain, bounded))
+        np.testing.assert_allclose([found.lower, found.upper], [expected.lower, expected.upper], rtol=1e-4)
+
+
+def test_the_profile_of_the_only_unknown():
+    """Where S has risen by t²/2, by SciPy's closed form."""
+    from scipy.optimize import brentq
+
+    z = noisy(4)
+    fit = jl.fit(SYSTEM, jl.Experiment(TIMES, z, 1.0, 0.0, sigma=SIGMA), START | {"b": 0.3}, free=("c",), rtol=1e-10, atol=1e-12)
+    S = lambda c: 0.5 * np.sum(((position(TIMES, c) - z) / SIGMA) ** 2)
+    at, t = float(fit.estimates["c"]), fit.quantile(0.95)
+    scale = float(fit.standard_errors["c"] / fit.white_standard_errors["c"])
+    ends = [brentq(lambda c: S(c) - S(at) - (t * scale) ** 2 / 2, *sorted((at, at + away))) for away in (-0.5, 0.5)]
+    found = fit.interval("c", profile=True)
+    np.testing.assert_allclose([found.lower, found.upper], ends, rtol=1e-5)
+
+
+# Events
+
+ringing = jl.System(lambda q, qdot, c: 0.5 * qdot**2 - 0.5 * c * q**2, events={"zero": jl.Event(lambda q: q)})
+
+
+def heard(count=3):
+    """Zeros of cos 2t."""
+    return np.pi / 4 + np.pi / 2 * np.arange(count)
+
+
+def listened(**more):
+    ts = np.linspace(0, 5, 41)
+    return jl.Experiment(
+        ts, {"x": np.cos(2 * ts)}, 1.0, 0.0, observe=lambda q: {"x": q}, events={"zero": heard()}, sigma={"x": 0.01, "zero": 1e-3}
+    )
+
+
+def test_predictions_of_events_have_their_errors():
+    """Of t_k = (k + ½) π/√c: t/2c of that of c; of x, t sin(√c t)/2√c."""
+    fit = jl.fit(ringing, listened(), {"c": 3.9}, free=("c",))
+    found, error = fit.predict(listened()), float(fit.standard_errors["c"])
+    np.testing.assert_allclose(found.standard_errors["zero"][:3], heard() / 8 * error, rtol=1e-3)
+    np.testing.assert_allclose(found.standard_errors["x"][8], abs(np.sin(2.0) / 4) * error, rtol=1e-3)
+
+
+def test_a_start_with_too_few_events_is_refused():
+    with pytest.raises(ValueError, match="fewer events happen than were measured"):
+        jl.fit(ringing, listened(), {"c": 0.5}, free=("c",))
+
+
+# Data and priors
+
+
+def test_fits_of_other_data_are_not_compared():
+    fits = {
+        name: jl.fit(SYSTEM, jl.Experiment(TIMES, z, x0, 0.0), START, free=("c", "b"))
+        for name, z, x0 in (("z", noisy(5), 1.0), ("−z", -noisy(5), -1.0))
+    }
+    with pytest.raises(ValueError, match="must be of the same measurements"):
+        jl.compare(fits)
+
+
+@pytest.mark.parametrize("prior", [(np.nan, 1.0), (None, 1.0), (np.inf, 1.0)])
+def test_priors_have_a_mean(prior):
+    with pytest.raises(ValueError, match="`priors` of 'c' must have a finite mean"):
+        jl.fit(SYSTEM, jl.Experiment(TIMES, noisy(6), 1.0, 0.0), START, free=("c",), priors={"c": prior})
