@@ -30,8 +30,9 @@ def too_short(problem: Problem) -> list[str]:
 
 def predicted_exactly(problem: Problem, found: Linearisation) -> dict[str, int]:
     """Of several channels those without noise, but not all, with the number of their measurements: none speaks of the noise of others."""
+    left = lambda z, seen: np.asarray(z)[: len(seen)] - np.asarray(seen)  # copies of the last one may follow
     measured = _by_channel(problem, lambda batch, _: batch.values)
-    residuals = _by_channel(problem, lambda batch, k: jax.tree.map(np.subtract, batch.values, found.batches[k].channels))
+    residuals = _by_channel(problem, lambda batch, k: jax.tree.map(left, batch.values, found.batches[k].channels))
     exact = {name: r.size for name, r in residuals.items() if r.size and np.sqrt(np.mean(r**2)) <= FLOOR * _spread(measured[name])}
     return exact if len(exact) < len(residuals) else {}
 

@@ -19,7 +19,7 @@ REASONS = (
     "`max_steps` was reached",
     "interrupted (Ctrl-C); these are the best parameters so far",
     "the motion at the start could not be computed",
-    "no step lowers the cost any more, but the predictions are unrelated to the measurements",
+    "the predictions are unrelated to the measurements, and no step brings them near",
     "the segments do not join, however heavily the gaps are weighted; use more segments, or start from other parameters",
     "the cost has a kink here, as where dry friction comes to stick or begins to slip, and steps along it lower it by next to nothing; "
     "the standard errors hold on one side of the kink; see whether `starts=` or a model that misses less finds a lower cost",

@@ -163,7 +163,7 @@ def _end(minimum: Minimum) -> Fields:
     """How the iteration ended."""
     outcome = minimum.outcome
     status = int(outcome.best.status)
-    if status == CONVERGED and _relative_size(minimum) > UNRELATED_SIZE:
+    if status in (CONVERGED, STEP_LIMIT) and _relative_size(minimum) > UNRELATED_SIZE:
         status = UNRELATED
     return {"converged": status == CONVERGED, "reason": REASONS[status], "steps": outcome.steps, "costs": outcome.costs}
 

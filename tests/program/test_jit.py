@@ -30,11 +30,11 @@ def swing(x):
 @pytest.mark.slow
 @pytest.mark.skipif(jax.default_backend() != "cpu", reason="the option is for CPUs")
 @pytest.mark.parametrize("function, x", [(ride, 3000.0), (swing, 0.7), (jax.jacfwd(ride), 3000.0)], ids=["ride", "swing", "slope"])
-def test_both_emitters_give_the_same_with_and_without_optimisation(function, x):
+def test_both_emitters_give_the_same_at_each_level(function, x):
     program = jax.jit(function).lower(x)
     by = lambda on, level: program.compile(compiler_options={"xla_cpu_use_fusion_emitters": on, "xla_backend_optimization_level": level})(x)
     default = by(True, 3)
-    for other in (by(False, 3), by(False, 0)):
+    for other in (by(False, 3), by(False, 1)):
         np.testing.assert_allclose(other, default, rtol=0, atol=1e-9 * np.max(np.abs(default)))
 
 
