@@ -202,9 +202,8 @@ def _update(now, trial, linearised, bounds, tolerance, freedom, size):
 def _status(now, trial, taken, newton_like, tolerance, freedom, size):
     """Whether the iteration goes on, judged by the step that was tried from `now`."""
     norms = _norms(now.jacobian)  # the present ones: those at the start may be larger by many powers of ten
-    least = jnp.finfo(now.residuals.dtype).eps ** 0.625 * jnp.minimum(
-        jnp.max(norms, initial=0.0), size
-    )  # the rounding of what is integrated
+    largest = jnp.minimum(jnp.max(norms, initial=0.0), size)
+    least = jnp.finfo(now.residuals.dtype).eps ** 0.625 * largest  # below the rounding of what is integrated
     short = trial.free_change <= jnp.maximum(tolerance**2 * 2 * now.cost / jnp.maximum(freedom, 1), least**2)
     cosines = jnp.where((norms > 0) & ~trial.active, now.residuals @ now.jacobian / jnp.where(norms > 0, norms, 1), 0)
     flat = jnp.linalg.norm(cosines) <= jnp.maximum(FLAT, SLIGHT / jnp.sqrt(jnp.maximum(freedom, 1))) * jnp.sqrt(2 * now.cost)
