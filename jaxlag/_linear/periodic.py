@@ -17,7 +17,7 @@ from .._model.paths import entry_names, is_within
 from .._model.state_values import given_states, start_values
 from .._model.system import System
 from .._model.validation import parameters, state
-from .._motion.integrate import tolerances_of
+from .._motion.scales import tolerances_of
 from .._motion.simulate import simulate
 from .._motion.trajectory import Trajectory
 from .._program.jit import is_concrete, seen
@@ -135,11 +135,12 @@ def periodic(
     dtype = jax.tree.leaves(q0)[0].dtype
     params, states = parameters(params, q0), given_states(system, states, q0)
     t, longest = _given(section, longest, t, dtype)
-    rtol, atol = (x if own is not None else FINER * x for x, own in zip(tolerances_of(rtol, atol, dtype), (rtol, atol), strict=True))
+    tolerances = tolerances_of(rtol, atol, q0)
+    tolerances = tolerances if rtol is not None else (FINER * tolerances[0], tolerances[1])
     at = start_values(system, states, t, q0, qdot0, params)
     start = {"q": q0, "qdot": qdot0, "states": at}
     setting = Setting(section, _returning(system, q0, at, cyclic), friction, solver, max_steps)
-    found = orbit_near(system, setting, Given(start, params, t, longest, (rtol, atol)))
+    found = orbit_near(system, setting, Given(start, params, t, longest, tolerances))
     values = seen(found)
     names = [name for part in ("q", "qdot", "states") for name in entry_names(start[part], part)]
     if values is not None:

@@ -14,6 +14,7 @@ from .._model.event import Event, Every
 from .._model.injection import call
 from .._model.system import System
 from .._motion.simulate import simulate
+from .._motion.step_size import SHARE
 from .._program.jit import compiled
 from .eigenvalues import eigen
 from .newton import differentiable_root, is_root, least_change
@@ -40,7 +41,7 @@ class Given(NamedTuple):
     params: PyTree
     t: Float[Array, ""]
     longest: Float[Array, ""]
-    tolerances: tuple[Array, Array]
+    tolerances: tuple[Array, Array | None]
 
 
 class Orbit(NamedTuple):
@@ -84,7 +85,7 @@ def orbit_near(system: System, setting: Setting, given: Given) -> Orbit:
     def residual(frame, w):
         return returned(frame, w, frame.given.t)[0][of] - w
 
-    near = _newton(lambda w: residual(jax.lax.stop_gradient(frame), w), frame.first[of], given.tolerances)
+    near = _newton(lambda w: residual(jax.lax.stop_gradient(frame), w), frame.first[of], given.tolerances[0], _scales(frame)[of])
     w = differentiable_root(residual, frame, near)
 
     def at(t):
@@ -106,16 +107,23 @@ def orbit_near(system: System, setting: Setting, given: Given) -> Orbit:
     return Orbit(unravel(here), times[0], unravel(ends[0] - here), values, *jax.lax.stop_gradient((*checks, left[0])))
 
 
-def _newton(residual: Callable, w: Float[Array, " k"], tolerances: tuple[Array, Array]) -> Float[Array, " k"]:
+def _scales(frame: Frame) -> Float[Array, " s"]:
+    """Of each entry of the state its scale in the course of a period: one that is zero at the section follows from its rate or integral."""
+    n, period = ravel_pytree(frame.given.start["q"])[0].size, frame.usual
+    q, v, states = jnp.split(jnp.abs(frame.first), [n, 2 * n])
+    scales = jnp.concatenate([q + period * v, v + q / period, states])
+    return jnp.where(scales > 0, scales, 1)
+
+
+def _newton(residual: Callable, w: Float[Array, " k"], rtol: Array, scale: Float[Array, " k"]) -> Float[Array, " k"]:
     """The root near w. The last step is as small as errors of the integration."""
-    rtol, atol = tolerances
 
     def turn(carry):
         w, _, i = carry
         both = lambda w: (found := residual(w), found)
         slope, left = jax.jacfwd(both, has_aux=True)(w)
-        step = -least_change(slope, left, 1 + jnp.abs(w))
-        return w + step, jnp.all(jnp.abs(step) <= rtol * jnp.abs(w) + atol), i + 1
+        step = -least_change(slope, left, scale)
+        return w + step, jnp.all(jnp.abs(step) <= rtol * jnp.maximum(jnp.abs(w), SHARE * scale)), i + 1
 
     def going_on(carry):
         w, done, i = carry

@@ -95,19 +95,23 @@ def gap_scales(flat: Flat, t, q, v, of_positions: Float[Array, " n"], of_velocit
     return GapScales(_times(G, of_positions), _times(G, of_velocities))
 
 
-def roundings(x: Float[Array, " n"]) -> Float[Array, " n"]:
-    """Of each number of a state, what counts as its rounding, with some for a state that is zero."""
+def roundings(x: Float[Array, " n"], own: Any) -> Float[Array, " n"]:
+    """Of each number of a state, what counts as its rounding, with some of its own scale for one that is zero just now."""
     little = jnp.finfo(x.dtype).eps ** ROUNDING
-    return little * jnp.abs(jax.lax.stop_gradient(x)) + little**2
+    return little * jnp.abs(jax.lax.stop_gradient(x)) + little**2 * own
 
 
-def roundings_of_rates(flat: Flat, t, q, v) -> Float[Array, " n"]:
-    """Of each velocity, what counts as rounding where an impact gives the energy of some to others: that of the largest it could be."""
-    t, q, v = jax.lax.stop_gradient((t, q, v))
+def roundings_beside(flat: Flat, t, q, v, x: Float[Array, " n"]) -> Float[Array, " n"]:
+    """Of each velocity, what counts as rounding where an impact gives the energy of some to others: that of the largest it could be.
+
+    Of x = v, and likewise of x = q.
+    """
+    t, q, v, x = jax.lax.stop_gradient((t, q, v, x))
     M = inertia(flat, t, q, v)[0]
     mass = jnp.diagonal(M.as_matrix())
-    largest = jnp.sqrt(jnp.maximum(v @ M.mv(v), 0) / jnp.where(mass > 0, mass, jnp.inf))
-    return roundings(jnp.maximum(jnp.abs(v), largest))
+    largest = jnp.sqrt(jnp.maximum(x @ M.mv(x), 0) / jnp.where(mass > 0, mass, jnp.inf))
+    largest = jnp.maximum(jnp.abs(x), largest)
+    return roundings(largest, largest)
 
 
 class Contacts(NamedTuple):
@@ -217,7 +221,7 @@ def in_current_mode(flat: Flat, t, q, v) -> Flat:
     elements = find_elements(flat, t, q, v)
     if not flat.contacts:
         return flat if elements is None else in_mode(flat, elements, first_mode(flat, elements, t, q, v)[0].sigma)
-    scales = gap_scales(flat, t, q, v, roundings(1 + jnp.abs(q)), roundings(1 + jnp.abs(v)))
+    scales = gap_scales(flat, t, q, v, roundings_beside(flat, t, q, v, q), roundings_beside(flat, t, q, v, v))
     candidates = touching(flat, t, q, v, scales)
     if elements is None:
         return in_contact(flat, select_closed(flat, t, q, v, candidates).closed)

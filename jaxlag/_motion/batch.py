@@ -5,7 +5,6 @@ from typing import Any
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 from jaxtyping import Array
 
 from .protocol import Arguments, AugmentedSystem
@@ -13,10 +12,6 @@ from .protocol import Arguments, AugmentedSystem
 
 class BatchedEquations(AugmentedSystem):
     """The `FirstOrderSystem` of members that share their steps: y has them as its last axis."""
-
-    def error_norm(self, error: Array) -> Array:
-        """The largest of the members."""
-        return jnp.max(self.equations.error_norm(error))
 
     def along_axis(self, function: Callable, t: Any, y: Any, args: Arguments) -> Array:
         member = lambda y, own: function(t, y, Arguments(eqx.combine(args.params, own), args.scales))

@@ -195,20 +195,27 @@ def _jacobian_product(of, varying, constant, ts, y, dx):
 
 @compiled
 def pushed(of: DifferentiableMap, varying: Any, constant: Any, ts: Any, dx: Any) -> Any:
-    """J dx."""
-    return _unless_zero(lambda x, solve, dx: jax.jvp(solve, (x,), (dx,))[1], of.solve, varying, constant, ts, dx)
+    """J dx, in steps that fit it."""
+    unravel = ravel_pytree(varying)[1]
+
+    def product(dx):
+        direction = jax.tree.map(lambda leaf: leaf[..., None], unravel(dx))
+        (_, dy), _ = of.push(eqx.combine(varying, constant), (direction,), ts)
+        return jax.tree.map(lambda leaf: leaf[..., 0], dy)
+
+    return _unless_zero(product, dx)
 
 
 @compiled
 def pulled(of: DifferentiableMap, varying: Any, constant: Any, ts: Any, dy: Any) -> Any:
     """Jᵀ dy."""
-    return _unless_zero(lambda x, solve, dy: jax.vjp(solve, x)[1](dy)[0], of.pull_back, varying, constant, ts, dy)
-
-
-def _unless_zero(product, solve, varying, constant, ts, vector):
-    """A product of the Jacobian and a vector; where that is zero, without a motion."""
     x, unravel = ravel_pytree(varying)
-    of_vector = lambda vector: product(x, lambda x: solve(eqx.combine(unravel(x), constant), ts)[0], vector)
+    solve = lambda x: of.pull_back(eqx.combine(unravel(x), constant), ts)[0]
+    return _unless_zero(lambda dy: jax.vjp(solve, x)[1](dy)[0], dy)
+
+
+def _unless_zero(of_vector, vector):
+    """A product of the Jacobian and a vector; where that is zero, without a motion."""
     like = jax.eval_shape(of_vector, vector)
     nothing = lambda _: jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), like)
     is_zero = everywhere(jnp.all(jnp.array([jnp.all(leaf == 0) for leaf in jax.tree.leaves(vector)])))

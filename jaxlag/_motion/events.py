@@ -14,7 +14,8 @@ from .._program.jit import jitted
 from .first_order import EquationsOfMotion
 from .jumps import after_jump
 from .mode_changes import Change, changed
-from .protocol import Arguments, Scales
+from .protocol import Arguments
+from .scales import Scales
 from .state_vector import Parts
 from .witnesses import matching, sides
 
@@ -120,5 +121,5 @@ def _still_closed(flat: Flat, t, q, v, closed, scales: Scales | None):
     if not flat.contacts:
         return closed
     assert scales is not None  # contacts are located
-    resting = jnp.abs(gap_rates(flat, t, q, v)) <= gap_scales(flat, t, q, v, scales.error(q), scales.error(v)).rate
+    resting = jnp.abs(gap_rates(flat, t, q, v)) <= gap_scales(flat, t, q, v, scales.of_positions(q), scales.of_velocities(v)).rate
     return jnp.where(resting, closed, 0)

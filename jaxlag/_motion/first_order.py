@@ -100,7 +100,7 @@ class EquationsOfMotion:
         elements = treatment.elements(flat, t, q, v)
         assert elements is not None  # rows were counted from them
         if args.scales is not None and np.any(elements.is_vector):
-            slow = slip_of(elements, t, q, v, jnp.full_like(v, args.scales.slow))
+            slow = slip_of(elements, t, q, v, args.scales.slow)
             elements = elements._replace(near_rest=jax.lax.stop_gradient(jnp.where(elements.is_vector, slow, 0)))
         return flat, in_mode(flat, elements, sigma), elements
 
@@ -220,10 +220,6 @@ class EquationsOfMotion:
         """y, which kept the constraints of one mode of friction, put on those of another, which differ in the velocities alone."""
         return _projected(self, t, y, args, not self.light)
 
-    def error_norm(self, error):
-        """The root mean square."""
-        return root_mean_square(error)
-
     def exhausted(self, y):
         """Whether there were more transitions than allowed."""
         return jnp.any(self.parts(y).transitions > self.formulation.friction.max_transitions)
@@ -291,8 +287,3 @@ def _projected(equations: EquationsOfMotion, t, y, args, found):
     if elements is not None:
         sigma = jax.lax.stop_gradient(redirected(elements, sigma, parts.held > 0, t, on_q, on_v))
     return parts._replace(q=on_q, v=on_v, works=works, sigma=sigma).y
-
-
-def root_mean_square(x) -> Array:
-    """Of each column; not differentiated, as the length of a step is not."""
-    return jnp.sqrt(jnp.mean(jax.lax.stop_gradient(x) ** 2, axis=0))

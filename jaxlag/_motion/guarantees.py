@@ -18,7 +18,7 @@ def verified(
     ys: Float[Array, "T1 y"],
     samples: tuple[Sample, Evidence],
     result: RESULTS,
-    tolerances: tuple[Array, Array],
+    rtol: Array,
 ) -> tuple[Sample, RESULTS, Float[Array, ""]]:
     """The samples that keep the guarantees, NaN from the first that does not; the reason that the motion ended; and the time it reached.
 
@@ -30,7 +30,7 @@ def verified(
     finite = jnp.all(jnp.isfinite(ys), axis=1)
     passed = ts < reached if equations.events else ts <= reached  # behind the end of a motion there is nothing
     there = finite | (passed & (result == RESULTS.successful))
-    for projected, reason in [(finite, RESULTS.undefined), *_guarantees(equations, ts, sample, evidence, tolerances)]:
+    for projected, reason in [(finite, RESULTS.undefined), *_guarantees(equations, ts, sample, evidence, rtol)]:
         broken = there & ~projected
         first = jnp.argmax(broken)
         there = there & (jnp.cumsum(broken) == 0)
@@ -43,7 +43,7 @@ def verified(
     return jax.tree.map(masked, sample), result, reached
 
 
-def _guarantees(equations: EquationsOfMotion, ts, sample: Sample, evidence: Evidence, tolerances) -> list[tuple[Bool[Array, " T"], Any]]:
+def _guarantees(equations: EquationsOfMotion, ts, sample: Sample, evidence: Evidence, rtol) -> list[tuple[Bool[Array, " T"], Any]]:
     """Which samples keep each guarantee, and the reason that a motion ended where one does not."""
     numbers = jax.tree.leaves((sample.qddot, sample.multipliers))
     finite = jnp.all(jnp.stack([jnp.all(jnp.isfinite(leaf.reshape(len(ts), -1)), axis=1) for leaf in numbers]), axis=0)
@@ -53,17 +53,16 @@ def _guarantees(equations: EquationsOfMotion, ts, sample: Sample, evidence: Evid
         within = excess <= LITTLE * scale + LITTLE**1.5 * jnp.max(jnp.where(jnp.isfinite(scale), scale, 0), axis=0, keepdims=True)
         guarantees.append((jnp.all(within, axis=1), RESULTS.missed))
     if equations.projection is not None:
-        kept = (evidence.off <= _residual_bound(tolerances)) & evidence.sound.satisfied
+        kept = (evidence.off <= _residual_bound(rtol)) & evidence.sound.satisfied
         guarantees.append((kept, RESULTS.contradictory))
     elif equations.system.constraints:  # what drifts contradicts itself in time
         guarantees.append((evidence.sound.satisfied | (jnp.arange(len(ts)) > 0), RESULTS.contradictory))
     return guarantees
 
 
-def _residual_bound(tolerances):
+def _residual_bound(rtol):
     """What projection leaves: far less than the tolerance of the integration, and where that is below √eps, than √eps."""
-    rtol, atol = tolerances
-    return jnp.maximum(rtol + atol, jnp.finfo(rtol.dtype).eps ** 0.5)
+    return jnp.maximum(rtol, jnp.finfo(rtol.dtype).eps ** 0.5)
 
 
 def _locks(equations, ts, sample):

@@ -2,7 +2,6 @@
 
 import dataclasses
 import functools
-import warnings
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -10,15 +9,15 @@ import diffrax as dfx
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
-from jaxtyping import Array, Bool, PyTree
+from jaxtyping import Array, Bool, Float, PyTree
 
 from .._mechanics.consistent_state import Consistent, has_inertia, nearest_state
 from .._mechanics.contact import outside
 from .._mechanics.friction_treatment import Regularised, StickSlip
+from .._mechanics.lagrange import inertia
 from .._mechanics.projection import Baumgarte, NoStabilisation, Projection
 from .._model.flat import Flat, StatesAt
-from .._model.numbers import count, number
+from .._model.numbers import count
 from .._model.signal import broken_signals, moves_smoothly
 from .._program.single_kernel import in_one_kernel
 from .events import begun
@@ -26,12 +25,13 @@ from .first_order import EquationsOfMotion, Formulation
 from .integrated import integrated
 from .mode_changes import started
 from .progress import Bar
-from .protocol import Arguments, FirstOrderSystem, Scales
+from .protocol import Arguments, FirstOrderSystem
 from .results import RESULTS, from_diffrax
 from .runge_kutta import Dop853, ExplicitRungeKutta, is_explicit
+from .scales import Scales
 from .search_for_start import Search
 from .sparse_implicit import in_structure
-from .step_size import GuardedController
+from .step_size import StepControl, with_tolerances
 from .stick_slip_solver import StickSlipSolver
 from .variational import VariationalEquations, derived, varied_along, with_variations
 from .wrapped_solver import ProjectedSolver, SamplingAdjoint
@@ -76,28 +76,6 @@ class SolverOptions:
 @functools.cache
 def _default_solver() -> dfx.AbstractSolver:
     return Dop853()
-
-
-def tolerances_of(rtol, atol, dtype) -> tuple[Array | np.ndarray, Array | np.ndarray]:
-    """The given tolerances, or the defaults for the precision."""
-    single = dtype.itemsize < 8
-    if single:
-        _warn_of_single_precision()
-    defaults = (1e-4, 1e-6) if single else (1e-8, 1e-10)
-    if rtol is None and atol is None:
-        return np.asarray(defaults[0], dtype), np.asarray(defaults[1], dtype)
-    rtol = number(defaults[0] if rtol is None else rtol, "`rtol`", dtype, least=0.0, cure=f"The default is {defaults[0]:g}.")
-    atol = number(defaults[1] if atol is None else atol, "`atol`", dtype, positive=True, cure=f"The default is {defaults[1]:g}.")
-    return rtol, atol
-
-
-@functools.cache
-def _warn_of_single_precision() -> None:
-    warnings.warn(
-        "jaxlag runs in single precision: tolerances below 1e-5 are out of reach. "
-        'For double precision: jax.config.update("jax_enable_x64", True).',
-        stacklevel=5,
-    )
 
 
 class Initial(NamedTuple):
@@ -178,20 +156,19 @@ def by_diffrax(
     equations: FirstOrderSystem, options: SolverOptions, adjoint: dfx.AbstractAdjoint, t0, y0, ts, args: Arguments, tolerances
 ) -> tuple[Array, RESULTS, dict]:
     """The same by diffrax's own loop, also of a batch."""
-    rtol, atol = tolerances
-    rounding = jnp.finfo(y0.dtype).eps * jnp.maximum(jnp.abs(ts[0]), jnp.abs(ts[-1]))
+    control = StepControl.of(tolerances, (ts[0], ts[-1]), equations, _variations(equations))
     alone = in_one_kernel if isinstance(adjoint, dfx.ForwardMode) else lambda function: function
     projected = alone(equations.projected) if equations.projection else None
     solution = dfx.diffeqsolve.__wrapped__(  # all is within a program already, and `equinox.filter_jit` would keep what it is given
         dfx.ODETerm(alone(equations.rates)),
-        _wrapped(options, equations, projected, adjoint, (t0, y0, args)),
+        with_tolerances(_wrapped(options, equations, projected, adjoint, (t0, y0, args)), control, jnp.abs(y0)),
         t0,
         ts[-1],
         None,
         y0,
         args,
         saveat=dfx.SaveAt(t1=True),
-        stepsize_controller=GuardedController(rtol, atol, dtmin=4 * rounding, force_dtmin=False, norm=equations.error_norm),
+        stepsize_controller=control,
         adjoint=SamplingAdjoint(adjoint, ts),
         max_steps=options.max_steps,
         throw=False,
@@ -201,6 +178,11 @@ def by_diffrax(
     ys = ys if projected is None else jax.vmap(lambda t, y: projected(t, y, args))(ts, ys)
     stats = {key: solution.stats[key] for key in ("num_steps", "num_accepted_steps", "num_rejected_steps")}
     return ys, from_diffrax(solution.result), stats | {"last": jax.lax.stop_gradient((last_t[0], last_y[0]))}
+
+
+def _variations(equations: FirstOrderSystem) -> int:
+    """How many last axes of y hold variations."""
+    return 1 + _variations(equations.equations) if isinstance(equations, VariationalEquations) else 0
 
 
 def _wrapped(options, equations, projected, adjoint, start):
@@ -233,13 +215,33 @@ def in_one_loop(
     meter, dense = Meter() if options.progress else dfx.NoProgressMeter(), not has_nodes(equations, args.params)
     back = in_one_kernel(equations.projected) if dense else equations.projected
     solver = _wrapped(options, equations, back if equations.projection else None, adjoint, (t0, y0, args))
+    if isinstance(equations, EquationsOfMotion) and args.scales is not None:
+        driven = _driven(equations, t0, y0[(..., *[0] * len(directions))], args)
+        args = args._replace(scales=args.scales._replace(driven=driven))
     numbers = y0, t0, args, ts, tolerances
-    ys, (result, stats) = integrated(equations, solver, options.max_steps, meter, *numbers, directions, reverse=reverse, dense=dense)
+    kind = {"variations": _variations(equations), "reverse": reverse, "dense": dense}
+    ys, (result, stats) = integrated(equations, solver, options.max_steps, meter, *numbers, directions, **kind)
     if dense and equations.projection:
         along = [(of_params, None) for of_params, _ in directions]
         projected = varied_along(lambda y, given: (equations.projected(given[1], y, args._replace(params=given[0])), None), along)
         ys = jax.vmap(lambda t, y: projected(y, (args.params, t))[0])(ts, ys)
     return ys, from_diffrax(result), stats
+
+
+def _driven(equations: EquationsOfMotion, t, y, args: Arguments) -> Float[Array, " n"] | None:
+    """Of each velocity a tenth of what friction in a plane at its bound would make of it within the motion; None without such friction.
+
+    Where slip begins it has no scale of its own yet, and its direction follows the load at a rate of 1/|v|.
+    """
+    if equations.rows == equations.elements:
+        return None
+    args, parts = args._replace(scales=args.scales._replace(driven=None)), equations.parts(y)
+    flat, _, elements = equations.mode(t, parts, args)
+    assert elements is not None and args.scales is not None
+    bound, slopes = equations.friction(t, parts, args).bound, jax.jacfwd(lambda v: elements.slip(t, parts.q, v))(parts.v)
+    force = jnp.sum(jnp.abs(slopes) * jnp.abs(bound)[elements.element_of_row][:, None], axis=0)
+    mass = jnp.diagonal(inertia(flat, t, parts.q, parts.v)[0].as_matrix())
+    return jax.lax.stop_gradient(0.1 * args.scales.duration * force / jnp.where(mass > 0, mass, jnp.inf))
 
 
 class Variations(NamedTuple):

@@ -15,7 +15,9 @@ from .interval_loop import IntervalLoop, Moving, Numbers, Steps
 from .results import number_of, numbered
 
 
-def integrated(equations, solver, max_steps, meter, y0, origin, args, ts, tolerances, directions=(), *, reverse=False, dense=False):
+def integrated(
+    equations, solver, max_steps, meter, y0, origin, args, ts, tolerances, directions=(), *, variations=0, reverse=False, dense=False
+):
     """States at the samples and behind events; and, not differentiated, the reason it ended, counts, and the `last` time and state.
 
     `origin` is the time of the start. With `directions` of (params, origin), for each order, the states and y0 have their variations as
@@ -37,7 +39,9 @@ def integrated(equations, solver, max_steps, meter, y0, origin, args, ts, tolera
     def started(given):
         ts, *columns = rows(given)
         of = {k: (*columns[2 * i : 2 * i + 2], s.interpolation) for i, (k, s) in enumerate(recorded.signals.items())}
-        loop = IntervalLoop(equations, solver, max_steps, meter, ts, lambda params: Inputs(of, equations.elsewhere, params), moving, dense)
+        loop = IntervalLoop(
+            equations, solver, max_steps, meter, ts, lambda params: Inputs(of, equations.elsewhere, params), moving, variations, dense
+        )
         return functools.partial(loop.run, *unpack(given)[1])
 
     length = ts.size + most(equations).sum()

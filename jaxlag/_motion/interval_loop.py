@@ -27,10 +27,8 @@ from .protocol import Arguments
 from .results import RESULTS, under_diffrax
 from .runge_kutta import ExplicitRungeKutta
 from .sparse_implicit import SparseImplicit
-from .step_size import GuardedController, ResumingController, with_tolerances
+from .step_size import StepControl, with_tolerances
 from .variational import varied_along, with_variations
-
-FIRST_STEP = 0.01  # what diffrax takes in a loop of its own; each step that is refused may be a fifth as long, each that is kept ten times
 
 
 class Moving(NamedTuple):
@@ -46,7 +44,7 @@ class Steps(NamedTuple):
 
     length: Float[Array, ""]  # planned, of the next step
     solver_state: PyTree
-    controller_state: PyTree
+    control: PyTree
     has_jumped: Bool[Array, ""]
     following: tuple[Int[Array, ""], ...]  # of each signal its first sample after t, of each sampled state its next update
     sample: Int[Array, ""]  # the next one
@@ -63,12 +61,25 @@ class Reached(NamedTuple):
     dense: PyTree
 
 
+class Tried(NamedTuple):
+    """A step that was tried: its end, the node that follows, y and its error, the state of the solver, its dense output where that is of
+    use.
+    """
+
+    t1: Float[Array, ""]
+    node: Float[Array, ""]
+    y: Array
+    error: Array
+    solver_state: PyTree
+    dense: PyTree
+
+
 class Numbers(NamedTuple):
     """The numbers that the loop reads at each turn."""
 
     varied: tuple[PyTree, Array]  # params, and the time at which the motion begins
     args: Arguments  # without params
-    tolerances: tuple[Array, Array]
+    tolerances: tuple[Array, Array | None]
     directions: tuple  # of what is varied, for each order
 
 
@@ -82,6 +93,7 @@ class IntervalLoop(NamedTuple):
     ts: Rows
     inputs: Callable[[PyTree], Inputs]
     moving: tuple[bool, ...]  # which jumps move with what is varied
+    variations: int  # how many last axes of the y of the equations hold variations
     dense: bool  # whether there is nothing but samples, which the dense output of the steps then shows
 
     def sample_time(self, sample: Int[Array, ""]) -> Float[Array, ""]:
@@ -91,22 +103,21 @@ class IntervalLoop(NamedTuple):
     def run(self, y0, following, sample, numbers: Numbers, saved: Any, write: Callable, loop: Callable) -> tuple[Moving, Steps, Any]:
         """From the first sample to the last, or as far as it goes; with what was saved at the samples. `sample` is the first one later."""
         first, last = (self.ts.at(i)[0] for i in (0, self.ts.shape[0] - 1))
-        rtol, atol = numbers.tolerances
         rounding = jnp.finfo(y0.dtype).eps * jnp.maximum(jnp.abs(first), jnp.abs(last))
-        norm = self.equations.error_norm
-        controller = ResumingController(rtol, atol, smallest=4 * rounding, norm=norm)
-        if self.dense:  # no node cuts a step short
-            controller = GuardedController(rtol, atol, dtmin=4 * rounding, force_dtmin=False, norm=norm)
-        stepping = self._replace(solver=with_tolerances(self.solver, controller))
+        variations = self.variations + len(numbers.directions)
+        control = StepControl.of(numbers.tolerances, (first, last), self.equations, variations, resumes=not self.dense)
         now = lambda x: _alone(x, numbers)
 
         def turn(carry):
             moving, steps, saved, meter = carry
             sample, before = steps.sample, jax.tree.map(now, moving)
-            (moving, reached), (steps, is_sample) = stepping._varied(controller, rounding, steps, numbers)(moving)
+            size = steps.control[0].size
+            stepping = self._replace(solver=with_tolerances(self.solver, control, now(size)))
+            scaled = numbers._replace(args=numbers.args._replace(scales=_at_scale(numbers.args.scales, size)))
+            (moving, reached), (steps, is_sample) = stepping._varied(control, rounding, steps, scaled)(moving)
             meter = self.meter.step(meter, (now(moving.t) - first) / (last - first))
             if self.dense:
-                steps, saved = stepping._sampled(steps, (before.t, now(moving.t)), reached.dense, numbers, saved, write)
+                steps, saved = self._sampled(steps, (before.t, now(moving.t)), reached.dense, numbers, saved, write)
                 return moving, steps, saved, meter
             for earlier, later in ((before.y, reached.there), (now(reached.there), moving.y)):
                 saved = with_events(self.equations, write, saved, self.ts.shape[0], earlier, later, now)
@@ -118,20 +129,18 @@ class IntervalLoop(NamedTuple):
             going = (steps.result == dfx.RESULTS.successful) & (steps.accepted + steps.rejected < self.max_steps)
             return within & going & ~has_stopped(self.equations, now(moving.y))
 
-        moving, steps = stepping._start(controller, first, last, y0, following, sample, numbers)
+        moving, steps = self._start(control, first, last, y0, following, sample, numbers)
         saved = with_events(self.equations, write, saved, self.ts.shape[0], None, y0, now)
         moving, steps, saved, meter = loop(going_on, turn, (moving, steps, saved, self.meter.init()))
         self.meter.close(meter)
         return moving, steps, saved
 
-    def _start(self, controller, first, last, y0, following, sample, numbers: Numbers) -> tuple[Moving, Steps]:
+    def _start(self, control: StepControl, first, last, y0, following, sample, numbers: Numbers) -> tuple[Moving, Steps]:
         """What is there before the first step."""
         term, y = self._term(), _alone(y0, numbers)
         args_of = lambda params: numbers.args._replace(params=self.inputs(params).pieces(following))
         params, origin = numbers.varied
-        planned = FIRST_STEP if self.dense else None  # and otherwise as the rates and their change suggest
-        more = y, planned, args_of(params), self.solver.func, self.solver.error_order(term)
-        t1, controller_state = controller.init(term, first, last, *more)
+        t1, state = control.init(term, first, last, y0, None, None, None, None)
 
         def make(y, given):
             return eqx.partition(self.solver.init(term, first, t1, y, args_of(given[0])), eqx.is_inexact_array)
@@ -146,14 +155,26 @@ class IntervalLoop(NamedTuple):
         origin = functools.reduce(_with_zeros, y0.shape[y.ndim :], origin)
         moving = Moving(origin, y0, changing)  # y0 is that at a fixed time, where there are directions
         zero = jnp.array(0)
-        return moving, Steps(t1 - first, rest, controller_state, jnp.array(is_new), following, sample, dfx.RESULTS.successful, zero, zero)
+        return moving, Steps(t1 - first, rest, state, jnp.array(is_new), following, sample, dfx.RESULTS.successful, zero, zero)
 
-    def _varied(self, controller, rounding, steps: Steps, numbers: Numbers) -> Callable:
-        """A step of what moves and its value at a sample, with their variations along the directions of what is varied, for each order."""
+    def _varied(self, control: StepControl, rounding, steps: Steps, numbers: Numbers) -> Callable:
+        """A step of what moves and its value at a sample, with their variations along the directions of what is varied, for each order.
 
-        function = lambda moving, given: self._step(controller, rounding, moving, given, steps, numbers.args)
-        function = varied_along(function, numbers.directions)
-        return lambda moving: function(moving, numbers.varied)
+        It is tried first, then it is decided whether its errors are small enough, those of the variations among them.
+        """
+        args = numbers.args
+        tried = varied_along(lambda moving, given: self._tried(rounding, moving, given, steps, args), numbers.directions)
+
+        def step(moving):
+            found, (solved, rest) = tried(moving, numbers.varied)
+            now = jax.lax.stop_gradient((moving.t, found.t1, moving.y, found.y, found.error))
+            t0, t1 = (_alone(t, numbers) for t in now[:2])
+            decided = control.adapt_step_size(t0, t1, *now[2:4], args, now[4], self.solver.error_order(self._term()), steps.control)
+            decided = jax.lax.stop_gradient((decided, solved, rest))
+            done = lambda both, given: self._done(rounding, *both, given, steps, args, decided)
+            return varied_along(done, numbers.directions)((moving, found), numbers.varied)
+
+        return step
 
     def _sampled(self, steps: Steps, between, dense, numbers: Numbers, saved, write: Callable) -> tuple[Steps, Any]:
         """With the samples of the last step, if it was kept, from its dense output."""
@@ -169,22 +190,41 @@ class IntervalLoop(NamedTuple):
         i, saved = jax.lax.while_loop(is_within, sampled, (steps.sample, saved))
         return steps._replace(sample=i), saved
 
-    def _step(self, controller, rounding, moving: Moving, given, steps: Steps, args) -> tuple[tuple[Moving, Reached], tuple[Steps, Any]]:
-        """One step, tried, up to the next node at most and behind the jumps there."""
-        (params, origin), t = given, moving.t
-        sample = self.ts.at(self.ts.shape[0] - 1)[0] if self.dense else self.sample_time(steps.sample)
+    def _coming(self, given, t, steps: Steps):
+        """The times that come next: of each signal, and of each sampled state."""
+        params, origin = given
         inputs, periods = self.inputs(params), self.equations.periods(params)
         signals = len(inputs.records)
         ticks = [(origin + i * period).astype(t.dtype) for i, period in zip(steps.following[signals:], periods, strict=True)]
         ticks = [jnp.where(tick > t, tick, jnp.inf) for tick in ticks]  # a period that is not positive has none
-        coming = [*inputs.times(steps.following, t), *ticks]
+        return [*inputs.times(steps.following, t), *ticks]
+
+    def _tried(self, rounding, moving: Moving, given, steps: Steps, args) -> tuple[Tried, Any]:
+        """A step of the solver up to the next node at most; and, not differentiated, its result and the rest of the solver's state."""
+        t, coming = moving.t, self._coming(given, moving.t, steps)
+        sample = self.ts.at(self.ts.shape[0] - 1)[0] if self.dense else self.sample_time(steps.sample)
         node, end = functools.reduce(lambda first, time: jnp.where(time + rounding < first, time, first), coming, sample), t + steps.length
         t1 = jnp.where(end + rounding >= node, node, end)
-        args, after = args._replace(params=inputs.pieces(steps.following)), args
+        args = args._replace(params=self.inputs(given[0]).pieces(steps.following))
         state = eqx.combine(moving.solver_state, steps.solver_state)
-        keep, y, state, dense, planned, control, result = self._tried(controller, t, t1, moving.y, args, state, steps)
+        y, error, dense, new, result = self.solver.step(self._term(), t, t1, moving.y, args, state, steps.has_jumped)
+        changing, rest = eqx.partition(new, eqx.is_inexact_array)
+        result = None if result is dfx.RESULTS.successful else result  # always, as of an explicit scheme: to compare them would be compiled
+        return Tried(t1, node, y, error, changing, dense if self.dense else None), jax.lax.stop_gradient((result, rest))
 
-        t = jnp.where(keep, t1, t)
+    def _done(self, rounding, moving: Moving, tried: Tried, given, steps: Steps, args, decided) -> tuple[tuple[Moving, Reached], Any]:
+        """What follows a step, tried and `decided` on: where it is kept, behind the jumps at its end."""
+        (keep, begin, end, _, control, result), solved, rest = decided
+        old = moving.y, moving.solver_state, steps.solver_state
+        y, changing, rest = jax.tree.map(lambda new, old: jnp.where(keep, new, old), (tried.y, tried.solver_state, rest), old)
+        result, t1, node = self._result(keep, solved, result), tried.t1, tried.node
+        coming = self._coming(given, moving.t, steps)
+        inputs, periods = self.inputs(given[0]), steps.following[len(self.inputs(given[0]).records) :]
+        signals = len(inputs.records)
+        sample = self.ts.at(self.ts.shape[0] - 1)[0] if self.dense else self.sample_time(steps.sample)
+        args, after = args._replace(params=inputs.pieces(steps.following)), args
+
+        t = jnp.where(keep, t1, moving.t)
         passed = [keep & (t1 == node) & (time <= node + rounding) for time in coming]
         following = tuple(i + by for i, by in zip(steps.following, passed, strict=True))
         is_sample = keep & (t1 == node) & (sample <= node + rounding)
@@ -194,23 +234,31 @@ class IntervalLoop(NamedTuple):
                 t = jnp.where(by, time, t)
         follows_slopes = bool(self.equations.modes and self.equations.light)  # what slips without inertia
         bends = [follows_slopes or k in self.equations.driving for k in range(signals)]
-        jump = [*map(max, inputs.jump, bends), *[True] * len(ticks)]
+        jump = [*map(max, inputs.jump, bends), *[True] * len(periods)]
         jumps = functools.reduce(jnp.logical_or, (by for by, jumps in zip(passed, jump, strict=True) if jumps), jnp.array(False))
         after = after._replace(params=inputs.pieces(following))
 
         def behind(y):
-            updated = self.equations.updated(t, y, after, passed[signals:]) if ticks else y
+            updated = self.equations.updated(t, y, after, passed[signals:]) if periods else y
             return behind_jump(self.equations, t, y, updated, args, after)
 
         there = y
         if any(jump):
             y, consistent = jax.lax.cond(jumps, behind, lambda y: (y, jnp.array(True)), y)
             result = dfx.RESULTS.where(consistent, result, under_diffrax(RESULTS.no_friction))
-        reached = Reached(self._moved(sample, t, y, after) if any(self.moving) else y, there, dense if self.dense else None)
-        changing, rest = eqx.partition(state, eqx.is_inexact_array)
+        reached = Reached(self._moved(sample, t, y, after) if any(self.moving) else y, there, tried.dense)
         counts = steps.sample + (is_sample & (not self.dense)), result, steps.accepted + keep, steps.rejected + ~keep
-        steps = Steps(planned, rest, control, jumps | (steps.has_jumped & ~keep), following, *counts)
+        steps = Steps(end - begin, rest, control, jumps | (steps.has_jumped & ~keep), following, *counts)
         return (Moving(t, y, changing), reached), jax.lax.stop_gradient((steps, is_sample))
+
+    def _result(self, keep, solved, controlled):
+        """Of a step: that of its control, or what the solver said of one that is kept."""
+        if solved is None:
+            return controlled
+        ended = solved != dfx.RESULTS.successful
+        if not (self.equations.contacts or self.equations.events):
+            ended &= keep  # what was refused is tried again
+        return dfx.RESULTS.where(ended, solved, controlled)
 
     def _term(self) -> dfx.ODETerm:
         return dfx.ODETerm(in_one_kernel(self.equations.rates) if self.dense else self.equations.rates)
@@ -219,20 +267,10 @@ class IntervalLoop(NamedTuple):
         """y at a time that equals t, but moves otherwise with what is varied."""
         return flow(time, t, (y, self.equations.rates(t, y, args)))
 
-    def _tried(self, controller, t0, t1, y0, args, state, steps: Steps):
-        """A step of the solver and its dense output, and whether it is kept."""
-        term = self._term()
-        y1, error, dense, new, result = self.solver.step(term, t0, t1, y0, args, state, steps.has_jumped)
-        *states, error = jax.lax.stop_gradient((t0, t1, y0, y1, error))
-        more = error, self.solver.error_order(term), steps.controller_state
-        keep, t, end, _, control, controlled = controller.adapt_step_size(*states, args, *more)
-        y, state = jax.tree.map(lambda new, old: jnp.where(keep, new, old), (y1, new), (y0, state))
-        if result is dfx.RESULTS.successful:  # always, as of an explicit scheme: to compare them would be compiled
-            return keep, y, state, dense, end - t, control, controlled
-        ended = result != dfx.RESULTS.successful
-        if not (self.equations.contacts or self.equations.events):
-            ended &= keep  # what was refused is tried again
-        return keep, y, state, dense, end - t, control, dfx.RESULTS.where(ended, result, controlled)
+
+def _at_scale(scales, size: Array):
+    """The scales of a motion whose entries have been as large as this so far."""
+    return None if scales is None else scales.at(size[(..., *[0] * (size.ndim - 1))])
 
 
 def _alone(x: Array, numbers: Numbers) -> Array:

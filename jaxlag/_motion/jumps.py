@@ -32,7 +32,7 @@ def after_jump(equations: EquationsOfMotion, t, y0, y, before: Arguments, args: 
     if equations.contacts:
         assert args.scales is not None  # contacts are located
         moved = equations.parts(equations.projected(t, parts.y, args))
-        errors = args.scales.error(moved.q), args.scales.error(moved.v)
+        errors = args.scales.of_positions(moved.q), args.scales.of_velocities(moved.v)
         nothing = jnp.zeros(equations.elements, bool), jnp.zeros(equations.contacts, bool)
         change = behind_contact(equations, t, moved, args, *nothing, errors, anew=True)
         return change.y, change.consistent & change.dissipates & change.impulsive
@@ -46,7 +46,7 @@ def after_jump(equations: EquationsOfMotion, t, y0, y, before: Arguments, args: 
     slip = elements.slip(t, q, v)
     size = elements.norms(slip)
     direction = slip / jnp.where(size > 0, size, 1)[elements.element_of_row]
-    at_rest = elements.follows | (size <= slip_of(elements, t, q, v, args.scales.error(v)))
+    at_rest = elements.follows | (size <= slip_of(elements, t, q, v, args.scales.of_velocities(v)))
     breaking = elements.follows & ~sticking(elements, parts.sigma)
     mode, _ = select_mode(flat, elements, t, q, v, direction, at_rest, breaking)
     y = in_other_mode(elements, moved._replace(sigma=parts.sigma), mode).y

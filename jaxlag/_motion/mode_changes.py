@@ -17,7 +17,7 @@ from .._mechanics.contact import (
     idle,
     on_contact,
     roundings,
-    roundings_of_rates,
+    roundings_beside,
     select_closed,
 )
 from .._mechanics.friction_elements import FrictionElements
@@ -71,16 +71,17 @@ def _margins(equations: EquationsOfMotion, t, parts: Parts, args):
         closed, none = parts.closed > 0.5, lambda: jnp.zeros_like(parts.closed)
         pressing = lambda: contact_rows(flat, equations.acceleration(mode, t, q, v).multipliers)
         forces = jax.lax.cond(jnp.any(closed), pressing, none) if equations.contacts else none()
-        return jnp.concatenate([_contact_margins(flat, t, q, closed, forces), of_events, *unbounded])
+        return jnp.concatenate([_contact_margins(flat, t, q, closed, forces, args), of_events, *unbounded])
     found = equations.friction(t, parts, args)
-    of_contacts = _contact_margins(flat, t, q, parts.closed > 0.5, contact_rows(flat, found.multipliers))
+    of_contacts = _contact_margins(flat, t, q, parts.closed > 0.5, contact_rows(flat, found.multipliers), args)
     of_elements = jnp.where((held > 0) | idle(flat, elements, sigma, found.bound), 1, found.margin)
     return jnp.concatenate([of_elements, of_contacts, of_events, found.bound, *unbounded])
 
 
-def _contact_margins(flat: Flat, t, q, closed, forces):
+def _contact_margins(flat: Flat, t, q, closed, forces, args: Arguments):
     """The force of a closed contact, the gap of an open one: with some of their rounding, since both begin at zero."""
-    rounding = gap_scales(flat, t, q, q, roundings(q), q).gap
+    own = q if args.scales is None else args.scales.of_q
+    rounding = gap_scales(flat, t, q, q, roundings(q, jnp.abs(own)), q).gap
     little = jnp.finfo(q.dtype).eps ** ROUNDING * jnp.max(jnp.abs(jax.lax.stop_gradient(forces)), initial=0.0)
     return jnp.where(closed, forces + little, flat.gaps(t, q) + rounding)
 
@@ -173,12 +174,12 @@ def changed(equations: EquationsOfMotion, t, y, args: Arguments, ended: Bool[Arr
     of_friction, of_contact = jnp.split(ended[: equations.elements + equations.contacts], [equations.elements])
     if not equations.contacts:
         assert elements is not None
-        stuck, slow = sticking(elements, parts.sigma) | (parts.held > 0), _slow(elements, t, parts, args.scales.error(parts.v))
+        stuck, slow = sticking(elements, parts.sigma) | (parts.held > 0), _slow(elements, t, parts, args.scales.of_velocities(parts.v))
         along, given = in_other(equations, t, parts, args), (parts.sigma, stuck | of_friction | slow, of_friction & stuck)
         mode, _ = select_mode(flat, elements, t, parts.q, parts.v, *given, friction_in=along)
         after = equations.in_new_mode(t, in_other_mode(elements, parts, mode).y, args)
         return Change(after, mode.consistent, jnp.array(True), jnp.array(True), jnp.all(~of_friction | stuck | slow))
-    errors = args.scales.error(parts.q), args.scales.error(parts.v)
+    errors = args.scales.of_positions(parts.q), args.scales.of_velocities(parts.v)
     return behind_contact(equations, t, parts, args, of_friction, of_contact, errors)
 
 
@@ -194,14 +195,14 @@ def behind_contact(equations: EquationsOfMotion, t, parts: Parts, args: Argument
     """
     flat, _, elements = equations.mode(t, parts, args)
     closed, q, before = parts.closed > 0.5, parts.q, parts.v
-    scales = gap_scales(flat, t, q, before, errors[0], roundings_of_rates(flat, t, q, before))
+    scales = gap_scales(flat, t, q, before, errors[0], roundings_beside(flat, t, q, before, before))
     near = closed | of_contact | (jax.lax.stop_gradient(flat.gaps(t, q)) <= scales.gap)
     opening = of_contact & closed
     hits = near & ~opening & (gap_rates(flat, t, q, before) < -scales.rate)
     is_impact = jnp.any(hits)
-    duration = jnp.inf if args.scales is None else args.scales.duration
+    duration, own = (jnp.inf, jnp.abs(q)) if args.scales is None else (args.scales.duration, args.scales.of_q)
     speed = jnp.maximum(-gap_rates(flat, t, q, before), 0)
-    is_low = speed * (t - parts.changed) / 4 <= LOW * gap_scales(flat, t, q, before, roundings(q), before).gap
+    is_low = speed * (t - parts.changed) / 4 <= LOW * gap_scales(flat, t, q, before, roundings(q, own), before).gap
     ratio, remaining, converged = _last_impacts(t, parts, hits & of_contact, is_low, duration)
     e = jnp.where(converged, 0, flat.restitution(t, speed))
 
@@ -283,10 +284,9 @@ def started(equations: EquationsOfMotion, at: StatesAt, params) -> Start:
     flat, _, elements = equations.mode(t, parts, args)
     yes = jnp.array(True)
     if equations.contacts:
-        near = 1 + jnp.abs(jax.lax.stop_gradient(parts.q))
-        inside = gap_scales(flat, t, parts.q, parts.v, jnp.finfo(near.dtype).eps ** 0.5 * near, parts.v).gap
+        errors = tuple(roundings_beside(flat, t, parts.q, parts.v, x) for x in (parts.q, parts.v))
+        inside = gap_scales(flat, t, parts.q, parts.v, jnp.finfo(parts.q.dtype).eps ** (0.5 - ROUNDING) * errors[0], parts.v).gap
         is_outside = jnp.all(flat.gaps(t, parts.q) >= -inside)
-        errors = roundings(near), roundings(1 + jnp.abs(jax.lax.stop_gradient(parts.v)))
         of_contact = flat.gaps(t, parts.q) <= 0
         change = behind_contact(equations, t, parts, args, jnp.zeros(equations.elements, bool), of_contact, errors, anew=True)
         return Start(change.y, change.consistent, yes, is_outside, change.dissipates, change.impulsive)

@@ -5,50 +5,17 @@ import dataclasses
 from collections.abc import Callable
 from typing import Any, ClassVar, NamedTuple, Protocol, runtime_checkable
 
-import jax
-import jax.numpy as jnp
 from jaxtyping import Array, PyTree
 
 from .._mechanics.projection import Projection
-from .._model.signal import least_spacing
 from .._program.jit import jitted
-
-
-class Scales(NamedTuple):
-    """What counts as small in a motion: tolerances, its duration, the sample spacing of its inputs, the rounding of its times."""
-
-    rtol: Any
-    atol: Any
-    duration: Any
-    spacing: Any
-    rounding: Any
-
-    @classmethod
-    def of(cls, tolerances: tuple[Array, Array], ts: Array, params: PyTree) -> "Scales":
-        """The scales of a motion at the times `ts`."""
-        end = jnp.maximum(jnp.abs(ts[0]), jnp.abs(ts[-1]))
-        rtol, atol = tolerances
-        found = cls(rtol, atol, ts[-1] - ts[0], least_spacing(params, ts.dtype), jnp.finfo(ts.dtype).eps * end)
-        return jax.lax.stop_gradient(found)
-
-    @property
-    def slow(self) -> Array:
-        """Per velocity, the slip below which its direction is not worth the many steps that resolving it would take.
-
-        Where elements begin to slide together, a velocity may be off by this much.
-        """
-        return 1e2 * self.atol
-
-    def error(self, v: Array) -> Array:
-        """Per velocity, the error of the integration: slip below it counts as rest where another element changes its mode."""
-        return 10 * (self.rtol * jnp.abs(v) + self.atol)
 
 
 class Arguments(NamedTuple):
     """What the right-hand side depends on besides t and y: diffrax's `args`."""
 
     params: PyTree  # of the system; in a batch, those that all members share
-    scales: Scales | None = None  # None where no event is located
+    scales: Any = None  # `Scales`; None where no event is located
     own: PyTree = None  # in a batch, the params of each member, members last
     directions: tuple = ()  # of the variational equations, for each order: derivatives of (params, own), directions last
 
@@ -60,6 +27,10 @@ class FirstOrderSystem(Protocol):
     @property
     def modes(self) -> int:
         """How many elements of dry friction and contacts change their modes; 0 where the right-hand side is smooth."""
+
+    @property
+    def size(self) -> int:
+        """n, the number of coordinates: the first entries of y, whose velocities are the next."""
 
     @property
     def controlled(self) -> tuple[bool, ...]:
@@ -75,9 +46,6 @@ class FirstOrderSystem(Protocol):
     def projected(self, t: Any, y: Array, args: Arguments) -> Array:
         """y, put back on the manifold."""
 
-    def error_norm(self, error: Array) -> Array:
-        """The size of an error of y."""
-
 
 @dataclasses.dataclass(frozen=True)
 class AugmentedSystem(abc.ABC):
@@ -91,6 +59,11 @@ class AugmentedSystem(abc.ABC):
     def periods(self, params: PyTree) -> list[Array]:
         """None: no state is sampled."""
         return []
+
+    @property
+    def size(self) -> int:
+        """The same as of the equations alone."""
+        return self.equations.size
 
     @property
     def controlled(self) -> tuple[bool, ...]:
@@ -109,10 +82,6 @@ class AugmentedSystem(abc.ABC):
     def projected(self, t: Any, y: Array, args: Arguments) -> Array:
         """y, put back on the manifold."""
         return _along_axis(self, "projected", t, y, args)
-
-    @abc.abstractmethod
-    def error_norm(self, error: Array) -> Array:
-        """The size of an error of y."""
 
     @abc.abstractmethod
     def along_axis(self, function: Callable, t: Any, y: Any, args: Arguments) -> Array:

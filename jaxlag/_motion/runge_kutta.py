@@ -84,7 +84,8 @@ class ExplicitRungeKutta(dfx.AbstractAdaptiveSolver):
         last = scheme.stages - 1
         ends, estimates = np.eye(size)[[0, last]], len(scheme.errors)
         every = changes(as_rows([*scheme.errors, scheme.a[last - 1], *ends, *scheme.dense], size, dtype), f)
-        error = jax.tree.map(lambda every: combined(*every[:estimates]), every)
+        held = jax.lax.stop_gradient if self.reverse else lambda x: x  # its derivative is the error of a variation, in forward mode
+        error = jax.tree.map(lambda every: combined(*held(every[:estimates])), every)
         y1 = jax.tree.map(lambda y0, every: y0 + every[estimates], y0, every)
         series = jax.tree.map(lambda every: every[estimates + 1 :], every)
         return y1, error, {"y0": y0, "y1": y1, "k": series}, jax.tree.map(lambda f: f[last], f), dfx.RESULTS.successful
@@ -118,12 +119,21 @@ def weighted(weights, f):
     return jnp.sum(weights * f.reshape(*[1] * (weights.ndim - f.ndim), *f.shape), axis=weights.ndim - f.ndim)
 
 
+@jax.custom_jvp
 def combined(error, lower=None):
-    """The estimate of an error; of higher order with one of lower beside it, e |e| / √(e² + ℓ²/100), entry by entry."""
+    """The estimate of an error; of higher order with one of lower beside it, e |e| / √(e² + ℓ²/100), entry by entry.
+
+    Its derivative is the same estimate for a variation, and not that of the formula, which is zero where the motion is at rest.
+    """
     if lower is None:
         return error
     size = jnp.sqrt(error**2 + 0.01 * lower**2)
     return jnp.where(size > 0, error * jnp.abs(error) / jnp.where(size > 0, size, 1), 0)
+
+
+@combined.defjvp
+def _combined_jvp(primals, tangents):
+    return combined(*primals), combined(*tangents)
 
 
 class Dopri5(ExplicitRungeKutta):

@@ -14,6 +14,7 @@ from .._program.implicit import undifferentiated
 from .._program.scalarise import scalarised
 from .first_order import EquationsOfMotion
 from .protocol import Arguments
+from .scales import Scales
 
 NEGLIGIBLE = 1e7  # times the tolerance, compared with which a slip of a thousand tolerances is negligible
 
@@ -52,9 +53,8 @@ class Evidence(NamedTuple):
     violation: Violation
 
 
-def sample_at(equations: EquationsOfMotion, t, y, params, tolerances) -> tuple[Sample, Evidence]:
+def sample_at(equations: EquationsOfMotion, t, y, params, scales: Scales) -> tuple[Sample, Evidence]:
     """One sample, from y on the constraints."""
-    rtol, atol = tolerances
     parts = equations.parts(y)
     q, v, works, sigma, held = parts.q, parts.v, parts.works, parts.sigma, parts.held
     flat, mode, elements = equations.mode(t, parts, Arguments(params))
@@ -67,7 +67,7 @@ def sample_at(equations: EquationsOfMotion, t, y, params, tolerances) -> tuple[S
         qddot, multipliers, sound = found.qddot, found.multipliers, Sound(jnp.array(True), jnp.array(True))
         friction_states = friction_by_term(elements, sigma, held > 0, t, q, v, found)
         stuck, load = sticking(elements, sigma), elements.norms(found.force)
-        scale = jnp.where(stuck, jnp.abs(found.bound) + load, slip_of(elements, t, q, v, NEGLIGIBLE * (rtol * jnp.abs(v) + atol)))
+        scale = jnp.where(stuck, jnp.abs(found.bound) + load, slip_of(elements, t, q, v, scales.of_velocities(v, NEGLIGIBLE)))
         excess = jnp.where((held > 0) | idle(flat, elements, sigma, found.bound), 0, -found.margin)
         violation = Violation(jnp.concatenate([excess, -found.bound]), jnp.concatenate([scale, jnp.abs(found.bound)]))
         counts = {"transitions": parts.transitions[0], "time_stuck": parts.time_stuck}
@@ -75,7 +75,7 @@ def sample_at(equations: EquationsOfMotion, t, y, params, tolerances) -> tuple[S
     off = of_mode(t, q, v) if equations.projection else jnp.zeros_like(t)
     named = dict(zip(equations.works, works, strict=True)) if equations.works else None
     if equations.contacts:
-        violation = violation.beside(*_contact_violation(flat, t, parts, multipliers, rtol, atol))
+        violation = violation.beside(*_contact_violation(flat, t, parts, multipliers, scales))
     of_contact = parts.closed > 0.5, parts.impacts, parts.changed, parts.impulse
     contacts = dict(zip(flat.contacts, zip(*of_contact, strict=True), strict=True))
     events = dict(zip(dict(equations.system.events), parts.happened, strict=True))
@@ -84,9 +84,9 @@ def sample_at(equations: EquationsOfMotion, t, y, params, tolerances) -> tuple[S
     return sample, Evidence(sound, off, jax.lax.stop_gradient(violation))
 
 
-def _contact_violation(flat, t, parts, multipliers, rtol, atol):
+def _contact_violation(flat, t, parts, multipliers, scales):
     """Of each contact, how far it is inside of its obstacle or pulls."""
     closed, forces = parts.closed > 0.5, contact_rows(flat, multipliers)
-    allowed = gap_scales(flat, t, parts.q, parts.v, NEGLIGIBLE * (rtol * jnp.abs(parts.q) + atol), parts.v).gap
+    allowed = gap_scales(flat, t, parts.q, parts.v, scales.of_positions(parts.q, NEGLIGIBLE), parts.v).gap
     scale = jnp.where(closed, jnp.max(jnp.abs(multipliers), initial=0.0), allowed)
     return jnp.where(closed, -forces, -flat.gaps(t, parts.q)), scale

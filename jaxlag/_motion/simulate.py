@@ -18,9 +18,10 @@ from .._program.jit import compiled, is_concrete
 from .derivative_rule import differentiable
 from .failure import raise_failure
 from .first_order import Formulation
-from .integrate import SolverOptions, tolerances_of
+from .integrate import SolverOptions
 from .padding import padded_signals, padded_times, without_padding
 from .progress import compiling
+from .scales import tolerances_of
 from .search_for_start import search_for
 from .solution_map import Inputs, SolutionMap, trajectory_of
 from .table import Table
@@ -38,7 +39,7 @@ def simulate(
     events: Mapping[str, Event] | None = None,
     solver: dfx.AbstractSolver | None = None,
     rtol: float | Array | None = None,
-    atol: float | Array | None = None,
+    atol: PyTree = None,
     stabilisation: Projection | Baumgarte | NoStabilisation = Projection(),
     friction: StickSlip | Regularised = StickSlip(),
     max_steps: int = 100_000,
@@ -65,7 +66,10 @@ def simulate(
     - `events`: by name, `Event(when, then, stop)`, in place of those of the system. Keep them: new ones are compiled anew.
     - `solver`: any explicit or diagonally implicit Runge–Kutta solver of diffrax. Default `jaxlag.Dop853()`; for forces
       that are not smooth `jaxlag.Dopri5()`, for stiff systems `diffrax.Kvaerno5()`.
-    - `rtol`, `atol`: tolerances of the step size control. Defaults 1e-8 and 1e-10 in double, 1e-4 and 1e-6 in single precision.
+    - `rtol`, `atol`: tolerances of the step size control. `rtol` is 1e-8 in double and 1e-4 in single precision. Without `atol` each
+      coordinate, velocity and state is compared with its own scale, a hundredth of the largest that it has been, in any unit;
+      otherwise it is a number, or one for each coordinate and its velocity in a pytree like `q0`. Derivatives are as exact as the
+      motion: their errors, compared with their own scales, shorten the steps of a motion that is differentiated.
     - `stabilisation`: how the constraints are maintained: `Projection()`, `Baumgarte(...)` or `NoStabilisation()`.
     - `friction`: treatment of dry friction: `StickSlip()` (exact Coulomb friction) or `Regularised(width)`.
     - `max_steps`: step limit.
@@ -94,7 +98,7 @@ def simulate(
     system = system if events is None else system.with_events(events)
     given = state_and_params(q0, qdot0, params, ("q0", "qdot0"))
     options = SolverOptions.of(solver, Formulation(stabilisation, friction, works), max_steps, adjoint, progress)
-    (ts, length), tolerances = padded_times(ts, given.dtype), tolerances_of(rtol, atol, given.dtype)
+    (ts, length), tolerances = padded_times(ts, given.dtype), tolerances_of(rtol, atol, given.trees[0])
     states = {} if states is None else given_states(system, states, given.trees[0])
     padded = padded_signals(given)
     with compiling("the motion", progress):

@@ -27,10 +27,11 @@ from .batch import BatchedEquations
 from .derivative_rule import differentiable_batch
 from .failure import raise_failure
 from .first_order import EquationsOfMotion, Formulation
-from .integrate import SolverOptions, Variations, by_diffrax, initialised, is_variational, tolerances_of, with_status
+from .integrate import SolverOptions, Variations, by_diffrax, initialised, is_variational, with_status
 from .members import all_devices, check_agreement, of_each, over_devices, padded
 from .protocol import Arguments
 from .results import RESULTS
+from .scales import tolerances_of
 from .simulate import simulate
 from .solution_map import samples_at, trajectory_of
 from .trajectory import Trajectory
@@ -51,7 +52,7 @@ def simulate_many(
     common_steps: bool | None = None,
     solver: dfx.AbstractSolver | None = None,
     rtol: float | Array | None = None,
-    atol: float | Array | None = None,
+    atol: PyTree = None,
     stabilisation: Projection | Baumgarte | NoStabilisation = Projection(),
     friction: StickSlip | Regularised = StickSlip(),
     max_steps: int = 100_000,
@@ -100,8 +101,10 @@ def simulate_many(
     dtype = jnp.result_type(*jax.tree.leaves((everything["q0"], everything["qdot0"])))
     options = SolverOptions.of(solver, Formulation(stabilisation, friction), max_steps)
     common_steps = _choice_of_steps(common_steps, steps)
+    like = eqx.combine(jax.tree.map(lambda leaf: np.zeros(leaf.shape[1:], leaf.dtype), own["q0"]), shared["q0"])
     check_agreement(**everything, ts=ts)
-    trajectory = _simulate_many(system, options, common_steps, own, shared, sample_times(ts, dtype), tolerances_of(rtol, atol, dtype))
+    tolerances = tolerances_of(rtol, atol, like)
+    trajectory = _simulate_many(system, options, common_steps, own, shared, sample_times(ts, dtype), tolerances)
     if throw:
         raise_failure(trajectory)
     return trajectory

@@ -12,7 +12,7 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, PyTree
 
 from .._model.flat import StatesAt
-from .._model.signal import with_second_derivatives
+from .._model.signal import is_signal, with_second_derivatives
 from .._model.state_values import start_values
 from .._model.system import System
 from .._model.validation import check
@@ -21,12 +21,13 @@ from .first_order import EquationsOfMotion
 from .guarantees import verified
 from .integrate import SolverOptions, Variations, in_one_loop, initialised, is_variational, states_at, with_status
 from .moments import ContactState, EventState, FrictionState
-from .protocol import Arguments, Scales
+from .protocol import Arguments
 from .provenance import Provenance
 from .sample import Sample, sample_at
+from .scales import Scales
 from .search_for_start import Search
 from .trajectory import Trajectory
-from .variational import derived, pushforward, split_varying
+from .variational import AccompaniedEquations, derived, pushforward, split_varying, with_variations
 
 
 class Inputs(NamedTuple):
@@ -36,7 +37,7 @@ class Inputs(NamedTuple):
     q0: PyTree
     qdot0: PyTree
     params: PyTree
-    tolerances: tuple[Array, Array]
+    tolerances: tuple[Array, Array | None]
     states: dict[str, PyTree]  # values at the start that differ from those of the system
 
 
@@ -79,11 +80,39 @@ class SolutionMap:
         equations, at = self._equations(inputs, ts)
         params, tolerances = inputs.params, inputs.tolerances
         smooth = with_second_derivatives(params)
-        args = Arguments(smooth, Scales.of(tolerances, ts, smooth))
+        args = Arguments(smooth, Scales.of(tolerances, ts, smooth, at.q, at.v))
         start = initialised(equations, at, smooth, args.scales, self.search)
-        ys, result, stats = states_at(equations, self.options, adjoint, at.t, start.y, ts, args, tolerances)
+        if isinstance(adjoint, dfx.ForwardMode) or self.options.adjoint or not is_variational(equations, self.options, None, params):
+            ys, result, stats = states_at(equations, self.options, adjoint, at.t, start.y, ts, args, tolerances)
+        else:
+            ys, result, stats = self._accompanied(equations, adjoint, start.y, inputs, ts, args)
         ys, result = with_status(ys, result, start.conditions, (inputs, ts))
         return samples_at(equations, ts, ys, params, result, stats | {"start_moved": start.moved}, tolerances)
+
+    def _accompanied(self, equations, adjoint, y0, inputs: Inputs, ts: Array, args: Arguments):
+        """The states of a motion in steps that fit a variation along a direction at random as well: reverse mode asks for all."""
+        direction = _at_random(inputs)
+        variations = self._variations(equations, inputs, (direction,), ts)
+        of_start = jax.lax.stop_gradient(variations.initial(jax.lax.stop_gradient(inputs))[0][..., 1:])
+        args = args._replace(directions=variations.directions)
+        y0, accompanied = with_variations(y0, of_start), AccompaniedEquations(equations)
+        ys, result, stats = states_at(accompanied, self.options, adjoint, _first_time(inputs, ts), y0, ts, args, inputs.tolerances)
+        last_t, last_y = stats["last"]
+        return ys[..., 0], result, stats | {"last": (last_t, last_y[..., 0])}
+
+    def _variations(self, equations, inputs: Inputs, directions: tuple[Inputs, ...], ts: Array) -> Variations:
+        """The equations of the motion with its variations along directions, for each order."""
+
+        def initial(inputs):
+            at, params = self._at(inputs, ts), with_second_derivatives(inputs.params)
+            start = initialised(equations, at, params, Scales.of(inputs.tolerances, ts, params, at.q, at.v), self.search)
+            return start.y, start
+
+        arguments = lambda inputs: (_first_time(inputs, ts), Arguments(with_second_derivatives(inputs.params)))
+        variations = Variations(equations, initial)
+        for of_order in directions:
+            variations = variations.along(of_order, (of_order.params, None), of_order.t0, arguments)
+        return variations
 
     def push(self, inputs: Inputs, directions: tuple[Inputs, ...], ts: Array) -> tuple[Any, Unchanging]:
         """The samples and their derivatives along directions, for each order; by the variational equations where they hold."""
@@ -91,19 +120,10 @@ class SolutionMap:
             return pushforward(self.solve)(inputs, directions, ts)
         equations, at = self._equations(inputs, ts)
         varying = [split_varying(inputs, of_order)[0].params for of_order in directions]
-
-        def initial(inputs):
-            params = with_second_derivatives(inputs.params)
-            start = initialised(equations, self._at(inputs, ts), params, Scales.of(inputs.tolerances, ts, params), self.search)
-            return start.y, start
-
-        arguments = lambda inputs: (_first_time(inputs, ts), Arguments(with_second_derivatives(inputs.params)))
-        variations = Variations(equations, initial)
-        for of_order in directions:
-            variations = variations.along(of_order, (of_order.params, None), of_order.t0, arguments)
+        variations = self._variations(equations, inputs, directions, ts)
         y0, start = variations.initial(inputs)
         smooth, tolerances = with_second_derivatives(inputs.params), inputs.tolerances
-        args = Arguments(smooth, Scales.of(tolerances, ts, smooth))
+        args = Arguments(smooth, Scales.of(tolerances, ts, smooth, at.q, at.v))
         if is_variational(equations, self.options, varying, inputs.params):
             args = args._replace(directions=variations.directions)
             ys, result, stats = in_one_loop(variations.equations, self.options, at.t, y0, ts, args, tolerances)
@@ -143,9 +163,10 @@ class SolutionMap:
     def drift(self, inputs: Inputs, ts: Array, samples: Samples) -> Samples:
         """The change of each sample with its own time."""
         equations, _ = self._equations(inputs, ts)
+        scales = scales_of(equations, inputs.tolerances, ts, inputs.params, samples.ys)
 
         def at(t, y):
-            shown, _ = sample_at(equations, t, y, inputs.params, inputs.tolerances)
+            shown, _ = sample_at(equations, t, y, inputs.params, scales)
             return y, eqx.filter(shown, eqx.is_inexact_array)
 
         def of_one(t, y):
@@ -168,6 +189,21 @@ class SolutionMap:
         return StatesAt(start_values(self.system, inputs.states, t0, *given), t0, q, v)
 
 
+def _at_random(inputs: Inputs) -> Inputs:
+    """A direction of the start and of params, each number changed by its own size, or by one where it is zero."""
+    signs = np.random.default_rng(0)
+
+    def one(leaf):
+        if is_signal(leaf) or not eqx.is_inexact_array(leaf):
+            return jax.tree.map(lambda _: None, leaf)
+        size = jnp.where(leaf == 0, 1, jnp.abs(leaf)) * signs.normal(size=np.shape(leaf))
+        return jax.lax.stop_gradient(size.astype(jnp.asarray(leaf).dtype))[..., None]
+
+    parts = inputs.q0, inputs.qdot0, inputs.params, inputs.states
+    q0, qdot0, params, states = (jax.tree.map(one, part, is_leaf=is_signal) for part in parts)
+    return Inputs(None, q0, qdot0, params, jax.tree.map(lambda _: None, inputs.tolerances), states)
+
+
 def _first_time(inputs: Inputs, ts: Array) -> Array:
     return ts[0] if inputs.t0 is None else inputs.t0
 
@@ -177,13 +213,20 @@ def samples_at(equations: EquationsOfMotion, ts, ys, params, result, stats, tole
     ys, events = ys[: ts.size], records(equations, ys[ts.size :])
     last_t, last_y = stats["last"]
     times, states = jnp.concatenate([ts, last_t[None]]), jnp.concatenate([ys, last_y[None]])
-    samples = jax.vmap(lambda t, y: sample_at(equations, t, y, params, tolerances))(times, states)
+    scales = scales_of(equations, tolerances, ts, params, states)
+    samples = jax.vmap(lambda t, y: sample_at(equations, t, y, params, scales))(times, states)
     if equations.events:  # behind the end of a motion there is none
         states = jnp.where(states[:, -1:] > 0, jnp.nan, states)
-    shown, result, reached = verified(equations, times, states, samples, result, tolerances)
+    shown, result, reached = verified(equations, times, states, samples, result, tolerances[0])
     counts = {name: count for name, count in stats.items() if name != "last"} | {"reached": jax.lax.stop_gradient(reached)}
     changing, rest = eqx.partition(shown, eqx.is_inexact_array)
     return Samples(ys, changing, events), Unchanging(result, counts, rest)
+
+
+def scales_of(equations: EquationsOfMotion, tolerances, ts, params, ys) -> Scales:
+    """The scales of a motion by its samples, as far as it went."""
+    largest = jnp.max(jnp.where(jnp.isfinite(ys), jnp.abs(ys), 0), axis=0)
+    return Scales.of(tolerances, ts, params, *jnp.split(largest[: 2 * equations.size], 2))
 
 
 def trajectory_of(system: System, options: SolverOptions, params: PyTree, ts, samples: Samples, unchanging: Unchanging) -> Trajectory:

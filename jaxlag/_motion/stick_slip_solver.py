@@ -174,7 +174,7 @@ class StickSlipSolver(ProjectedSolver):
     def _joined(self, split: Split, t0, t1, y0, args):
         """What diffrax asks of a step, from its pieces."""
         (first, second, cut, seen), ended = split, split.seen.ended
-        error = jnp.where(ended, jnp.maximum(jnp.abs(first.error), jnp.abs(second.error)), first.error)
+        error = jnp.where(ended, first.error + second.error, first.error)  # a sum, which has a derivative at zero
         jammed = ended & cut.usable & ~cut.consistent & (self.equations.elements == 0)  # as between walls that close in
         # There, and where a bound has turned negative, steps shrink until the motion has come as far as it goes.
         shrinking = (seen.negative | jammed) & (t1 - t0 > BARELY * args.scales.duration)

@@ -2,7 +2,7 @@
 
     δẏ = ∂f/∂y δy + ∂f/∂p δp   beside   ẏ = f(t, y, p)
 
-An explicit scheme gives of these what differentiating it would, for the same steps, which the motion alone sets.
+An explicit scheme gives of these what differentiating it would, for the same steps, which fit the worst of them (`step_size`).
 Source: Hairer, Nørsett & Wanner, Solving Ordinary Differential Equations I, eqs. I.14.13 and I.14.14.
 """
 
@@ -80,12 +80,16 @@ class VariationalEquations(AugmentedSystem):
     That of its variational equations in their turn has the second variations, and so on.
     """
 
-    def error_norm(self, error: Array) -> Array:
-        """The error of the motion alone sets the steps."""
-        return self.equations.error_norm(error[..., 0])
-
     def along_axis(self, function: Callable, t: Any, y: Any, args: Arguments) -> Array:
         *before, directions = args.directions
         given = lambda numbers: Arguments(numbers[0], own=numbers[1], directions=tuple(before))
         along = varied_along(lambda y, numbers: (function(t, y, given(numbers)), None), [directions])
         return along(y, (args.params, args.own))[0]
+
+
+class AccompaniedEquations(VariationalEquations):
+    """The same where variations have a part in setting the steps alone: reverse mode goes through the motion and not through them."""
+
+    def along_axis(self, function: Callable, t: Any, y: Any, args: Arguments) -> Array:
+        alone = function(t, y[..., 0], args._replace(directions=args.directions[:-1]))
+        return with_variations(alone, jax.lax.stop_gradient(super().along_axis(function, *jax.lax.stop_gradient((t, y, args))))[..., 1:])

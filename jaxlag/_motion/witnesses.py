@@ -19,19 +19,26 @@ def witness_margins(equations: EquationsOfMotion, t, parts: Parts, args: Argumen
         return parts.sign, parts.sign
     parts = equations.decided(t, parts, args)
     value, scale_of = _value_and_scale(equations, t, parts, args)
-    return parts.sign * value, scale_of(roundings(parts.q), roundings(parts.v))
+    return parts.sign * value, scale_of(*_roundings(parts, args))
+
+
+def _roundings(parts: Parts, args: Arguments):
+    """What counts as rounding of q and of q̇."""
+    assert args.scales is not None  # events are located
+    return roundings(parts.q, args.scales.of_q), roundings(parts.v, args.scales.of_v)
 
 
 def _value_and_scale(equations, t, parts, args):
     """Of each witness, its value, and what errors of q and q̇ amount to in it."""
     flat, _, _ = equations.mode(t, parts, args)
     multipliers = _multipliers(equations, t, parts, args)(t, parts.q, parts.v)
-    of_loads = roundings(jnp.max(jnp.abs(multipliers), initial=0.0) * jnp.ones_like(multipliers))
+    largest = jax.lax.stop_gradient(jnp.max(jnp.abs(multipliers), initial=0.0)) * jnp.ones_like(multipliers)
+    of_loads, of_time = roundings(largest, largest), roundings(t[None], args.scales.duration)
     at = t, parts.q, parts.v, multipliers
     slopes = [jnp.abs(by).reshape(equations.events, -1) for by in jax.jacfwd(flat.witnesses, argnums=(0, 1, 2, 3))(*at)]
 
     def scale(of_q, of_v):
-        errors = roundings(t[None]), of_q, of_v, of_loads
+        errors = of_time, of_q, of_v, of_loads
         return jax.lax.stop_gradient(sum(jnp.sum(by * of[None], axis=1) for by, of in zip(slopes, errors, strict=True)))
 
     return flat.witnesses(*at), scale
@@ -58,9 +65,9 @@ def sides(equations: EquationsOfMotion, t, parts: Parts, args: Arguments) -> tup
     multipliers, qddot = _multipliers(equations, t, parts, args), equations.acceleration(mode, t, parts.q, parts.v).x
     along = lambda t, q, v: flat.witnesses(t, q, v, multipliers(t, q, v))
     rate = jax.jvp(along, (t, parts.q, parts.v), (jnp.ones_like(t), parts.v, qddot))[1]
-    is_far = jnp.abs(value) > scale_of(args.scales.error(parts.q), args.scales.error(parts.v))
+    is_far = jnp.abs(value) > scale_of(args.scales.of_positions(parts.q), args.scales.of_velocities(parts.v))
     side = jnp.where(jnp.where(is_far, value, rate) < 0, -1.0, 1.0).astype(value.dtype)
-    return jax.lax.stop_gradient((side, jnp.abs(value) > scale_of(roundings(parts.q), roundings(parts.v))))
+    return jax.lax.stop_gradient((side, jnp.abs(value) > scale_of(*_roundings(parts, args))))
 
 
 def matching(equations: EquationsOfMotion, sign: Float[Array, " w"]) -> Bool[Array, " w"]:

@@ -158,8 +158,8 @@ BORDER = {
     "a width that is endless": (lambda: jl.Regularised(np.inf), "^`width` must be finite, but is inf"),
     "a negative rtol": (lambda: run(rtol=-1e-6), "^`rtol` must be at least 0, but is -1e-06. The default is 1e-08"),
     "an rtol that is NaN": (lambda: run(rtol=np.nan), "^`rtol` must be finite, but is nan"),
-    "an atol of zero": (lambda: run(atol=0.0), "^`atol` must be positive, but is 0. The default is 1e-10"),
-    "an atol for each": (lambda: run(atol=jnp.ones(2)), r"^`atol` must be one number, but has shape \(2,\)"),
+    "an atol of zero": (lambda: run(atol=0.0), "^`atol` must be positive, but is 0. Leave it out, and each coordinate"),
+    "an atol for each": (lambda: run(atol=jnp.ones(2)), r"^`atol` must be a number, or one for each coordinate in a pytree like `q0`, but is"),
     "no steps": (lambda: run(max_steps=0), "^`max_steps` must be at least 1, but is 0"),
     "steps below zero": (lambda: run(max_steps=-5), "^`max_steps` must be at least 1, but is -5"),
 }  # fmt: skip

@@ -10,7 +10,7 @@ import pytest
 from scipy.special import ellipj, ellipk
 
 import jaxlag as jl
-from jaxlag._motion import integrate, solution_map
+from jaxlag._motion import scales, solution_map
 from jaxlag._motion.results import RESULTS, from_diffrax, reason_of, under_diffrax
 from jaxlag.examples import pendulum, vehicle
 
@@ -237,7 +237,7 @@ def test_a_batch_is_printed_as_one():
 
 
 def test_single_precision_works_and_warns_once(single_precision):
-    integrate._warn_of_single_precision.cache_clear()
+    scales._warn_of_single_precision.cache_clear()
     ts, p = jnp.linspace(0, 2, 21), pendulum.params
     with pytest.warns(UserWarning, match="single precision") as caught:
         for _ in range(2):

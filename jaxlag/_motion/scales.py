@@ -1,0 +1,113 @@
+"""What counts as small in a motion: tolerances, given or by default, and the scale of each coordinate along the motion.
+
+By default a coordinate is compared with what it has been so far, in its own unit: no number of the package has one.
+"""
+
+import functools
+import warnings
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.flatten_util import ravel_pytree
+from jaxtyping import Array, PyTree
+
+from .._model.numbers import number, numbers
+from .._model.signal import least_spacing
+from .._program.jit import is_concrete
+
+SHARE = 0.01  # of its own scale, what of a coordinate near zero is compared with
+LEAST = 1e-3  # of a coordinate's own scale, what its velocity has to move it by within the motion to have a scale of its own
+
+
+class Scales(NamedTuple):
+    """What counts as small in a motion: tolerances, its duration, the sample spacing of its inputs, the rounding of its times, and beside
+    q and q̇, the scale of each along the motion so far.
+    """
+
+    rtol: Any
+    atol: Any  # None where each follows its own scale
+    duration: Any
+    spacing: Any
+    rounding: Any
+    of_q: Any
+    of_v: Any
+    driven: Any = None  # of each velocity, the least scale that dry friction in a plane gives it
+
+    @classmethod
+    def of(cls, tolerances: tuple[Array, Array | None], ts: Array, params: PyTree, q: Array, v: Array) -> "Scales":
+        """The scales of a motion at the times `ts`, where q and q̇ have been as large as this."""
+        end = jnp.maximum(jnp.abs(ts[0]), jnp.abs(ts[-1]))
+        spacing = least_spacing(params, ts.dtype)
+        found = cls(*tolerances, ts[-1] - ts[0], spacing, jnp.finfo(ts.dtype).eps * end, q, v)
+        return jax.lax.stop_gradient(found.at(jnp.abs(jnp.concatenate([q, v]))))
+
+    def at(self, sizes: Array) -> "Scales":
+        """The same, where the largest values of the entries of y so far are these."""
+        n = len(self.of_q)
+        reach = jax.lax.stop_gradient(reaching(sizes, n, self.duration))
+        of_v = reach[n : 2 * n] if self.driven is None else jnp.maximum(reach[n : 2 * n], self.driven)
+        return self._replace(of_q=reach[:n], of_v=of_v)
+
+    @property
+    def slow(self) -> Array:
+        """Of each velocity, the slip below which its direction is not worth the many steps that resolving it would take.
+
+        Where elements begin to slide together, a velocity may be off by this much.
+        """
+        return 1e2 * self._absolute(self.of_v)
+
+    def of_positions(self, q: Array, factor: float = 10) -> Array:
+        """Of each coordinate, the error of the integration."""
+        return factor * (self.rtol * jnp.abs(q) + self._absolute(self.of_q))
+
+    def of_velocities(self, v: Array, factor: float = 10) -> Array:
+        """Of each velocity, the error of the integration: slip below it counts as rest where another element changes its mode."""
+        return factor * (self.rtol * jnp.abs(v) + self._absolute(self.of_v))
+
+    def _absolute(self, own: Array) -> Array:
+        if self.atol is None:
+            return SHARE * self.rtol * own
+        n = len(self.of_q)
+        return self.atol[:n] if jnp.ndim(self.atol) else jnp.full(n, self.atol)
+
+
+def reaching(size: Array, coordinates: int, duration: Any) -> Array:
+    """Of each entry of y the scale that it is compared with: its size; of a velocity, at least what moves its coordinate noticeably."""
+    q, v, rest = size[:coordinates], size[coordinates : 2 * coordinates], size[2 * coordinates :]
+    return jnp.concatenate([q, jnp.maximum(v, LEAST * q / jnp.where(duration > 0, duration, jnp.inf)), rest])
+
+
+def tolerances_of(rtol, atol, q: PyTree) -> tuple[Array | np.ndarray, Array | np.ndarray | None]:
+    """The given tolerances, or the default for the precision; the absolute one of each coordinate and its velocity, where they differ."""
+    dtype = jnp.result_type(*jax.tree.leaves(q))
+    single = dtype.itemsize < 8
+    if single:
+        _warn_of_single_precision()
+    default = 1e-4 if single else 1e-8
+    if rtol is None and atol is None:
+        return np.asarray(default, dtype), None
+    rtol = number(default if rtol is None else rtol, "`rtol`", dtype, least=0.0, cure=f"The default is {default:g}.")
+    if atol is None:
+        return rtol, None
+    cure = "Leave it out, and each coordinate is compared with its own scale."
+    given, like = (jax.tree.flatten(tree) for tree in (atol, q))
+    if jax.tree_util.treedef_is_leaf(given[1]) and np.ndim(atol) == 0:
+        return rtol, number(atol, "`atol`", dtype, positive=True, cure=cure)
+    if not (str(given[1]) == str(like[1]) and all(np.shape(x) in ((), np.shape(y)) for x, y in zip(given[0], like[0], strict=True))):
+        raise ValueError(f"`atol` must be a number, or one for each coordinate in a pytree like `q0`, but is {atol!r}. {cure}")
+    each = jax.tree.map(lambda x, like: jnp.broadcast_to(numbers(x, "`atol`", dtype), np.shape(like)), atol, q)
+    each = ravel_pytree(each)[0]
+    if is_concrete(each) and not np.all(np.asarray(each) > 0):
+        raise ValueError(f"`atol` must be positive, but is {atol!r}. {cure}")
+    return rtol, jnp.tile(each, 2)
+
+
+@functools.cache
+def _warn_of_single_precision() -> None:
+    warnings.warn(
+        "jaxlag runs in single precision: tolerances below 1e-5 are out of reach. "
+        'For double precision: jax.config.update("jax_enable_x64", True).',
+        stacklevel=5,
+    )

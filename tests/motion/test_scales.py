@@ -1,0 +1,97 @@
+"""Motions and their derivatives do not depend on the units of their coordinates and of their clock."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxlag as jl
+
+UNITS = [(1.0, 1.0), (1e-12, 1.0), (1e9, 1e6), (1e-9, 1e-6), (1e-9, 1e6)]  # of length and of time
+
+CIRCUIT = jl.System(lambda q, V, C: V * q - 0.5 * q**2 / C, dissipation=lambda qdot, R: 0.5 * R * qdot**2)
+OSCILLATOR = jl.System(lambda q, qdot, w: 0.5 * qdot**2 - 0.5 * w**2 * q**2)
+SLIDER = jl.System(lambda q, qdot, c: 0.5 * qdot**2 - 0.5 * c * q**2, dissipation=lambda qdot, F: F * jnp.abs(qdot))
+BALL = jl.System(lambda q, qdot, g: 0.5 * qdot**2 - g * q, unilateral={"floor": jl.Contact(lambda q: q, restitution=0.5)})
+
+
+def test_a_circuit_of_small_charges():
+    """q = V C (1 − exp(−t/RC)), of 1e-10 C: with an absolute tolerance of 1e-10 it was 87 % off."""
+    ts = np.linspace(0, 5e-4, 51)
+    charge = jl.simulate(CIRCUIT, 0.0, 0.0, ts, {"V": 1.0, "C": 1e-10, "R": 1e6}).q
+    np.testing.assert_allclose(charge, -1e-10 * np.expm1(-ts / 1e-4), rtol=1e-7, atol=1e-25)
+
+
+@pytest.mark.parametrize("length, time", UNITS)
+def test_an_oscillator(length, time):
+    ts = np.linspace(0, 20, 41)
+    motion = jl.simulate(OSCILLATOR, length, 0.0, ts * time, {"w": 2 / time})
+    np.testing.assert_allclose(motion.q / length, np.cos(2 * ts), atol=1e-7)
+    assert motion.stats["num_steps"] == jl.simulate(OSCILLATOR, 1.0, 0.0, ts, {"w": 2.0}).stats["num_steps"]
+
+
+@pytest.mark.parametrize("length, time", UNITS)
+def test_dry_friction(length, time):
+    """An oscillator (c = 4) loses 2 F/c of its amplitude each half a period, and rests where |c x| ≤ F: from 1, F = 0.3, at 0.1."""
+    motion = jl.simulate(SLIDER, length, 0.0, np.array([0.0, 20.0]) * time, {"c": 4 / time**2, "F": 0.3 * length / time**2})
+    left = 1.0
+    while left * 4 > 0.3:
+        left = abs(left - 0.15) if left > 0.075 else left
+    np.testing.assert_allclose(abs(motion.q[-1]) / length, left, rtol=1e-7)
+
+
+@pytest.mark.parametrize("length, time", UNITS)
+def test_a_bouncing_ball(length, time):
+    """From 1 with g = 10 and e = ½ it rests after √(2h/g) (1 + e)/(1 − e) = 3 √0.2."""
+    motion = jl.simulate(BALL, length, 0.0, np.array([0.0, 1.0, 5.0]) * time, {"g": 10 * length / time**2})
+    np.testing.assert_allclose(motion.contacts["floor"].changed[-1] / time, 3 * np.sqrt(0.2), rtol=1e-7)
+
+
+def test_a_chain_named_mass_by_mass():
+    """The last of twelve masses moves by coupling alone, at first like t²⁴: it has no scale then, and is compared with none."""
+
+    def energy(q, qdot):
+        x = [q[f"x{i}"] for i in range(12)]
+        springs = sum((b - a) ** 2 for a, b in zip([0.0, *x], [*x, 0.0], strict=True))
+        return 0.5 * sum(v**2 for v in qdot.values()) - 0.5 * springs
+
+    q0 = {f"x{i}": 1e-6 * (i == 0) for i in range(12)}
+    motion = jl.simulate(jl.System(energy), q0, dict.fromkeys(q0, 0.0), [0.0, 5.0, 20.0])
+    K = 2 * np.eye(12) - np.eye(12, k=1) - np.eye(12, k=-1)
+    w2, modes = np.linalg.eigh(K)
+    exact = 1e-6 * modes @ (modes[0][:, None] * np.cos(np.sqrt(w2)[:, None] * np.array([5.0, 20.0])))
+    found = np.array([motion.q[f"x{i}"][1:] for i in range(12)])
+    np.testing.assert_allclose(found, exact, atol=1e-13)
+
+
+def test_a_slow_slider_beside_a_fast_rotor():
+    """Each is compared with its own scale: 1e-6 beside 1e4."""
+    system = jl.System(lambda q, qdot: 0.5 * qdot["x"] ** 2 - 0.5 * q["x"] ** 2 + 0.5 * qdot["phi"] ** 2)
+    motion = jl.simulate(system, {"x": 1e-6, "phi": 0.0}, {"x": 0.0, "phi": 1e4}, [0.0, 10.0])
+    np.testing.assert_allclose(motion.q["x"][-1], 1e-6 * np.cos(10.0), rtol=1e-6)
+
+
+def test_a_given_absolute_tolerance_is_taken_as_given():
+    steps = lambda **given: int(jl.simulate(OSCILLATOR, 1e-9, 0.0, [0.0, 20.0], {"w": 2.0}, **given).stats["num_steps"])
+    assert steps(atol=1e-10) < steps(atol=1e-18) <= steps(atol=1e-19)
+    each = jl.System(lambda q, qdot: sum(0.5 * qdot[k] ** 2 - 2 * q[k] ** 2 for k in "xy"))
+    run = lambda atol: jl.simulate(each, {"x": 1e-9, "y": 1e-9}, {"x": 0.0, "y": 0.0}, [0.0, 20.0], atol=atol).stats["num_steps"]
+    assert run({"x": 1e-3, "y": 1e-18}) > run({"x": 1e-3, "y": 1e-3})
+
+
+def test_a_circuit_that_is_fitted():
+    """RC from charges of 1e-10 C: 1.31 in place of 1.023 before."""
+    ts, noise = np.linspace(0, 5e-4, 51), np.random.default_rng(0).normal(size=51)
+    charge = -1e-10 * np.expm1(-ts / 1.023e-4) + 1e-12 * noise
+    record = jl.Experiment(ts, {"q": charge}, 0.0, 0.0, observe=lambda q: {"q": q}, sigma={"q": 1e-12})
+    fit = jl.fit(CIRCUIT, record, {"V": 1.0, "C": 1e-10, "R": 0.7e6}, free=("R",))
+    slope = 1e-10 * (-ts / 1.023e-4) * np.exp(-ts / 1.023e-4) / 1.023e6  # dq/dR
+    sigma = 1e-12 / np.sqrt(np.sum(slope**2))
+    np.testing.assert_allclose(fit.params["R"], 1.023e6, atol=4 * sigma)
+    np.testing.assert_allclose(fit.standard_errors["R"], sigma, rtol=0.05)
+
+
+def test_single_precision(single_precision):
+    ts = np.linspace(0, 20, 11)
+    for length in (1.0, 1e-9):
+        motion = jl.simulate(OSCILLATOR, length, 0.0, ts, {"w": 2.0})
+        np.testing.assert_allclose(np.asarray(motion.q) / length, np.cos(2 * ts), atol=2e-3)

@@ -1,0 +1,120 @@
+"""Derivatives are as exact as motions: where these are at rest, straight or symmetric, their steps fit the derivatives all the same."""
+
+import jax
+import jax.numpy as jnp
+import mpmath
+import numpy as np
+import pytest
+
+import jaxlag as jl
+
+TS = np.array([0.0, 20.0])
+DRIVEN = jl.System(lambda q, qdot, c: 0.5 * qdot**2 - 0.5 * c * q**2, force=lambda t, A: A * jnp.sin(3 * t))
+BY_AMPLITUDE = (np.sin(60.0) - 1.5 * np.sin(40.0)) / (4 - 9)  # of q(20), c = 4, from rest
+
+
+def driven(A, unit=1.0, **how):
+    return jl.simulate(DRIVEN, 0.0, 0.0, TS * unit, {"c": 4.0 / unit**2, "A": A} if unit == 1.0 else {"c": 4.0, "A": A}, **how).q[-1]
+
+
+@pytest.mark.parametrize("derivative", [jax.jacfwd, jax.jacrev])
+@pytest.mark.parametrize("A", [0.0, 1e-12, 1.0])
+def test_an_amplitude_at_rest(derivative, A):
+    """−3e11 before, at A = 0."""
+    np.testing.assert_allclose(derivative(driven)(A), BY_AMPLITUDE, rtol=1e-6)
+
+
+def test_an_amplitude_at_rest_in_a_batch():
+    many = lambda A: jl.simulate_many(DRIVEN, 0.0, 0.0, TS, {"c": 4.0, "A": A}, over=("A",)).q[:, -1]
+    found = jax.jacfwd(many)(jnp.array([0.0, 1.0, 0.0]))
+    np.testing.assert_allclose(found, BY_AMPLITUDE * np.eye(3), atol=1e-6)
+
+
+def test_an_amplitude_is_fitted_from_zero():
+    ts = np.linspace(0, 20, 101)
+    exact = 0.7 * (np.sin(3 * ts) - 1.5 * np.sin(2 * ts)) / (4 - 9)
+    record = jl.Experiment(
+        ts, {"q": exact + 1e-3 * np.random.default_rng(1).normal(size=101)}, 0.0, 0.0, observe=lambda q: {"q": q}, sigma=1e-3
+    )
+    fit = jl.fit(DRIVEN, record, {"c": 4.0, "A": 0.0}, free=("A",))
+    sigma = 1e-3 / np.sqrt(np.sum((exact / 0.7) ** 2))
+    np.testing.assert_allclose(fit.params["A"], 0.7, atol=4 * sigma)
+    np.testing.assert_allclose(fit.standard_errors["A"], sigma, rtol=0.05)
+
+
+def test_many_amplitudes_at_rest_in_reverse():
+    """120 numbers are differentiated in reverse, whose steps fit a direction at random."""
+    w = np.arange(1, 121) / 10 + 0.05
+    system = jl.System(lambda q, qdot: 0.5 * qdot**2 - 2 * q**2, force=lambda t, A: jnp.sum(A * jnp.sin(jnp.asarray(w) * t)))
+    last = lambda A: jl.simulate(system, 0.0, 0.0, TS, {"A": A}).q[-1]
+    exact = (np.sin(w * 20) - w / 2 * np.sin(40.0)) / (4 - w**2)
+    found = jax.grad(last)(jnp.zeros(120))
+    np.testing.assert_allclose(found, exact, atol=1e-6 * np.max(np.abs(exact)))
+    np.testing.assert_allclose(jax.jvp(last, (jnp.zeros(120),), (jnp.ones(120),))[1], exact.sum(), rtol=1e-6)
+
+
+def test_an_inverted_pendulum_at_rest():
+    """dq(20)/dq₀ = cosh 20: half of it before."""
+    system = jl.System(lambda q, qdot: 0.5 * qdot**2 + 0.5 * q**2)
+    slope = jax.jacfwd(lambda q0: jl.simulate(system, q0, 0.0, TS).q[-1])(0.0)
+    np.testing.assert_allclose(slope, np.cosh(20.0), rtol=1e-6)
+
+
+def test_a_stiffness_of_zero():
+    """½q̇² − c (1 − cos 3q), v₀ = 1: dq/dc at c = 0 is −3 ∫ (T − t) sin 3t dt; −177 before."""
+    system = jl.System(lambda q, qdot, c: 0.5 * qdot**2 - c * (1 - jnp.cos(3 * q)))
+    slope = jax.grad(lambda c: jl.simulate(system, 0.0, 1.0, np.array([0.0, 10.0]), {"c": c}).q[-1])(0.0)
+    np.testing.assert_allclose(slope, -3 * float(mpmath.quad(lambda t: (10 - t) * mpmath.sin(3 * t), np.linspace(0, 10, 11))), rtol=1e-6)
+
+
+def test_a_hanging_rod():
+    """A rod pendulum in x, y, driven from rest: linear in A, with ω² = g/l."""
+    system = jl.System(
+        lambda q, qdot: 0.5 * qdot @ qdot - 9.81 * q[1],
+        holonomic={"rod": lambda q: q @ q - 1},
+        force=lambda t, A: jnp.stack([A * jnp.sin(3 * t), 0 * t]),
+    )
+    x = lambda A: jl.simulate(system, jnp.array([0.0, -1.0]), jnp.zeros(2), TS, {"A": A}).q[-1, 0]
+    w = np.sqrt(9.81)
+    exact = (np.sin(60.0) - 3 / w * np.sin(w * 20)) / (w**2 - 9)
+    for derivative in (jax.jacfwd, jax.jacrev):
+        np.testing.assert_allclose(derivative(x)(0.0), exact, rtol=1e-5)
+
+
+def test_a_slider_that_an_amplitude_breaks_away():
+    """Dry friction, then sliding: dq/dF of ½(t − t₀)² (t₀ = F) type motions, where the start is at rest."""
+    system = jl.System(lambda q, qdot: 0.5 * qdot**2, dissipation=lambda qdot, F: F * jnp.abs(qdot), force=lambda t: t)
+    last = lambda F: jl.simulate(system, 0.0, 0.0, np.array([0.0, 2.0]), {"F": F}).q[-1]
+    np.testing.assert_allclose(last(0.7), (2 - 0.7) ** 3 / 6, rtol=1e-8)
+    np.testing.assert_allclose(jax.grad(last)(0.7), -((2 - 0.7) ** 2) / 2, rtol=1e-6)
+
+
+@pytest.mark.slow
+def test_slip_that_begins_in_a_plane():
+    """Behind it the direction follows the load at a rate of 1/|v|. Numbers of SciPy (Radau from a series, differences of fourth order);
+    where no step resolves the derivative it is infinite, and no wrong number (−1.6e17 before).
+    """
+    system = jl.System(
+        lambda q, qdot: 0.5 * qdot @ qdot,
+        dissipation=lambda qdot, F: F * jl.dissipation.speed(qdot),
+        force=lambda t, b: jnp.stack([t, b * t**2]),
+    )
+    last = lambda b, F: jl.simulate(system, jnp.zeros(2), jnp.zeros(2), np.array([0.0, 2.0]), {"b": b, "F": F}).q[-1]
+    np.testing.assert_allclose(last(1.0, 1.0), [0.38173203, 0.56411349], rtol=1e-7)
+    np.testing.assert_allclose(jax.jacfwd(last, 1)(1.0, 1.0), [-0.46354488, -0.56886836], rtol=2e-5)
+    assert np.all(np.isinf(jax.jacfwd(last)(0.0, 1.0)))
+
+
+def test_a_direction_of_rounding_alone_costs_few_steps():
+    """The mass of a wheel that does not turn, beside a start that matters."""
+    system = jl.System(
+        lambda q, qdot, m, J: 0.5 * m * qdot[0] ** 2 + 0.5 * J * qdot[1] ** 2 - 2 * q[0] ** 2 - q[1] * (jnp.sqrt(J) ** 2 - J)
+    )
+
+    def last(m, J):
+        motion = jl.simulate(system, jnp.array([1.0, 0.0]), jnp.zeros(2), TS, {"m": m, "J": J})
+        return motion.q[-1, 0], motion.stats["num_steps"]
+
+    (slope, of_wheel), steps = jax.grad(last, (0, 1), has_aux=True)(1.0, 0.3)
+    np.testing.assert_allclose(slope, 20 * np.sin(40.0), rtol=1e-6)  # q = cos(2t/√m)
+    assert of_wheel == 0 and steps < 200
