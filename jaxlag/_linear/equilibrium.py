@@ -11,7 +11,7 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, PyTree
 
 from .._model.numbers import number
-from .._model.paths import entry_names, is_within
+from .._model.paths import entry_names, is_within, listed
 from .._model.state_values import given_states
 from .._model.system import System
 from .._model.validation import coordinates, parameters, state, without_contacts
@@ -171,9 +171,7 @@ def steady(
 
 def _entries(q, names, label):
     """The numbers of q that the names stand for."""
-    if isinstance(names, str):
-        raise ValueError(f"`{label}` must be a list of names, but is the string {names!r}. Write `{label}=[{names!r}]`.")
-    entries = entry_names(q, "q")
+    names, entries = listed(names, label), entry_names(q, "q")
     for name in names:
         if not any(is_within(entry, name) for entry in entries):
             raise ValueError(f"`{label}` must name coordinates, but holds {name!r}. The coordinates are {', '.join(entries)}.")

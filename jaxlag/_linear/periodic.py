@@ -13,7 +13,7 @@ from jaxtyping import Array, Complex, Float, PyTree
 from .._mechanics.friction_treatment import Regularised, StickSlip
 from .._model.event import Event, Every
 from .._model.numbers import number
-from .._model.paths import entry_names, is_within
+from .._model.paths import entry_names, is_within, listed
 from .._model.state_values import given_states, start_values
 from .._model.system import System
 from .._model.validation import parameters, state
@@ -175,8 +175,7 @@ def _given(section, longest, t, dtype):
 def _returning(system, q, states, cyclic):
     """Which numbers of the state return."""
     entries, beside = entry_names(q, "q"), len(ravel_pytree(states)[0])
-    if isinstance(cyclic, str):
-        raise ValueError(f"`cyclic` must be a list of names, but is the string {cyclic!r}. Write `cyclic=[{cyclic!r}]`.")
+    cyclic = listed(cyclic, "cyclic")
     for name in cyclic:
         if not any(is_within(entry, name) for entry in entries):
             raise ValueError(f"`cyclic` must name coordinates, but holds {name!r}. The coordinates are {', '.join(entries)}.")
