@@ -1,7 +1,8 @@
 """Branches of eigenvalues followed over a parameter, and where they cross the imaginary axis."""
 
+import functools
 import itertools
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
@@ -70,6 +71,7 @@ def _unit(vectors):
 
 def followed(spectrum_at: Callable[[float], Spectrum], values: np.ndarray) -> tuple[list[Spectrum], list[Transition]]:
     """The spectra at the values, their branches in one order, and the transitions in between."""
+    spectrum_at = functools.cache(spectrum_at)
     first, *others = finer(values)
     spectra = [spectrum_at(first)]
     transitions: list[Transition] = []
@@ -79,22 +81,26 @@ def followed(spectrum_at: Callable[[float], Spectrum], values: np.ndarray) -> tu
     return spectra[::FINER], transitions
 
 
-def _transitions(spectrum_at: Callable, before: Spectrum, after: Spectrum) -> Iterator[Transition]:
-    """Between two spectra, one after the other: each where the number of growing eigenvalues changes.
+def _transitions(spectrum_at: Callable, before: Spectrum, after: Spectrum) -> list[Transition]:
+    """Those of all branches between two spectra, in their order; of a pair once.
 
     With bounds of rounding for each branch that are those of both ends at least: in between they flicker, and would be crossed twice.
     """
     bound = np.maximum(before.rounding_of_pairs, after.rounding_of_pairs)
-    count = lambda spectrum: np.sum(spectrum.growing(bound))
-    ends = before.at, after.at
-    while count(before) != count(after):
-        low, high = before, after
-        while (middle := (low.at + high.at) / 2) not in (low.at, high.at):
-            between = continued(low, spectrum_at(middle))
-            low, high = (between, high) if count(between) == count(before) else (low, between)
-        grows = bool(count(high) > count(low))
-        growing, other = (high, low) if grows else (low, high)
-        crosses = growing.growing(bound) & ~other.growing(bound) & (growing.values.imag >= -bound)
-        for which in np.flatnonzero(crosses):
-            yield Transition(high.at, int(which), grows, growing, max(ends, key=lambda end: abs(end - high.at)))
-        before = high
+    changed = np.flatnonzero(before.growing(bound) != after.growing(bound))
+    found = [_transition(spectrum_at, before, after, bound, int(which)) for which in changed]
+    return sorted((of for of in found if of is not None and of.eigenvalue.imag >= -bound[of.which]), key=lambda of: of.at)
+
+
+def _transition(spectrum_at: Callable, before: Spectrum, after: Spectrum, bound: np.ndarray, which: int) -> Transition | None:
+    """Where one branch begins or ceases to grow, by bisection along it; None where it was mistaken for another at the far end."""
+    grows = lambda spectrum: bool(spectrum.growing(bound)[which])
+    low, high = before, after
+    while (middle := (low.at + high.at) / 2) not in (low.at, high.at):
+        between = continued(low, spectrum_at(middle))
+        low, high = (between, high) if grows(between) == grows(before) else (low, between)
+    high = continued(low, high)
+    if grows(high) == grows(before):
+        return None
+    far = max(before.at, after.at, key=lambda end: abs(end - high.at))
+    return Transition(high.at, which, grows(high), high if grows(high) else low, far)

@@ -11,7 +11,7 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, PyTree
 
 from .._model.numbers import number
-from .._model.paths import entry_names, is_within
+from .._model.paths import entry_names, is_within, listed
 from .._model.state_values import given_states
 from .._model.system import System
 from .._model.validation import coordinates, parameters, state, without_contacts
@@ -136,13 +136,14 @@ def steady(
 
     $$ f(q, \dot q, \lambda) + G^T\lambda = 0, \qquad \ddot q = 0, \qquad g(q) = 0, \qquad \psi(q, \dot q) = 0 $$
 
-    A spinning top, a governor, a rolling wheel. Coordinates run whose velocity in the guess `qdot` is not zero; nothing may depend on them
-    but by their velocities. Where more is unknown than the equations say, as the speed of a governor, the nearest to the guess is taken.
+    A spinning top, a governor, a rolling wheel. Coordinates run whose velocity in `qdot` is not zero; nothing may depend on them but by
+    their velocities, and by t where a motor drives them. Velocities that the equations leave open stay as given, as the speed of a
+    governor; others are a guess, as that of a body that falls through air.
 
-    **Arguments:** as `equilibrium`, and `qdot`, a guess of the velocities; `fixed_rates`: names of coordinates whose velocity stays as
-    given. Any consistent units.
+    **Arguments:** as `equilibrium`, and `qdot`, the velocities; `fixed_rates`: names of coordinates whose velocity is no guess. Any
+    consistent units.
 
-    **Returns:** an `Equilibrium`, with its `qdot`. Differentiable in `params` and in what is fixed.
+    **Returns:** an `Equilibrium`, with its `qdot`. Differentiable in `params` and in what stays as given.
 
     **Raises:** `ValueError` where no steady motion was found, or what was found does not stay as it is.
 
@@ -170,9 +171,7 @@ def steady(
 
 def _entries(q, names, label):
     """The numbers of q that the names stand for."""
-    if isinstance(names, str):
-        raise ValueError(f"`{label}` must be a list of names, but is the string {names!r}. Write `{label}=[{names!r}]`.")
-    entries = entry_names(q, "q")
+    names, entries = listed(names, label), entry_names(q, "q")
     for name in names:
         if not any(is_within(entry, name) for entry in entries):
             raise ValueError(f"`{label}` must name coordinates, but holds {name!r}. The coordinates are {', '.join(entries)}.")

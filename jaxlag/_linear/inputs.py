@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Array, Float, PyTree
 
 from .._model.flat import Flat, rows_by_name
-from .._model.paths import entry_names, is_within, labels, leaf_names
+from .._model.paths import entry_names, is_within, labels, leaf_names, listed
 from .._model.signal import is_signal
 from .._model.states import Flowing
 
@@ -28,9 +28,7 @@ class Input(NamedTuple):
 
 def find_inputs(names: Sequence[str], params: PyTree, q: PyTree, flat: Flat, sampled: PyTree) -> tuple[Input, ...]:
     """What the names stand for, one for each number."""
-    if isinstance(names, str):
-        raise ValueError(f"`inputs` must be a list of names, but is the string {names!r}. Write `inputs=({names!r},)`.")
-    known = list(_candidates(params, q, flat, sampled))
+    names, known = listed(names, "inputs"), list(_candidates(params, q, flat, sampled))
     found: list[Input] = []
     for name in names:
         meant = [entry for entry in known if is_within(entry.name, name)]

@@ -169,11 +169,13 @@ class LinearSystem(eqx.Module):
         return zeros(A, B, C, D[0])
 
     def discrete(self, sample_time: Any) -> "LinearSystem":
-        """The same in discrete time, with inputs held over each `sample_time`, exactly."""
+        """The same in discrete time, with inputs held over each `sample_time`, exactly; of many systems each."""
         if self.sample_time is not None:
             raise ValueError("`discrete` must start from continuous time, but this system is in discrete time already. Linearise it anew.")
         self._refuse_rates("`discrete`")
         T = number(sample_time, "`sample_time`", self.A.dtype, positive=True, cure="Give the time between two samples.")
+        if self.A.ndim > 2:
+            return jax.vmap(lambda system: system.discrete(T))(self)
         A, B = held(self.A, self.B, T)
         return eqx.tree_at(lambda s: (s.A, s.B, s.sample_time), self, (A, B, T), is_leaf=lambda x: x is None)
 
@@ -196,12 +198,13 @@ class LinearSystem(eqx.Module):
     @property
     def _matrices(self):
         if self.A.ndim > 2:
-            raise ValueError("a response is that of one linear system, but these are many. Take one, or use `jax.vmap`.")
+            raise ValueError("a response or state space is that of one linear system, but these are many. Take one, or use `jax.vmap`.")
         return self.A, self.B, self.C, jnp.concatenate([self.D[None], self.D_rates])
 
     def _numbers(self):
+        A, B, C, D = self._matrices
         self._refuse_rates("a state space")
-        return tuple(map(np.asarray, (self.A, self.B, self.C, self.D)))
+        return tuple(map(np.asarray, (A, B, C, D[0])))
 
     def _refuse_rates(self, what):
         if is_concrete(self.D_rates) and np.any(np.asarray(self.D_rates)):

@@ -13,7 +13,7 @@ from .._mechanics.consistent_state import consistent_state
 from .._model.flat import Flat, StatesAt, bind
 from .._model.injection import check_function
 from .._model.numbers import number
-from .._model.paths import entry_names, is_within
+from .._model.paths import entry_names, is_within, listed
 from .._model.state_values import Layout, given_states, of_first_order, sampled, start_values
 from .._model.system import System
 from .._model.validation import coordinates, parameters, state, without_contacts
@@ -159,7 +159,9 @@ class _Near:
         rows, _, off = jax.tree.map(np.asarray, constraint_slopes(self.system, *values))
         if not off <= np.sqrt(np.finfo(rows.dtype).eps):
             raise ValueError(f"`q` and `qdot` must satisfy the constraints, but are off by {off:.2g} of their size. {CURE}")
-        return partition(rows, positions.shape[0], [i for name in independent or () for i in self._entries_within(name)])
+        return partition(
+            rows, positions.shape[0], [i for name in listed(independent or (), "independent") for i in self._entries_within(name)]
+        )
 
     def _entries_within(self, name):
         found = [i for i, entry in enumerate(self.entries) if is_within(entry, name)]

@@ -69,7 +69,10 @@ def lowest_modes(system: System, q: Any, params: PyTree = None, *, count: int = 
         raise ValueError(f"`lowest_modes` must see the numbers, but `jit` or `vmap` hides them. Call it outside, or: {CURE}")
     multipliers, matrices = _at_rest(system, known, entry_names(q, "q"))
     found = modes_near(matrices, count, shift)
-    return _described(system, given, _Slopes(system, given, multipliers, matrices, found).values(), found)
+    values = _Slopes(system, given, multipliers, matrices, found).values()
+    x, mu = np.split(found.vectors, [matrices.n])
+    mu = matrices.shared(mu.real) + 1j * matrices.shared(mu.imag)
+    return _described(system, given, values, found._replace(vectors=np.concatenate([x, mu])))
 
 
 def _refuse(system: System) -> None:
@@ -88,7 +91,7 @@ def _at_rest(system: System, known: tuple, names: tuple[str, ...]) -> tuple[np.n
     if not np.all(np.isfinite(loose.pencil.left)):
         raise ValueError("`q` must be a state at which all forces are finite, but is not. `examine` says which are not.")
     f = -np.asarray(loose.pencil.left, float)[:, None]
-    multipliers = loose.nearest(f[:n], 0 * f[n:])[n:, 0].astype(dtype)
+    multipliers = loose.shared(loose.nearest(f[:n], 0 * f[n:])[n:, 0]).astype(dtype)
     matrices = of(multipliers) if len(multipliers) else loose
     left, flat = np.asarray(matrices.pencil.left), np.concatenate([*(np.ravel(x) for x in jax.tree.leaves(known[1])), multipliers])
     allowed = np.finfo(dtype).eps ** STILL * (abs(matrices.K) @ (1 + np.abs(flat)))

@@ -14,7 +14,6 @@ from .._mechanics.constraint_residuals import off_constraints
 from .._mechanics.contact import in_current_mode
 from .._mechanics.lagrange import applied_force, constraint_rows, inertia
 from .._mechanics.massless import first_order, with_masses
-from .._mechanics.pseudo_inverse import CLEAR
 from .._mechanics.saddle_point import augmented
 from .._model.flat import StatesAt
 from .._model.state_values import start_values
@@ -142,7 +141,7 @@ def _slopes(
     change = -jnp.linalg.solve(saddle, jnp.concatenate([E, c[held]]))
     qddot, multipliers = change[:n], jnp.zeros((rows, d + 3 * m), M.dtype).at[held].set(change[n:])
     if redundant:  # the λ of least norm is G times something: what the selected rows lack of it
-        in_range = G @ jnp.linalg.pinv(G, rtol=jnp.finfo(G.dtype).eps ** CLEAR)
+        in_range = _onto_range(G, held)
         multipliers = in_range @ multipliers + spread[:, : d + 3 * m] - in_range @ spread[:, : d + 3 * m]
 
     def followed(J):
@@ -152,6 +151,16 @@ def _slopes(
 
     of = lambda J: ByInputs(J[:, :d], jnp.moveaxis(J[:, d:].reshape(len(J), 3, m), 1, 0))
     return [of(x) for x in (qddot, multipliers, followed(slope.z), followed(slope.outputs), followed(slope.updates))], M, found
+
+
+def _onto_range(G: Float[Array, "m n"], held: np.ndarray) -> Float[Array, "m m"]:
+    """The projection on what G reaches, by what its rows `held` reach: G = T G_held, whatever the units of the rows."""
+    size = jnp.linalg.norm(G, axis=1, keepdims=True)
+    size = jnp.where(size > 0, size, 1)
+    unit = G / size
+    T = size * (unit @ jnp.linalg.pinv(unit[held])) / size[held].T
+    Q, _ = jnp.linalg.qr(T / jnp.linalg.norm(T, axis=0, keepdims=True))
+    return Q @ Q.T
 
 
 def _slopes_of_solution(

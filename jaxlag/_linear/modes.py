@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Complex, Float, PyTree
 
 from .._program.jit import compiled, is_concrete
-from .eigenvalues import are_repeated, eigen, rounding, symmetric_eigen
+from .eigenvalues import are_repeated, balanced, eigen, rounding, symmetric_eigen
 from .not_differentiated import without_derivative
 from .origin import Origin
 
@@ -34,7 +34,8 @@ class Modes(eqx.Module):
 
     $$ \delta q = \mathrm{Re}\,(\hat q\,e^{\lambda t}), \qquad \omega_0 = |\lambda|, \qquad \zeta = -\mathrm{Re}\,\lambda/|\lambda| $$
 
-    - `eigenvalues`: λ, in 1/time; those of rigid bodies and of coordinates on which nothing depends are exactly 0.
+    - `eigenvalues`: λ, in 1/time; those of rigid bodies and of coordinates on which nothing depends are exactly 0, one for
+      each independent shape.
     - `angular_frequency`: ω₀ in rad/time; `frequency`: ω₀/2π; both of the undamped oscillation, and of a real λ its size.
     - `damping_ratio`: ζ; 1 and more of what does not oscillate, negative of what grows. `time_constant`: 1/|Re λ|.
     - `stable`: whether it does not grow. `repeated`: whether another mode has the same eigenvalue: of these shapes any combination is
@@ -144,22 +145,49 @@ def of_second_order(system: SecondOrder) -> Found:
 
 
 def of_first_order(A: Float[Array, "d d"], sample_time: Any) -> Found:
-    """Eigenvalues of A, of a conjugate pair the upper one where Python may look at them."""
+    """Eigenvalues of A, where Python may look at them: of a conjugate pair the upper one, and of zeros one for each of `at_rest`."""
     found = _of_first_order(A, sample_time)
     values = jax.lax.stop_gradient(found.values)
     if not is_concrete(values):
         return found
-    upper = np.flatnonzero(np.asarray(values).imag >= 0)
-    return Found(found.values[upper], found.vectors[:, upper], found.stable[upper], found.repeated[upper])
+    values = np.asarray(values)
+    still, moving = np.flatnonzero(values == 0), np.flatnonzero((values != 0) & (values.imag >= 0))
+    shapes = at_rest(A if sample_time is None else A - jnp.eye(len(A), dtype=A.dtype), still.size)
+    still = still[: shapes.shape[1]]
+    chosen = np.concatenate([still, moving])
+    vectors = jnp.concatenate([shapes.astype(found.vectors.dtype), found.vectors[:, moving]], axis=1)
+    repeated = jnp.concatenate([jnp.full(still.size, still.size > 1), found.repeated[moving]])
+    return Found(found.values[chosen], vectors, found.stable[chosen], repeated)
+
+
+def at_rest(A: Float[Array, "d d"], zeros: int) -> Float[Array, "d k"]:
+    """A basis of the states that stay where they are put, A N = 0, of which there may be fewer than A has zeros as eigenvalues: a body
+    that moves freely has two, a place and a speed, and one state at rest. Each is 1 at an entry at which the others are 0.
+
+    N solves A N + W s = 0, P N = 1, with P these entries and W that which A does not reach, and is differentiated as that does.
+    """
+    import scipy.linalg  # imported here because that takes a while
+
+    fixed = jax.lax.stop_gradient(A)
+    scale, _ = balanced(fixed)
+    left, sizes, right = np.linalg.svd(np.asarray(fixed * scale[None, :] / scale[:, None]))
+    dust = 100 * len(A) * np.finfo(sizes.dtype).eps * np.max(sizes, initial=0.0)
+    k = min(max(int(np.sum(sizes <= dust)), 1), zeros)
+    if not k:
+        return jnp.zeros((len(A), 0), A.dtype)
+    _, _, order = scipy.linalg.qr(right[len(A) - k :], pivoting=True)
+    entries = np.eye(len(A), dtype=A.dtype)[order[:k]]
+    bordered = jnp.block([[A * scale[None, :] / scale[:, None], left[:, len(A) - k :]], [entries, np.zeros((k, k), A.dtype)]])
+    N = jnp.linalg.solve(bordered, np.eye(len(A) + k, k, -len(A), dtype=A.dtype))[: len(A)]
+    return scale[:, None] * N / scale[order[:k]][None, :]
 
 
 def undamped(found: Found) -> Found:
     """Of the modes of first order of an undamped system those that `of_second_order` finds, in its order, by positions alone: of ±ω the
-    growing one, of two zeros one.
+    growing one.
     """
     values = np.asarray(jax.lax.stop_gradient(found.values))
-    still = np.flatnonzero(values == 0)
-    chosen = np.sort(np.concatenate([still[: len(still) // 2], np.flatnonzero((values.imag > 0) | (values.real > 0))]))
+    chosen = np.flatnonzero((values == 0) | (values.imag > 0) | (values.real > 0))
     positions = found.vectors[: len(found.vectors) // 2]
     return Found(found.values[chosen], positions[:, chosen], found.stable[chosen], found.repeated[chosen])
 
@@ -184,6 +212,7 @@ def _of_first_order(A, sample_time):
     again = jnp.sum(are_repeated(values, bound), axis=1) > 1
     if sample_time is not None:
         there = values != 0
+        values = jnp.where(jnp.abs(values - 1) <= bound, 1 + values - jax.lax.stop_gradient(values), values)  # what stays where it is put
         values = jnp.where(there, jnp.log(jnp.where(there, values, 1)) / sample_time, -jnp.inf)
         bound = bound / sample_time
         order = jnp.argsort(jnp.abs(values), stable=True)

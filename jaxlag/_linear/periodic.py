@@ -13,7 +13,7 @@ from jaxtyping import Array, Complex, Float, PyTree
 from .._mechanics.friction_treatment import Regularised, StickSlip
 from .._model.event import Event, Every
 from .._model.numbers import number
-from .._model.paths import entry_names, is_within
+from .._model.paths import entry_names, is_within, listed
 from .._model.state_values import given_states, start_values
 from .._model.system import System
 from .._model.validation import parameters, state
@@ -36,7 +36,7 @@ class PeriodicOrbit(eqx.Module):
     - `multipliers`: the Floquet multipliers, eigenvalues of the derivative of the return map by all of its state that returns, the largest
       first: a small deviation is multiplied by them in a period. Deviations along the motion and off the constraints do not last: 0.
     - `is_stable`: whether all of them are less than 1 in absolute value.
-    - `t`, `params`, `system`: the time at the section, and what was given.
+    - `t`, `params`, `system`: the time at the section, and what was given; `setting` and `tolerances`, with which it was computed.
     """
 
     q: PyTree
@@ -47,7 +47,9 @@ class PeriodicOrbit(eqx.Module):
     multipliers: Complex[Array, " k"]
     t: Float[Array | np.ndarray, ""]
     params: PyTree
+    tolerances: PyTree
     system: System = eqx.field(static=True)
+    setting: Setting = eqx.field(static=True)
 
     @property
     def is_stable(self) -> Any:
@@ -55,9 +57,10 @@ class PeriodicOrbit(eqx.Module):
         return jnp.all(jnp.abs(self.multipliers) < 1)
 
     def motion(self, samples: int = 201, **settings: Any) -> Trajectory:
-        """One period of it at some `samples`, as `simulate` gives it with these `settings`."""
-        ts = self.t + self.period * jnp.linspace(0, 1, samples)
-        return simulate(self.system, self.q, self.qdot, ts, self.params, states=self.states, **settings)
+        """One period of it at some `samples`, from `simulate`: computed as the orbit was, but for `settings`."""
+        ts, (rtol, atol) = self.t + self.period * jnp.linspace(0, 1, samples), self.tolerances
+        given = self.setting.of_motions() | {"rtol": rtol, "atol": atol} | settings
+        return simulate(self.system, self.q, self.qdot, ts, self.params, states=self.states, **given)
 
     def __repr__(self) -> str:
         if not is_concrete((self.q, self.period, self.multipliers)):
@@ -150,7 +153,8 @@ def periodic(
     returns = np.isin(np.arange(entries.size), setting.returning)
     shown = found.start, found.period, unravel(jnp.where(returns, 0, entries)), found.multipliers
     start, period, drift, multipliers = jax.tree.map(lambda x: jnp.where(is_one, x, jnp.nan), shown)
-    return PeriodicOrbit(start["q"], start["qdot"], start["states"], period, drift, multipliers, t, params, system)
+    more = multipliers, t, params, jax.tree.map(jnp.asarray, (rtol, atol)), system, setting
+    return PeriodicOrbit(start["q"], start["qdot"], start["states"], period, drift, *more)
 
 
 def _given(section, longest, t, dtype):
@@ -172,8 +176,7 @@ def _given(section, longest, t, dtype):
 def _returning(system, q, states, cyclic):
     """Which numbers of the state return."""
     entries, beside = entry_names(q, "q"), len(ravel_pytree(states)[0])
-    if isinstance(cyclic, str):
-        raise ValueError(f"`cyclic` must be a list of names, but is the string {cyclic!r}. Write `cyclic=[{cyclic!r}]`.")
+    cyclic = listed(cyclic, "cyclic")
     for name in cyclic:
         if not any(is_within(entry, name) for entry in entries):
             raise ValueError(f"`cyclic` must name coordinates, but holds {name!r}. The coordinates are {', '.join(entries)}.")

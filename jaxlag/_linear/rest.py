@@ -11,6 +11,7 @@ from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from .._mechanics.friction_elements import FrictionElements, find_elements
 from .._mechanics.lagrange import applied_force, constraint_rows, inertia
+from .._mechanics.pseudo_inverse import FOLLOWS, SEEN
 from .._mechanics.stick_slip import in_mode, slip_of, sticking
 from .._model.flat import Flat, StatesAt, bind
 from .._model.state_values import Layout, start_values
@@ -80,12 +81,13 @@ class Unknowns(NamedTuple):
 
 
 class Given(NamedTuple):
-    """On what a steady state depends."""
+    """On what a steady state depends; `open`: of the velocities that run, those that stay as given."""
 
     numbers: PyTree  # of params
     t: Float[Array | np.ndarray, ""]
     q: Float[Array, " n"]
     v: Float[Array, " n"]
+    open: Bool[Array, " b"]
 
 
 class Equations:
@@ -115,7 +117,8 @@ class Equations:
         rates = ravel_pytree(flat.state_rates(given.t, q, v))[0]
         values, updates = self.unravel_states(of.states), flat.updates(given.t, q, v)
         changes = ravel_pytree([jax.tree.map(jnp.subtract, new, values[name]) for name, new in updates.items()])[0]
-        return jnp.concatenate([self.force(flat, given, q, v, of), g, psi, rates, changes]).astype(w.dtype)
+        kept = jnp.where(given.open, of.v - given.v[self.running], 0)
+        return jnp.concatenate([self.force(flat, given, q, v, of), g, psi, rates, changes, kept]).astype(w.dtype)
 
     def force(self, flat: Flat, given: Given, q: Array, v: Array, of: Unknowns) -> Float[Array, " n"]:
         """f + Gᵀλ with dry friction where it slips; where it does not, without it, or with what it would have to hold."""
@@ -131,12 +134,28 @@ class Equations:
         return inertia(flat, t, q, v)[1] + applied_force(flat, t, q, v, of.multipliers) + G.T @ of.multipliers + held
 
 
+def left_open(J: Float[Array, "r u"], which: np.ndarray) -> Bool[Array, " b"]:
+    """Which of these unknowns, one after the other, can have any value: J x = 0 then has a solution in which it changes and those before it
+    that are open do not. In units in which rows and columns of J are of one size.
+    """
+    eps = jnp.finfo(J.dtype).eps
+    for axis in (1, 0, 1, 0):
+        size = jnp.max(jnp.abs(J), axis=axis, keepdims=True, initial=0.0)
+        J = J / jnp.where(size > 0, size, 1)
+    P = jnp.eye(J.shape[1], dtype=J.dtype) - jnp.linalg.pinv(J, rtol=eps**SEEN) @ J  # on the solutions of J x = 0
+    found = []
+    for i in which:
+        found.append(P[i, i] > eps**FOLLOWS)
+        P = P - jnp.where(found[-1], jnp.outer(P[:, i], P[i]) / jnp.where(found[-1], P[i, i], 1), 0)
+    return jnp.stack(found)
+
+
 @compiled
 def steady_state(search: Search, system: System, t: Any, q: PyTree, qdot: PyTree, params: PyTree, states: PyTree) -> Rest:
     """The steady state near a guess."""
     flat, t, q0, v0 = checked(system, t, q, qdot, params, states)
     values = start_values(system, states, t, q, qdot, params)
-    given = Given(eqx.filter(params, eqx.is_array), t, q0, v0)
+    given = Given(eqx.filter(params, eqx.is_array), t, q0, v0, jnp.zeros(len(search.running), bool))
     equations = Equations(search, system, q, params, values, given, flat)
     start = jax.lax.stop_gradient(q0)
     if search.stable:
@@ -146,7 +165,11 @@ def steady_state(search: Search, system: System, t: Any, q: PyTree, qdot: PyTree
     f, (_, G, _) = equations.force(flat, given, start, v0, of), constraint_rows(flat, t, start, v0)
     of = of._replace(multipliers=least_change(G.T, -f, 1.0) if flat.rows else of.multipliers)
     ease = jnp.ones(sum(x.size for x in of), q0.dtype).at[equations.sizes[2] :].set(1e8 if search.held else 1.0)  # q stays if it can
-    w, found = root_near(equations, given, jnp.concatenate(of), ease)
+    guess = jax.lax.stop_gradient(jnp.concatenate(of))
+    if search.running:
+        J = jax.jacfwd(equations, 1)(jax.lax.stop_gradient(given), guess)
+        given = given._replace(open=left_open(J, equations.sizes[0] + np.arange(len(search.running))))
+    w, found = root_near(equations, given, guess, ease)
     return _described(equations, given, w, found)
 
 
@@ -157,8 +180,9 @@ def _described(equations: Equations, given: Given, w: Array, found: Array) -> Re
     J, R = jax.jacfwd(equations, 1)(known, at_rest), equations(known, at_rest)
     allowed = jnp.abs(J) @ (1 + jnp.abs(at_rest)) + jnp.finfo(w.dtype).tiny
     step = 0.1 * (1 + jnp.max(jnp.abs(q))) / jnp.maximum(jnp.max(jnp.abs(v)), jnp.finfo(w.dtype).tiny ** 0.5)
+    step = jnp.where(jnp.any(v != 0), step, 0)  # what drives a motion runs with it; at rest, t is the time at which forces are taken
     later = at_rest.at[: equations.moving.size].add(jax.lax.stop_gradient(step * v)[equations.moving])
-    uniform = is_root(J, equations(known._replace(q=known.q + step * known.v), later), at_rest)
+    uniform = is_root(J, equations(known._replace(t=known.t + step, q=known.q + step * known.v), later), at_rest)
     in_terms_of_q = lambda q: equations(known._replace(q=q), at_rest.at[: equations.moving.size].set(q[equations.moving]))
     multipliers = of.multipliers
     if flat.rows:  # of dependent rows, those of least norm
@@ -208,7 +232,7 @@ def _friction(
 
 def directions_of_slip(elements: FrictionElements, given: Given) -> Float[Array, " r"]:
     """Of the rows of each element that slips in the guess, as on a belt that runs; 0 of what rests there."""
-    _, t, q, v = jax.lax.stop_gradient(given)
+    _, t, q, v, _ = jax.lax.stop_gradient(given)
     slip = elements.slip(t, q, v)
     size = elements.norms(slip)
     at_rest = size <= slip_of(elements, t, q, v, 1e2 * jnp.finfo(v.dtype).eps * jnp.abs(v))

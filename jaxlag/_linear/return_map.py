@@ -33,6 +33,10 @@ class Setting(NamedTuple):
     solver: Any  # of diffrax, or None
     max_steps: int
 
+    def of_motions(self) -> dict[str, Any]:
+        """The arguments of `simulate` among them."""
+        return {"friction": self.friction, "solver": self.solver, "max_steps": self.max_steps}
+
 
 class Given(NamedTuple):
     """The numbers from which the search starts."""
@@ -137,10 +141,9 @@ def _motion(system, setting, given, start, t, longest):
     events = dict(system.events)
     if isinstance(setting.section, Event):
         events[SECTION] = setting.section
-    of = dict(friction=setting.friction, solver=setting.solver, max_steps=setting.max_steps, events=events, throw=False)
-    rtol, atol = given.tolerances
+    of = dict(events=events, rtol=given.tolerances[0], atol=given.tolerances[1], throw=False)
     times = jnp.stack([t, t + longest])
-    return simulate(system, start["q"], start["qdot"], times, given.params, states=start["states"], rtol=rtol, atol=atol, **of)
+    return simulate(system, start["q"], start["qdot"], times, given.params, states=start["states"], **setting.of_motions(), **of)
 
 
 def _state(q, qdot, states, i):

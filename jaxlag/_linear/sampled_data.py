@@ -14,6 +14,8 @@ from .linear_system import LinearSystem
 from .matrices import ByInputs
 from .response import held
 
+ROUNDING = 4  # units in the last place, by which periods that are computed in several ways differ
+
 
 def between_updates(system: System, params: PyTree, states: PyTree, updates: ByInputs, open_loop: LinearSystem) -> LinearSystem:
     """x and the sampled states u, from just before an update to just before the next; other inputs w are held in between.
@@ -48,8 +50,11 @@ def between_updates(system: System, params: PyTree, states: PyTree, updates: ByI
 def _common_period(system: System, params: PyTree) -> Array:
     """The one period of all sampled states."""
     periods = [period(system, name, params) for name in sampled(system)]
-    if is_concrete(periods) and len({float(T) for T in periods}) > 1:
-        several = ", ".join(f"{T:g}" for T in sorted({float(T) for T in periods}))
+    if not is_concrete(periods):
+        return periods[0]
+    known = np.stack([np.asarray(T) for T in periods])
+    if np.ptp(known) > ROUNDING * np.finfo(known.dtype).eps * np.max(known):
+        several = ", ".join(str(T) for T in np.unique(known))
         raise ValueError(
             f"`system` must update its sampled states all at once to be linearised, but has periods of {several}. "
             "Name these states in `inputs` to see the system between updates."

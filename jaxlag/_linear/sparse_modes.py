@@ -18,29 +18,37 @@ from .._program.sparse_matrix import SparseMatrix
 from .pencil import CURE, Pencil
 from .sparse_descent import eigenvalues_below
 
+NOTHING = 1e-10  # of the square of a row, what is left of it where it follows from others
 EQUAL = 0.625  # exponent of eps: values that differ by less, in parts of their size, are one
 BESIDE = 4  # modes that are sought beside those asked for
 ATTEMPTS = 12  # to find the lowest modes, where some lie far below what is sought
 
 
 class Matrices(NamedTuple):
-    """A `Pencil`, also as matrices of SciPy, of n coordinates."""
+    """A `Pencil`, also as matrices of SciPy, of n coordinates; constraints that follow from others left out, with which a multiplier of
+    zero stands alone; and these, −G x = 0.
+    """
 
     pencil: Pencil
     K: scipy.sparse.csc_matrix
     C: scipy.sparse.csc_matrix
     M: scipy.sparse.csc_matrix
     n: int
+    left_out: np.ndarray
+    rows_left_out: scipy.sparse.csc_matrix
 
     @classmethod
     def of(cls, given: Pencil, n: int) -> "Matrices":
-        of = lambda A: scipy.sparse.csc_matrix((np.asarray(A.values, float), (A.places.rows, A.places.columns)), A.shape)
-        return cls(given, of(given.stiffness), of(given.damping), of(given.mass), n)
+        K = _scipy(given.stiffness)
+        left_out = n + following_rows(K[n:, :n])
+        if left_out.size:
+            given = _without(given, left_out)
+        return cls(given, _scipy(given.stiffness), _scipy(given.damping), _scipy(given.mass), n, left_out, K[left_out, :n].tocsc())
 
     @property
     def freedoms(self) -> int:
         """Degrees of freedom."""
-        return 2 * self.n - self.K.shape[0]
+        return 2 * self.n - self.K.shape[0] + len(self.left_out)
 
     @property
     def equal(self) -> float:
@@ -63,9 +71,55 @@ class Matrices(NamedTuple):
         from scipy.sparse.linalg import splu  # imported here because that takes a while
 
         one = scipy.sparse.diags(np.r_[np.ones(self.n), np.zeros(len(c))])
-        of_q = scipy.sparse.diags(np.r_[np.zeros(self.n), np.ones(len(c))])
+        size = np.sqrt(np.asarray(self.K[self.n :].multiply(self.K[self.n :]).sum(axis=1)).ravel())
+        of_q = scipy.sparse.diags(np.r_[np.zeros(self.n), 1 / np.where(size > 0, size, 1)])  # rows of length 1, in any unit
+        unit = np.where(np.arange(self.n + len(c)) < self.n, 1, of_q.diagonal())[:, None]
         with searching():
-            return splu((one + of_q @ self.K + self.K @ of_q).tocsc()).solve(np.concatenate([f, c]))
+            return unit * splu((one + of_q @ self.K + self.K @ of_q).tocsc()).solve(unit * np.concatenate([f, c]))
+
+    def shared(self, multipliers: Float[np.ndarray, "m *k"]) -> Float[np.ndarray, "m *k"]:  # noqa: F821
+        """Of multipliers with the same Gᵀλ those of least norm, in the range of G: what follows from others shares their load."""
+        if not self.left_out.size:
+            return multipliers
+        rows, out = self.rows_left_out.toarray(), self.left_out - self.n
+        size = np.linalg.norm(rows, axis=1, keepdims=True)
+        T = self.nearest(rows.T / np.where(size > 0, size, 1).T, np.zeros((len(multipliers), len(rows))))[self.n :].T  # of others
+        others = np.setdiff1d(np.flatnonzero(np.any(np.abs(T) > NOTHING * np.max(np.abs(T), axis=1, keepdims=True), axis=0)), out)
+        which = np.r_[others, out]
+        T = np.r_[np.eye(others.size), size * T[:, others]]
+        Q, _ = np.linalg.qr(T / np.linalg.norm(T, axis=0))
+        found = multipliers.copy()
+        found[which] = Q @ (Q.T @ multipliers[which])
+        return found
+
+
+def _scipy(A: SparseMatrix) -> scipy.sparse.csc_matrix:
+    return scipy.sparse.csc_matrix((np.asarray(A.values, float), (A.places.rows, A.places.columns)), A.shape)
+
+
+def following_rows(G: scipy.sparse.csc_matrix) -> np.ndarray:
+    """Which rows follow from others: a pivot of G Gᵀ, of rows of length 1, is the square of what those before leave of one."""
+    from scipy.sparse.linalg import splu  # imported here because that takes a while
+
+    if not G.shape[0]:
+        return np.zeros(0, int)
+    size = np.sqrt(np.asarray(G.multiply(G).sum(axis=1)).ravel())
+    unit = scipy.sparse.diags(1 / np.where(size > 0, size, 1)) @ G
+    squares = unit @ unit.T + NOTHING**1.5 * scipy.sparse.identity(len(size))  # no pivot is zero
+    factors = splu(squares.tocsc(), permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
+    return np.flatnonzero(np.abs(factors.U.diagonal())[factors.perm_c] <= NOTHING)
+
+
+def _without(given: Pencil, left_out: np.ndarray) -> Pencil:
+    """The pencil without some of the constraints: −d μ = 0 of each in its place, d as large as its row."""
+    places, values = given.stiffness.places, np.asarray(given.stiffness.values)
+    is_out = np.isin(np.arange(places.shape[0]), left_out)
+    taken = is_out[places.rows] | is_out[places.columns]
+    size = np.zeros(places.shape[0], values.dtype)
+    np.maximum.at(size, places.rows, np.abs(values))
+    on_diagonal = places.rows == places.columns
+    values = np.where(taken, np.where(on_diagonal, -np.where(size > 0, size, 1)[places.rows], 0), values)
+    return given._replace(stiffness=SparseMatrix(jnp.asarray(values), places))
 
 
 class Found(NamedTuple):
@@ -120,7 +174,7 @@ def _undamped(matrices: Matrices, count: int, shift: float) -> Found:
     else:
         raise ValueError(f"`shift` must be such that the lowest modes are found, but from {shift} lower ones are left out. Give another.")
     squares, vectors = squares[:count], vectors[:, :count]
-    _refuse_unsolved(matrices.K @ vectors - matrices.M @ vectors * squares, abs(matrices.K) @ np.abs(vectors), matrices)
+    _refuse_unsolved(matrices.K @ vectors - matrices.M @ vectors * squares, abs(matrices.K) @ np.abs(vectors), vectors, matrices)
     squares = np.where(np.abs(squares) <= matrices.equal * shift**2, 0, squares)
     with searching():
         if np.any((squares != 0) & (np.abs(squares) <= matrices.rounding)):
@@ -153,8 +207,12 @@ def _left_out(matrices: Matrices, squares: np.ndarray, count: int) -> bool:
     return is_certain and int(below) > i + 1
 
 
-def _refuse_unsolved(left: np.ndarray, terms: np.ndarray, matrices: Matrices) -> None:
-    """Raises where what is `left` of the equations of a mode is more than the rounding of their terms: of rows that follow from others."""
+def _refuse_unsolved(left: np.ndarray, terms: np.ndarray, vectors: np.ndarray, matrices: Matrices) -> None:
+    """Raises where what is `left` of the equations of a mode is more than the rounding of their terms: of rows that nearly follow from
+    others.
+    """
+    rows, x = matrices.rows_left_out, vectors[: matrices.n]
+    left, terms = np.concatenate([left, rows @ x]), np.concatenate([terms, abs(rows) @ np.abs(x)])
     with searching():
         if not np.all(np.max(np.abs(left), axis=0) <= matrices.equal * np.max(terms, axis=0)):
             raise RuntimeError("they do not solve their equations")
@@ -164,9 +222,9 @@ def _damped(matrices: Matrices, count: int, shift: float, symmetric: bool) -> Fo
     """By the linear pencil of (x, λx, μ), twice as large: A z = λ B z; from two starts, which must find the same."""
     from scipy.sparse.linalg import eigs, splu
 
-    (_, K, C, M, n), block = matrices, scipy.sparse.block_array
+    (_, K, C, M, n, *_), block = matrices, scipy.sparse.block_array
     one, rows = scipy.sparse.identity(n), K.shape[0] - n
-    blocks: Any = [[None, one, None], [-K[:n, :n], -C[:n, :n], -K[:n, n:]], [-K[n:, :n], None, None]]
+    blocks: Any = [[None, one, None], [-K[:n, :n], -C[:n, :n], -K[:n, n:]], [-K[n:, :n], None, -K[n:, n:]]]
     A: Any = block(blocks).tocsc()
     B = scipy.sparse.block_diag([one, M[:n, :n], scipy.sparse.csc_matrix((rows, rows))]).tocsc()
     of_modes, k = np.r_[:n, 2 * n : 2 * n + rows], min(2 * count + BESIDE, 2 * matrices.freedoms - 2)
@@ -184,7 +242,7 @@ def _damped(matrices: Matrices, count: int, shift: float, symmetric: bool) -> Fo
     dust = np.abs(values.real) <= matrices.equal * np.abs(values)
     values = np.where(dust, 1j * values.imag, values)
     terms = abs(K) @ np.abs(vectors) + np.abs(values) * (abs(C) @ np.abs(vectors)) + np.abs(values) ** 2 * (abs(M) @ np.abs(vectors))
-    _refuse_unsolved(K @ vectors + values * (C @ vectors) + values**2 * (M @ vectors), terms, matrices)
+    _refuse_unsolved(K @ vectors + values * (C @ vectors) + values**2 * (M @ vectors), terms, vectors, matrices)
     with searching():
         left = vectors if symmetric else np.stack([_left_vector(matrices, value, splu) for value in values], axis=1)
     size = np.einsum("ik,ik->k", left, C @ vectors + 2 * values * (M @ vectors))

@@ -48,7 +48,7 @@ def many_at_rest(search: Search, system: System, t: Any, q: PyTree, qdot: PyTree
     if q0.size < MANY or beside or (search.stable and flat.rows) or find_elements(flat, t, q0, v0) is not None:
         return None
     values = start_values(system, states, t, q, qdot, params)
-    given = Given(eqx.filter(params, eqx.is_array), t, q0, v0)
+    given = Given(eqx.filter(params, eqx.is_array), t, q0, v0, jnp.zeros(0, bool))
     start = lax.stop_gradient(jnp.concatenate([q0, jnp.zeros(flat.rows, q0.dtype)]))
     of_rest = EquationsOfRest(search, system, q, params, values, given, flat)
     equations = SparseEquations.of(of_rest, given, start, q0.size)

@@ -116,7 +116,7 @@ def roundings_beside(flat: Flat, t, q, v, x: Float[Array, " n"]) -> Float[Array,
 
 class Contacts(NamedTuple):
     """Contacts with g = 0 and ġ = 0, to choose the closed ones from: those chosen so far, how often they changed, and what of their forces
-    and accelerations counts as rounding.
+    and accelerations counts as rounding: which pull they may have, below zero of those that open where nothing presses them.
 
     All candidates are closed at first. One by one, the contact that pulls most opens, and where none pulls, the one that goes deepest
     closes, until none pulls and none goes deeper. If that takes long, they change in the order of their numbers, which ends without
@@ -130,10 +130,11 @@ class Contacts(NamedTuple):
     acceleration: Float[Array, " c"]
 
     @classmethod
-    def of(cls, flat: Flat, t, q, v, candidates: Bool[Array, " c"]) -> "Contacts":
-        """All candidates closed."""
-        scales = scalarised(lambda t, q, v: _scales(flat, t, q, v))(t, q, v)
-        return cls(candidates, candidates, jnp.array(0), *jax.lax.stop_gradient(scales))
+    def of(cls, flat: Flat, t, q, v, candidates: Bool[Array, " c"], loose: Float[Array, " c"] | None = None) -> "Contacts":
+        """All candidates closed; those that are `loose` open where no more than that presses them."""
+        force, acceleration = jax.lax.stop_gradient(scalarised(lambda t, q, v: _scales(flat, t, q, v))(t, q, v))
+        force = force if loose is None else jnp.where(loose > 0, -force - loose, force)
+        return cls(candidates, candidates, jnp.array(0), force, acceleration)
 
     def applied_to(self, flat: Flat) -> Flat:
         """The system with those that are closed."""
@@ -171,7 +172,7 @@ class Chosen(NamedTuple):
     consistent: Bool[Array, ""]
 
 
-def select_closed(flat: Flat, t, q, v, candidates: Bool[Array, " c"]) -> Chosen:
+def select_closed(flat: Flat, t, q, v, candidates: Bool[Array, " c"], loose: Float[Array, " c"] | None = None) -> Chosen:
     """Which of the candidates are closed, without friction."""
     t, q, v = jax.lax.stop_gradient((t, q, v))
 
@@ -181,7 +182,7 @@ def select_closed(flat: Flat, t, q, v, candidates: Bool[Array, " c"]) -> Chosen:
         return contacts.next(flat, t, q, v, qddot, multipliers)
 
     most = 4 * len(flat.contacts) + 2 ** min(len(flat.contacts), 10)
-    start = Contacts.of(flat, t, q, v, candidates), jnp.any(candidates)
+    start = Contacts.of(flat, t, q, v, candidates, loose), jnp.any(candidates)
     contacts, changes = jax.lax.while_loop(lambda carry: carry[1] & (carry[0].turn < most), turn, start)
     return Chosen(contacts.closed, None, ~changes)
 

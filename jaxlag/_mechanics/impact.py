@@ -61,7 +61,8 @@ def impact(flat: Flat, elements: FrictionElements | None, t, q, v, near: Bool[Ar
     By Poisson's law compression, as without restitution, and then expansion, in which e of the impulses is given.
     """
     of_poisson = np.array(flat.poisson, bool)
-    returned = jnp.where(of_poisson, 0, e * jnp.minimum(gap_rates(flat, t, q, v), 0))
+    rates = gap_rates(flat, t, q, v)
+    returned = jnp.where((rates < 0) & ~of_poisson, e * rates, 0)
     phases = [_phase(flat, elements, t, q, v, near, returned)]
     if of_poisson.any():
         (compression,) = phases

@@ -180,8 +180,8 @@ class _Bound:
         def of_one(name, given, speed):
             if not callable(given):
                 return jnp.asarray(given, speed.dtype)
-            e = call(given, f"`restitution` of {name!r}", at_time(self.params, t), speed=speed)
-            return jnp.clip(jnp.asarray(e, speed.dtype), 0, 1)
+            e = jnp.asarray(call(given, f"`restitution` of {name!r}", at_time(self.params, t), speed=speed), speed.dtype)
+            return jnp.where(e < 0, 0, jnp.where(e > 1, 1, e))  # not `clip`, which halves the derivative at 0 and 1
 
         found = [of_one(*term, speed) for term, speed in zip(self.system.restitution, speeds, strict=True)]
         return jnp.concatenate([jnp.zeros(0, speeds.dtype), *(e[None] for e in found)])

@@ -2,7 +2,7 @@
 
 import dataclasses
 import inspect
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import jax
@@ -27,8 +27,9 @@ def rate(coordinate: Callable) -> Callable:
     **Arguments:** `coordinate`: the position x(t, q), a number, a vector or any pytree; it receives the arguments it names, out of
     `t`, `q`, `params` and the entries of `params`.
 
-    **Returns:** a function of `(t, q, qdot, params)`, whose value has the structure and shapes of x. Where x depends on states beside q,
-    a function of the system names `states` and hands it on as a fifth argument. Any consistent units.
+    **Returns:** a function of `(t, q, qdot, params)`, whose value has the structure and shapes of x. Entries of params may be given by
+    name, and t left out where x does not name it: `rate(x)(q=..., qdot=..., l=1.0)`. Where x depends on states beside q, a function of
+    the system names `states` and hands it on as a fifth argument. Any consistent units.
 
     **Raises:** `TypeError` where `coordinate` is no hashable function; when the rate is called, `TypeError` where t, q or qdot is missing.
 
@@ -183,7 +184,10 @@ class _Rate(_Composed):
     def _names(self):
         return ("t", "q", "qdot", "params")
 
-    def __call__(self, t=None, q=None, qdot=None, params=None, states=None):
+    def __call__(self, t=None, q=None, qdot=None, params=None, states=None, **entries):
+        if entries and not (params is None or isinstance(params, Mapping)):
+            raise TypeError(f"`params` must be a mapping where its entries are named, but is a {type(params).__name__}. Pass it alone.")
+        params = {**(params or {}), **entries} if entries else params
         if t is None and not asks_for(self.coordinate, "t"):
             t = 0.0
         for name, value in (("t", t), ("q", q), ("qdot", qdot)):

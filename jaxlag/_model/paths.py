@@ -1,6 +1,6 @@
 """Names of what a pytree holds: its leaves, their numbers, and what lies within a name."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from typing import Any
 
 import jax
@@ -29,3 +29,10 @@ def labels(name: str, shape: tuple[int, ...]) -> list[str]:
 def is_within(entry: str, name: str) -> bool:
     """Whether the entry is the one named, or part of it."""
     return entry == name or entry.startswith((f"{name}.", f"{name}["))
+
+
+def listed(names: Iterable[Any], label: str) -> tuple[Any, ...]:
+    """The names in a list; a string, which would be read letter by letter, is refused."""
+    if isinstance(names, str):
+        raise ValueError(f"`{label}` must be a list of names, but is the string {names!r}. Write `{label}=[{names!r}]`.")
+    return tuple(names)

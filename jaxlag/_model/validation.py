@@ -37,6 +37,11 @@ def coordinates(q: Any, name: str) -> Arrays:
 
 def _coordinates(q, name):
     """The same as leaves and structure."""
+    if hasattr(q, "q") and hasattr(q, "qdot"):  # a sample of a motion, an equilibrium, a motion
+        raise TypeError(
+            f"`{name}` must be coordinates, but is of class {type(q).__name__}, which holds them. Pass its parts, e.g. after "
+            "`last = motion[-1]`: `simulate(system, last.q, last.qdot, ts, params, states=last.states)`."
+        )
     is_leaf = lambda node: node is None or is_vector(node)
     given, structure = jax.tree.flatten(q, is_leaf=is_leaf)
     if not given:

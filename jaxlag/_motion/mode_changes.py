@@ -217,8 +217,10 @@ def behind_contact(equations: EquationsOfMotion, t, parts: Parts, args: Argument
     impulses = found.impulses * jnp.where(converged, (1 + ratio) / jnp.where(converged, 1 - ratio, 1), 1)
     parts = parts._replace(q=q, v=found.v, **_counted(t, parts, hits, opening, impulses, jnp.where(converged, remaining, 0)))
     resting = near & ~opening & (jnp.abs(gap_rates(flat, t, q, found.v)) <= scales.rate)
+    varies = [callable(e) for _, e in equations.system.restitution]
+    loose = jnp.where(hits & jnp.array(varies), jnp.finfo(q.dtype).tiny, 0) if any(varies) else None  # they depart as e grows
     if elements is None:
-        chosen = select_closed(flat, t, q, found.v, resting)
+        chosen = select_closed(flat, t, q, found.v, resting, loose)
         slow, stuck = jnp.ones_like(of_friction), jnp.ones_like(of_friction)
     else:
         stuck, slow = sticking(elements, parts.sigma) | (parts.held > 0), _slow(elements, t, parts, errors[1])
@@ -229,7 +231,7 @@ def behind_contact(equations: EquationsOfMotion, t, parts: Parts, args: Argument
         breaking = jnp.where(anew, elements.follows & ~stuck, of_friction & stuck)  # at its bound: the forces tell where it goes on
         along = jnp.where(anew, slip / jnp.where(size > 0, size, 1), parts.sigma)
         given = along, at_rest, breaking
-        among = Contacts.of(flat, t, q, found.v, resting)
+        among = Contacts.of(flat, t, q, found.v, resting, loose)
         mode, contacts = select_mode(flat, elements, t, q, found.v, *given, among, in_other(equations, t, parts, args))
         chosen = Chosen(contacts.closed, mode, mode.consistent)
         parts = in_other_mode(elements, parts, mode)

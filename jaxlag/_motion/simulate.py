@@ -59,7 +59,8 @@ def simulate(
     **Arguments:**
 
     - `system`: the `System`, n coordinates in all.
-    - `q0`, `qdot0`: the state at ts[0]; pytrees of one structure, of numbers or arrays of any shape. Any consistent units.
+    - `q0`, `qdot0`: the state at ts[0]; pytrees of one structure, of numbers or arrays of any shape. Any consistent units. To go on from
+      `last = motion[-1]`: `last.q, last.qdot`, with `states=last.states`.
     - `ts`: sample times, shape (T,), increasing, at least two.
     - `params`: what the functions of the system name, any pytree; measured inputs among them are `Signal`s.
     - `states`: values at the start of states of the system, by name, in place of those that `State` and `Sampled` give.

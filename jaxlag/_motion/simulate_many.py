@@ -17,7 +17,7 @@ from .._mechanics.projection import Baumgarte, NoStabilisation, Projection
 from .._model.deprecation import renamed
 from .._model.event import Event
 from .._model.flat import StatesAt
-from .._model.paths import is_within, leaf_names
+from .._model.paths import is_within, leaf_names, listed
 from .._model.signal import is_signal, jump_times, with_second_derivatives
 from .._model.state_values import start_values
 from .._model.system import System
@@ -97,7 +97,7 @@ def simulate_many(
     system = system if events is None else system.with_events(events)
     everything = {"q0": coordinates(q0, "q0"), "qdot0": coordinates(qdot0, "qdot0")}
     everything["params"] = parameters(params, everything["q0"])
-    own, shared = eqx.partition(everything, _differing(everything, tuple(over)))
+    own, shared = eqx.partition(everything, _differing(everything, listed(over, "over")))
     dtype = jnp.result_type(*jax.tree.leaves((everything["q0"], everything["qdot0"])))
     options = SolverOptions.of(solver, Formulation(stabilisation, friction), max_steps)
     common_steps = _choice_of_steps(common_steps, steps)
@@ -129,6 +129,8 @@ def _differing(everything, over):
         if not within:
             raise ValueError(f"`over` must name q0, qdot0 or entries of params, but holds {name!r}. There are {', '.join(names)}.")
         sizes[name] = {np.shape(leaf)[:1] for leaf in within}
+    if not sizes:
+        raise ValueError("`over` must name what differs between members, but is empty. Call `simulate` for one motion.")
     every = set().union(*sizes.values())
     if len(every) != 1 or () in every:
         shown = ", ".join(f"{name}: {sorted(of_name)}" for name, of_name in sizes.items())

@@ -2,6 +2,8 @@
 
 import keyword
 import re
+import unicodedata
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
@@ -74,7 +76,7 @@ LEAST_NORM = [
 
 def to_python(program: Program) -> str:
     """The source of a NumPy function."""
-    writer = _Writer(program, NumPyPrinter({"strict": True}), RESERVED_IN_PYTHON)
+    writer = _Writer(program, NumPyPrinter({"strict": True}), RESERVED_IN_PYTHON, identifier)
     names = lambda symbols: ", ".join(writer.names[symbol] for symbol in symbols)
     array = lambda formulas: f"numpy.array([{', '.join(formulas)}], float)"
     body = [f"{names(part)}{',' * (len(part) == 1)} = {given}" for part, given in ((program.q, "q"), (program.qdot, "qdot"))]
@@ -96,7 +98,8 @@ def to_python(program: Program) -> str:
 
 def to_c(program: Program) -> str:
     """The source of a function in C99."""
-    writer = _Writer(program, C99CodePrinter({"strict": True, "math_macros": {}}), RESERVED_IN_C)
+    spelt = lambda name: identifier(_in_ascii(name))
+    writer = _Writer(program, C99CodePrinter({"strict": True, "math_macros": {}}), RESERVED_IN_C, spelt)
     given = [("q", program.q), ("qdot", program.qdot), ("params", tuple(symbol for symbol, _ in program.params))]
     body = [f"const double {writer.names[symbol]} = {part}[{i}];" for part, symbols in given for i, symbol in enumerate(symbols)]
     body += [f"const double {name} = {formula};" for name, formula in writer.shared]
@@ -116,14 +119,30 @@ def to_c(program: Program) -> str:
     )
 
 
+def identifier(name: str) -> str:
+    """A name as Python reads it: k_2 of k^2, _1k of 1k."""
+    name = re.sub(r"\W", "_", unicodedata.normalize("NFKC", name))  # as Python does: two spellings may be one identifier
+    return name if name.isidentifier() else f"_{name}"
+
+
+def _in_ascii(name: str) -> str:
+    """A name in the letters of C99: phi of φ."""
+    return "".join(x if x.isascii() else _letter_in_words(x) for x in unicodedata.normalize("NFKD", name) if not unicodedata.combining(x))
+
+
+def _letter_in_words(letter: str) -> str:
+    *_, word = unicodedata.name(letter, "_").replace("-", "_").split()
+    return word.capitalize() if letter.isupper() else word.lower()
+
+
 class _Writer:
     """Formulas in a language: names of the symbols, common subexpressions, and with these z, or A and b."""
 
-    def __init__(self, program: Program, printer: CodePrinter, reserved: frozenset[str]):
+    def __init__(self, program: Program, printer: CodePrinter, reserved: frozenset[str], spelt: Callable[[str], str]):
         self.printer = printer
         self.names: dict[Symbol, str] = {program.t: "t"}
         for symbol in (*program.q, *program.qdot, *(symbol for symbol, _ in program.params), *program.multipliers):
-            name = re.sub(r"\W", "_", symbol.name)
+            name = spelt(symbol.name)
             while name in reserved or name in self.names.values():
                 name += "_"
             self.names[symbol] = name

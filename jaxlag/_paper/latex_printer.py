@@ -8,7 +8,7 @@ from sympy.functions.elementary.trigonometric import TrigonometricFunction
 from sympy.printing.latex import LatexPrinter, translate
 
 from .notation import Notation
-from .textbook_printer import Textbook, split_name
+from .textbook_printer import NUMBERS, Textbook, split_name
 
 
 class Latex(Textbook, LatexPrinter):
@@ -43,7 +43,7 @@ class Latex(Textbook, LatexPrinter):
     def letter(self, name, dots):
         r"""\ddot{x}_{2}, \Theta_{s}."""
         letter, below = split_name(name)
-        letter = self.LETTERS.get(letter, translate(letter))
+        letter = "pi" if name in NUMBERS else self.LETTERS.get(letter, translate(letter))
         letter = letter if len(letter) == 1 or letter.startswith("\\") else rf"\mathrm{{{letter}}}"
         is_word = lambda part: re.match(r"[^\W\d_]{2}", part) and translate(part) == part
         subscripts = [rf"\mathrm{{{part}}}" if is_word(part) else translate(part) for part in below]

@@ -126,7 +126,7 @@ def _check_names(symbols: list[Symbol], positive: Collection[str]) -> None:
 
 
 def check_against_simulation(system: System, s: SymbolicSystem, steps: Steps, q: SymbolTree, params: SymbolTree, states: States) -> None:
-    """Raises where the equations differ from what is simulated, at one random state."""
+    """Raises where the equations differ from what is simulated, at random states: all positive, all negative, and of both signs."""
     like = coordinates(q.example, "q")
 
     def simulated(t, q_, v, multipliers, params_, states_):
@@ -135,16 +135,30 @@ def check_against_simulation(system: System, s: SymbolicSystem, steps: Steps, q:
         _, G, gamma = constraint_rows(flat, t, q_, v)
         return M.as_matrix(), force + applied_force(flat, t, q_, v, multipliers), G, gamma
 
-    draw = np.random.default_rng(0).uniform
-    state = [draw(0.2, 0.8, shape) for shape in ((), len(s.q), len(s.q), len(s.multipliers))]
+    draw = np.random.default_rng(0)
     # A zero would hide its factors, and dividing by it gives infinity.
-    drawn = lambda number: np.where(number == 0, draw(0.2, 0.8, number.shape), number).astype(float)
-    numbers = jax.tree.map(drawn, (params.numbers, states.tree.numbers))
+    drawn = lambda number: np.where(number == 0, draw.uniform(0.2, 0.8, number.shape), number).astype(float)
+    state = [np.ones(shape) for shape in ((), len(s.q), len(s.q), len(s.multipliers))]
+    given = jax.tree.map(drawn, params.numbers), states.tree.numbers
     with jax.enable_x64(True):
-        simulation = evaluate(jax.make_jaxpr(simulated)(*state, *numbers), Algebra(), *state, *jax.tree.leaves(numbers))
+        program = jax.make_jaxpr(simulated)(*state, *given)
     symbols = [s.t, *s.q, *s.qdot, *s.multipliers, *(symbol for symbol, _ in (*params.paths, *states.tree.paths))]
-    values = np.concatenate([np.ravel(part) for part in (*state, *jax.tree.leaves(numbers))])
-    point = dict(zip(symbols, map(sympy.Float, values), strict=True))
+    numbers = np.concatenate([np.ravel(part) for part in (*state, *jax.tree.leaves(given))])
+    is_given = np.isin(np.arange(len(symbols)), len(symbols) - len(states.tree.paths) - 1 - np.arange(len(params.paths)))
+    some, others = (draw.choice((1, -1), len(symbols)) for _ in range(2))
+    for signs in (1, np.where(is_given, 1, -1), np.where(is_given, 1, some), np.where(is_given, -1, others)):
+        values = np.where(is_given, numbers, draw.uniform(0.2, 0.8, len(symbols)))
+        values = np.where([bool(symbol.is_positive) for symbol in symbols], np.abs(values), signs * values)
+        _check_at(dict(zip(symbols, values, strict=True)), program, s, steps)
+
+
+def _check_at(values: dict[Symbol, float], program: Any, s: SymbolicSystem, steps: Steps) -> None:
+    """Raises where the equations differ from what is simulated, for these numbers."""
+    shapes = [aval.shape for aval in program.in_avals]
+    parts = np.split(np.array(list(values.values())), np.cumsum([int(np.prod(shape)) for shape in shapes])[:-1])
+    with jax.enable_x64(True):
+        simulation = evaluate(program, Algebra(), *(part.reshape(shape) for part, shape in zip(parts, shapes, strict=True)))
+    point = {symbol: sympy.Float(value) for symbol, value in values.items()}
     point |= {v: sympy.Float(number(rate.xreplace(point)).real) for v, rate in zip(s.zdot, s.rates, strict=True)}
     derived = {"M": steps.M, "f": steps.f, "G": steps.G, "γ": steps.gamma}
     for (name, matrix), want in zip(derived.items(), map(np.ravel, simulation), strict=True):

@@ -126,6 +126,9 @@ def _merged_abs_powers(factors: Sequence[Expr]) -> list[Expr]:
     return out
 
 
+NUMBERS = {"pi", "π"}  # names that would be read as a number: they stay words
+
+
 def split_name(name: str) -> tuple[str, list[str]]:
     """The letter of a name, and its subscripts."""
     letter, above, below = split_super_sub(name)

@@ -9,7 +9,7 @@ from sympy.functions.elementary.trigonometric import TrigonometricFunction
 from sympy.printing.pretty.pretty_symbology import greek_unicode, sub
 from sympy.printing.str import StrPrinter
 
-from .textbook_printer import Textbook, split_name
+from .textbook_printer import NUMBERS, Textbook, split_name
 
 
 class Unicode(Textbook, StrPrinter):
@@ -46,7 +46,7 @@ class Unicode(Textbook, StrPrinter):
     def letter(self, name, dots):
         """ẍ₂, Θₛ; the dots of a word follow it: wheel˙."""
         letter, below = split_name(name)
-        letter = greek_unicode.get(letter, letter)
+        letter = "pi" if name in NUMBERS else greek_unicode.get(letter, letter)
         if len(letter) > 1:
             return self.letter(name, 0) + ["", "˙", "¨"][dots] if dots else letter + self._subscript(below)
         return unicodedata.normalize("NFC", letter + ["", "\u0307", "\u0308"][dots]) + self._subscript(below)

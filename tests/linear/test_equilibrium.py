@@ -297,9 +297,44 @@ def test_a_conical_pendulum():
     at = jl.steady(CONICAL, *CIRCLING, {"l": l}, fixed=("theta",))
     np.testing.assert_allclose([at.q["theta"], at.qdot["phi"]], [0.8, np.sqrt(g / (l * np.cos(0.8)))], rtol=EXACT)
     at = jl.steady(CONICAL, *CIRCLING, {"l": l})
-    np.testing.assert_allclose(np.cos(at.q["theta"]) * at.qdot["phi"] ** 2, g / l, rtol=EXACT)
-    assert abs(at.q["theta"] - 0.8) < 0.2 and abs(at.qdot["phi"] - 6) < 1
+    np.testing.assert_allclose([at.q["theta"], at.qdot["phi"]], [np.arccos(g / (l * 36)), 6], rtol=EXACT)
     np.testing.assert_array_equal([at.q["phi"], at.qdot["theta"]], 0)
+
+
+MOTORS = {"none": CONICAL, "holonomic": None, "nonholonomic": None}
+MOTORS["holonomic"] = jl.System(spherical, holonomic={"motor": lambda t, q, speed: q["phi"] - speed * t})
+MOTORS["nonholonomic"] = jl.System(spherical, nonholonomic={"motor": lambda qdot, speed: qdot["phi"] - speed})
+
+
+@pytest.mark.parametrize("kind", MOTORS)
+@pytest.mark.parametrize("per_time", [1.0, 1e6, pytest.param(1e-6, marks=pytest.mark.slow)])
+def test_a_speed_stays_as_given_or_as_a_motor_has_it(kind, per_time):
+    """cos θ = g/(l φ̇²), dθ/dφ̇ = 2 cos θ/(φ̇ sin θ), in any unit of time (l is 1/per_time², so that g stays)."""
+    l, speed, t = 0.5 / per_time**2, 6.0 * per_time, 0.3 / per_time
+
+    def angle(speed):
+        start = {"theta": 0.8, "phi": speed * t}, {"theta": 0.0, "phi": speed if kind == "none" else 6.0 * per_time}
+        at = jl.steady(MOTORS[kind], *start, {"l": l, "speed": speed}, t=t)
+        return at.q["theta"], at
+
+    slope, at = jax.grad(angle, has_aux=True)(speed)
+    expected = np.arccos(g / (l * speed**2))
+    np.testing.assert_allclose([at.q["theta"], at.qdot["phi"]], [expected, speed], rtol=EXACT)
+    np.testing.assert_allclose(slope, 2 / (np.tan(expected) * speed), rtol=1e-9)
+
+
+def test_speeds_that_the_equations_decide_are_a_guess():
+    """A body falls through air at m g/b, and spins as it was spun; a coordinate that t pushes ever harder has no steady motion."""
+    falling = jl.System(
+        lambda q, qdot, m: 0.5 * m * qdot @ qdot - m * g * q[0],
+        dissipation=lambda qdot, b: 0.5 * b * qdot[0] ** 2,
+        force=lambda t, a: jnp.stack([a * t, 0.0]),
+    )
+    speeds = lambda b, a=0.0: jl.steady(falling, np.zeros(2), np.array([-1.0, 3.0]), {"m": 0.4, "b": b, "a": a}).qdot
+    np.testing.assert_allclose(speeds(2.0), [-0.2 * g, 3], rtol=EXACT)
+    np.testing.assert_allclose(jax.jacfwd(speeds)(2.0), [0.1 * g, 0], rtol=1e-9, atol=1e-12)
+    with pytest.raises(ValueError, match="but the motion found does not stay as it is"):
+        speeds(2.0, 1.0)
 
 
 def test_derivatives_of_a_steady_motion():

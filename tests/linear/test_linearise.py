@@ -55,6 +55,21 @@ def test_along_a_trajectory_all_arrays_have_its_samples():
     np.testing.assert_allclose(middle.A, expected[0], rtol=1e-12, atol=1e-12)
 
 
+def test_along_a_trajectory_in_discrete_time_and_one_by_one_for_others():
+    """A pendulum at its samples: exp(A T), with ω² = g cos φ/l of either sign; another package takes one of the systems."""
+    angles = jl.System(lambda q, qdot, l: 0.5 * (l * qdot["phi"]) ** 2 + g * l * jnp.cos(q["phi"]))
+    motion = jl.simulate(angles, {"phi": 2.0}, {"phi": 0.5}, np.linspace(0.0, 2.0, 9), {"l": 0.7})
+    linear = jl.linearise(angles, motion, params={"l": 0.7}, inputs=["phi"])
+    discrete = linear.discrete(0.05)
+    expected = [signal.cont2discrete((A, B, C, D), 0.05) for A, B, C, D in zip(linear.A, linear.B, linear.C, linear.D, strict=True)]
+    np.testing.assert_allclose(discrete.A, [A for A, *_ in expected], rtol=1e-12)
+    np.testing.assert_allclose(discrete.B, [B for _, B, *_ in expected], rtol=1e-12)
+    eigenvalues = [np.sort_complex(modes.eigenvalues) for modes in (discrete.modes(), linear.modes())]
+    np.testing.assert_allclose(*eigenvalues, rtol=1e-9, atol=1e-9)
+    with pytest.raises(ValueError, match="a response or state space is that of one linear system, but these are many"):
+        discrete.to_scipy()
+
+
 # Inputs: what can be moved
 
 OSCILLATOR = {"m": 2.0, "b": 3.0, "c": 50.0}
@@ -200,6 +215,17 @@ def test_a_controller_with_too_large_a_gain_is_unstable():
     for ratio, stable in ((0.999, True), (1.001, False)):
         modes = jl.linearise(sampled_pd(), 0.0, params=PLANT | GAINS | {"kp": 0.0, "kd": ratio * edge}).modes()
         assert np.all(modes.stable) == stable
+
+
+def test_periods_that_are_computed_in_two_ways_are_one():
+    """0.1 · 0.1 is the next number but one after 0.01; u pushes, and w remembers the u before."""
+    states = lambda every: {"u": jl.Sampled(lambda q: -q, every=0.01, start=0.0), "w": jl.Sampled(lambda u: u, every=every, start=0.0)}
+    carts = [jl.System(lambda qdot: 0.5 * qdot**2, force=lambda u: u, states=states(every)) for every in (0.1 * 0.1, 0.01 * (1 + 1e-9))]
+    near = jl.linearise(carts[0], 0.0)
+    force, memory = [-1, 0, 0, 0], [0, 0, 1, 0]
+    np.testing.assert_allclose(near.A, [[1 - 0.5e-4, 0.01, 0, 0], [-0.01, 1, 0, 0], force, memory], rtol=1e-12, atol=1e-15)
+    with pytest.raises(ValueError, match="but has periods of 0.01, 0.01000000001"):
+        jl.linearise(carts[1], 0.0)
 
 
 @pytest.mark.slow

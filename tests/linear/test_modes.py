@@ -119,6 +119,37 @@ def test_a_train_that_moves_freely_has_a_mode_of_exactly_zero():
     np.testing.assert_allclose(shift / shift[0], np.ones(3), rtol=1e-9)
 
 
+@pytest.mark.parametrize("per_time", [1.0, 1e6, 1e-6])
+@pytest.mark.parametrize("sample_time", [None, 0.1])
+@pytest.mark.parametrize("b", [0.0, 0.1])
+def test_each_free_body_has_one_mode_of_zero_with_damping_too(per_time, sample_time, b):
+    """Two trains of two wagons each, k/m = 2 and ζ = b/√(2 k m): two shapes at rest, of which A has four zeros."""
+    trains = jl.System(
+        lambda q, qdot, k: 0.5 * qdot @ qdot - 0.5 * k * ((q[0] - q[1]) ** 2 + (q[2] - q[3]) ** 2),
+        dissipation=lambda qdot, b: 0.5 * b * ((qdot[0] - qdot[1]) ** 2 + (qdot[2] - qdot[3]) ** 2),
+    )
+    near = jl.linearise(trains, np.zeros(4), params={"k": 2 * per_time**2, "b": b * per_time})
+    modes = (near if sample_time is None else near.discrete(sample_time / per_time)).modes()
+    np.testing.assert_allclose(modes.angular_frequency / per_time, [0, 0, 2, 2], rtol=1e-9)
+    np.testing.assert_array_equal(modes.angular_frequency[:2], 0)
+    np.testing.assert_allclose(modes.damping_ratio, [0, 0, b / 2, b / 2], rtol=1e-9, atol=1e-12)
+    rigid = np.real(modes.shapes[:2])
+    assert np.linalg.matrix_rank(rigid) == 2
+    np.testing.assert_allclose(rigid[:, ::2], rigid[:, 1::2], rtol=0, atol=1e-12)
+
+
+def test_derivatives_of_a_damped_shape_that_stays_where_it_is_put():
+    """A gear, q₀ = r q₁: (1, 1/r), and (r, 1)/√(1 + r²) of unit mass."""
+    gear = jl.System(
+        lambda q, qdot, r: 0.5 * qdot @ qdot - 0.5 * (q[0] - r * q[1]) ** 2, dissipation=lambda qdot, r: 0.05 * (qdot[0] - r * qdot[1]) ** 2
+    )
+    shape = lambda r, **scale: jl.linearise(gear, np.zeros(2), params={"r": r}).modes(**scale).shapes[0].real
+    np.testing.assert_allclose(jax.jacrev(shape)(2.0), [0, -0.25], rtol=1e-12, atol=1e-15)
+    np.testing.assert_allclose(jax.jacfwd(jax.jacfwd(shape))(2.0), [0, 0.25], rtol=1e-12, atol=1e-15)
+    of_unit_mass = jax.jacfwd(lambda r: shape(r, normalise="mass"))(2.0)
+    np.testing.assert_allclose(of_unit_mass, [5**-1.5, -2 * 5**-1.5], rtol=1e-12)
+
+
 def test_the_force_in_a_joint_of_a_mode():
     """A mass on a spring pulls another along by a rod, g = x₂ − x₁: m₂ ẍ₂ = λ."""
     m1, m2, c = 0.4, 0.6, 90.0

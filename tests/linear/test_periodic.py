@@ -62,6 +62,21 @@ def test_forced_vibration():
     np.testing.assert_allclose(sorted(orbit.multipliers, key=np.imag), sorted([expected, expected.conj()], key=np.imag), rtol=1e-8)
 
 
+@pytest.mark.slow
+def test_the_motion_of_an_orbit_is_computed_as_the_orbit_was():
+    """Friction F s/√(s² + w²) instead of that which sticks, and given tolerances; against SciPy."""
+    F, w = 0.3, 0.05
+    rubbing = jl.System(lambda q, qdot: 0.5 * qdot**2 - q**2, dissipation=lambda qdot: F * jnp.abs(qdot), force=lambda t: jnp.cos(t))
+    given = dict(friction=jl.Regularised(w), rtol=1e-10, atol=1e-12)
+    orbit = jl.periodic(rubbing, 0.5, 0.0, section=jl.Every(2 * np.pi), **given)
+    motion = orbit.motion(11)
+    rates = lambda t, y: [y[1], np.cos(t) - 2 * y[0] - F * y[1] / np.hypot(y[1], w)]
+    expected = solve_ivp(rates, (0, 2 * np.pi), [float(orbit.q), float(orbit.qdot)], "DOP853", rtol=1e-12, atol=1e-14, t_eval=motion.ts)
+    np.testing.assert_allclose([motion.q, motion.qdot], expected.y, rtol=0, atol=1e-8)
+    np.testing.assert_allclose([motion.q[-1], motion.qdot[-1]], [orbit.q, orbit.qdot], rtol=0, atol=1e-8)
+    assert not np.allclose(orbit.motion(11, friction=jl.StickSlip()).q[-1], orbit.q, rtol=0, atol=1e-3)
+
+
 ball = jl.System(
     lambda q, qdot: 0.5 * qdot**2 - G * q, unilateral={"table": jl.Contact(lambda t, q, A: q - A * jnp.sin(20.0 * t), restitution=0.5)}
 )

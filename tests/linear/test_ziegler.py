@@ -151,6 +151,19 @@ def test_branches_keep_their_column_where_frequencies_pass_each_other():
         assert sum(np.allclose(column, branch, rtol=1e-9, atol=1e-9) for column in columns) == 1
 
 
+@pytest.mark.parametrize("per_time", [1.0, 1e6, 1e-6])
+@pytest.mark.parametrize("k2", [1.0, 4.0])
+def test_branches_that_cross_in_opposite_directions_are_both_seen(k2, per_time):
+    """Of two oscillators with the dampings p and −p one steadies at p = 0 and the other begins to flutter; as many grow as before."""
+    opposite = jl.System(pair, dissipation=lambda qdot, p: 0.5 * p * (qdot["a"] ** 2 - qdot["b"] ** 2))
+    params = {"k1": per_time**2, "k2": k2 * per_time**2, "p": 0.0}
+    values = per_time * np.array([-0.95, 1.0])
+    found = jl.root_locus(opposite, {"a": 0.0, "b": 0.0}, params=params, over="p", values=values).crossings
+    np.testing.assert_allclose([crossing.value for crossing in found], 0, atol=1e-14 * per_time)
+    kinds = {(crossing.direction, round(crossing.frequency / per_time, 9), crossing.kind) for crossing in found}
+    assert len(found) == 2 and kinds == {("stabilises", 1.0, "flutter"), ("destabilises", np.sqrt(k2), "flutter")}
+
+
 def test_a_branch_of_equilibria_is_followed():
     """A bead on a hoop that turns: cos θ = g/(Ω² R), where δθ̈ = −Ω² sin²θ δθ; the guess is near the first of them."""
     hoop = jl.System(

@@ -78,6 +78,10 @@ def test_rate_of_a_moving_point():
     t, q, v, r = 0.4, 0.7, -1.1, 2.0
     expected = [-r * np.sin(t) + v * np.sin(2 * t) + 2 * q * np.cos(2 * t), r * np.cos(t) + v * np.cos(q) - q * v * np.sin(q)]
     np.testing.assert_allclose(jl.rate(turning)(t, q, v, {"r": r}), expected, rtol=1e-14)
+    for by_name in ({"r": r}, {"params": {"r": r}}, {"params": {"r": 0.0}, "r": r}):
+        np.testing.assert_allclose(jl.rate(turning)(t=t, q=q, qdot=v, **by_name), expected, rtol=1e-14)
+    with pytest.raises(TypeError, match="`params` must be a mapping where its entries are named, but is a tuple"):
+        jl.rate(turning)(t, q, v, (1.0,), r=r)
     in_body = jax.jit(lambda v: jl.rate(turning)(t, q, v, {"r": r}))
     np.testing.assert_allclose(jax.jacfwd(in_body)(v), [np.sin(0.8), np.cos(q) - q * np.sin(q)], rtol=1e-13)
 

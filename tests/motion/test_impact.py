@@ -186,3 +186,32 @@ def test_the_pecking_woodpecker():
     fallen = np.interp([first, second], ts, motion.q[:, 0])
     np.testing.assert_allclose(fallen[0] - fallen[1], 19.5e-3, atol=0.2e-3)
     assert np.max(np.abs(motion.balance())) < 1e-8
+
+
+@pytest.mark.slow
+def test_derivatives_by_a_restitution_at_its_bounds():
+    """From a wall at e v, in any unit of length: dq/de = v (t − t_hit) = 2 at 0 and at 1 too, and 0 beyond them."""
+    wall = jl.System(lambda qdot: 0.5 * qdot**2, unilateral={"wall": jl.Contact(lambda q: q, restitution=lambda e: e)})
+    at = jax.value_and_grad(lambda e, unit: jl.simulate(wall, unit, -2 * unit, np.linspace(0, 1.5, 4), {"e": e}).q[-1] / unit)
+    for unit in (1.0, 1e9, 1e-9):
+        for e, there, slope in ((0.0, 0.0, 2.0), (1.0, 2.0, 2.0), (0.5, 1.0, 2.0), (1.2, 2.0, 0.0)):
+            np.testing.assert_allclose(at(e, unit), [there, slope], rtol=1e-9, atol=1e-12)
+
+
+@pytest.mark.slow
+def test_derivatives_by_a_restitution_at_its_bounds_with_friction():
+    """The impulse (1 + e) 2 takes a quarter of it from the velocity along the wall."""
+    wall = jl.System(
+        lambda qdot: 0.5 * (qdot["x"] ** 2 + qdot["y"] ** 2),
+        unilateral={"wall": jl.Contact(lambda q: q["x"], restitution=lambda e: e)},
+        dissipation=lambda qdot, multipliers, mu: mu * jnp.abs(multipliers["wall"]) * jnp.abs(qdot["y"]),
+    )
+
+    def ends(e):
+        last = jl.simulate(wall, {"x": 1.0, "y": 0.0}, {"x": -2.0, "y": 3.0}, np.linspace(0, 1.5, 4), {"e": e, "mu": 0.25})[-1]
+        return (both := jnp.stack([last.q["x"], last.q["y"]])), both
+
+    for e in (0.0, 1.0):
+        slope, value = jax.jacfwd(ends, has_aux=True)(e)
+        np.testing.assert_allclose(value, [2 * e, 3 * 1.5 - (1 + e) * 0.5], rtol=1e-9, atol=1e-12)
+        np.testing.assert_allclose(slope, [2, -0.5], rtol=1e-8)

@@ -567,6 +567,49 @@ def test_programs_give_names_that_their_language_allows(tmp_path):
     np.testing.assert_allclose(in_c(0.0, [0.4], [0.0], [0.5, 4.0, 2.0, 3.0], 1, 0)[0], [want], rtol=1e-14)
 
 
+def test_programs_spell_names_that_are_no_identifiers(tmp_path):
+    """A digit first, signs, letters that C does not have, and two names that become one."""
+    params = {"1k": 2.0, "k^2": 3.0, "k_2": 0.5, "k²": 4.0, "φ": 0.7, "pi": 1.3}
+
+    def lagrangian(q, qdot, params):
+        a, b, c, d, phi, pi = (params[name] for name in ("1k", "k^2", "k_2", "k²", "φ", "pi"))
+        return 0.5 * pi * qdot**2 - 0.5 * (a + 2 * b + 3 * c + 5 * d + 7 * phi) * q**2
+
+    e = jl.equations(jl.System(lagrangian), "α", params)
+    program: dict = {}
+    exec(e.to_python(), program)
+    assert e.to_c().isascii()
+    want = -(2 + 2 * 3 + 3 * 0.5 + 5 * 4 + 7 * 0.7) * 0.4 / 1.3
+    np.testing.assert_allclose(program["acceleration"](0.0, [0.4], [0.0], params)[0], [want], rtol=1e-14)
+    in_order = [params[name] for name in sorted(params)]
+    np.testing.assert_allclose(compiled(e.to_c(), tmp_path)(0.0, [0.4], [0.0], in_order, 1, 0)[0], [want], rtol=1e-14)
+
+
+@pytest.mark.parametrize("name", ["pi", "π"])
+def test_a_parameter_that_is_called_pi_is_not_read_as_the_number(name):
+    system = jl.System(lambda q, qdot, params: 0.5 * params[name] * qdot**2 - 0.5 * jnp.pi * q**2 - params["pi_1"] * q)
+    e = jl.equations(system, "x", {name: 1.0, "pi_1": 2.0})
+    assert str(e) == "pi ẍ + π x + π₁ = 0"
+    assert e.latex().splitlines()[1] == r"\mathrm{pi} \ddot{x} + \pi x + \pi_{1} &= 0"
+
+
+@jax.custom_jvp
+def square(v):
+    return v**2
+
+
+square.defjvp(lambda primals, tangents: (square(*primals), jnp.where(primals[0] < 0, 6, 2) * primals[0] * tangents[0]))
+
+
+@pytest.mark.parametrize("of", ["q", "qdot"])
+def test_a_rule_that_differs_below_zero_is_seen(of):
+    """Only there is the derivative that of 3 v²; on paper it is 2 v everywhere."""
+    spring, damper = (square if name == of else (lambda v: v**2) for name in ("q", "qdot"))
+    system = jl.System(lambda q, qdot, m: 0.5 * m * qdot**2 - spring(q), dissipation=lambda qdot: damper(qdot))
+    with pytest.raises(ValueError, match="the equations must agree with the simulation, but f differs"):
+        jl.equations(system, "x", {"m": 1.0})
+
+
 def test_programs_say_what_they_cannot_do():
     digamma = jl.equations(jl.System(lambda q, qdot: 0.5 * qdot**2 + lax.digamma(q)), "x")
     for write in (digamma.to_python, digamma.to_c):
