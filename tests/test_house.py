@@ -80,6 +80,7 @@ WINGS = {  # each imports only from those above it, and each file of a wing only
         "block_saddle_point",
         "saddle_point",
         "constrained_root",
+        "convex_dissipation",
         "massless",
         "constrained_acceleration",
         "singular_directions",
