@@ -20,6 +20,7 @@ from .._program.sparse_jacobian import jacobian, sparsity_pattern, underdetermin
 from .convex_dissipation import by_newton, smooth_force
 from .lagrange import constraint_rows, inertia, velocity_residual
 from .saddle_point import Sound, reach_of, saddle_point
+from .self_consistent import is_affine
 
 RECIPROCAL = (
     "`lagrangian` and `force` must not couple the velocities of coordinates without inertia among each other, but do. "
@@ -117,7 +118,7 @@ def completed(flat: Flat, t, q, v) -> Completed:
         psi, G = jacobian(lambda w: velocity_residual(flat, t, q, of(v, w))[rows], w)
         return slope, G.as_matrix(), -F, -psi
 
-    if _is_linear(flat, z, t, q, v):
+    if is_affine(lambda w: smooth_force(flat, t, q, of(v, w))[z], v[z]):  # not even by a comparison, as that of unlike dampers is not
         found = saddle_point(*equations(t, q, v, jnp.zeros(z.size, v.dtype)))
         w, of_rows, sound = found
     else:
@@ -140,19 +141,6 @@ def _check(flat: Flat, z, t, q, v) -> None:
     coupled = sparsity_pattern(unsymmetric, v[z])
     if np.any(coupled & ~np.eye(z.size, dtype=bool)):
         raise ValueError(RECIPROCAL)
-
-
-def _is_linear(flat: Flat, z, t, q, v) -> bool:
-    """Whether the force is seen to be affine in ż: its slope does not depend on ż, not even by a comparison, as of unlike dampers.
-
-    The slope is taken along a direction of which nothing is known: along one of ones, the force of a difference has none.
-    """
-
-    def slope(at_and_along):
-        at, along = jnp.split(at_and_along, 2)
-        return jax.jvp(lambda w: smooth_force(flat, t, q, v.at[z].set(w))[z], (at,), (along,))[1]
-
-    return not np.any(sparsity_pattern(slope, jnp.concatenate([v[z], v[z]]))[:, : z.size])
 
 
 def inertial_part(flat: Flat, t, q, v, reaction: Float[Array, " n"] | None = None) -> Flat:
