@@ -10,11 +10,11 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float, PyTree
 
+from .._mechanics.augmented_inertia import augmented
 from .._mechanics.constraint_residuals import off_constraints
 from .._mechanics.contact import in_current_mode
 from .._mechanics.lagrange import applied_force, constraint_rows, inertia
 from .._mechanics.massless import first_order, with_masses
-from .._mechanics.saddle_point import augmented
 from .._model.flat import StatesAt
 from .._model.state_values import start_values
 from .._model.system import System

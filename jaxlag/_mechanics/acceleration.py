@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
-from jaxtyping import PyTree
+from jaxtyping import Array, Bool, PyTree
 
 from .._model.flat import Flat, rows_by_name
 from .._model.injection import check_function
@@ -20,6 +20,7 @@ from .contact import in_current_mode
 from .lagrange import constraint_rows
 from .pseudo_inverse import pseudo_inverse
 from .saddle_point import CONTRADICTION, NO_INERTIA, Sound
+from .self_consistent import NOT_CONSISTENT
 from .singular_directions import explained
 
 
@@ -43,8 +44,8 @@ def acceleration(system: System, q: PyTree, qdot: PyTree, params: PyTree = None,
 
     **Returns:** `Acceleration(qddot, multipliers)`: q̈ structured like q; λ by the constraint's name, structured like what g or a returns.
 
-    **Raises:** `ValueError` where a direction has no inertia and no constraint holds it, or where constraints contradict each other.
-    Under `jit` the result is NaN there.
+    **Raises:** `ValueError` where a direction has no inertia and no constraint holds it, where constraints contradict each other, or where
+    forces depend on λ such that none agrees with them, or more than one. Under `jit` the result is NaN there.
 
     **Source:** Hairer & Wanner, Solving Ordinary Differential Equations II, eqs. VII.1.46.
 
@@ -59,17 +60,24 @@ def acceleration(system: System, q: PyTree, qdot: PyTree, params: PyTree = None,
     jl.acceleration(pendulum, *state, {"m": 3.0, "g": 9.81, "l": 2.0}).multipliers["rod"]  # −m l φ̇² − m g cos φ = −35.43
     ```
     """
-    result, sound = at_state(_acceleration, system, q, qdot, params, t, states)
-    _refuse(sound, system, q, qdot, params, t, states)
+    result, sound, agrees = at_state(_acceleration, system, q, qdot, params, t, states)
+    _refuse(sound, agrees, system, q, qdot, params, t, states)
     return result
 
 
-def _refuse(sound: Sound, *given) -> None:
+def _refuse(sound: Sound, agrees: Bool[Array, ""], *given) -> None:
     """Raises where a solve has no unique solution; under `jit` its result is NaN."""
     if is_concrete(sound) and not sound.determined:
         raise ValueError(explained(NO_INERTIA, *given))
     if is_concrete(sound) and not sound.satisfied:
         raise ValueError(CONTRADICTION)
+    if is_concrete(agrees) and not agrees:
+        raise ValueError(explained(NOT_CONSISTENT, *given))
+
+
+def _agrees(flat: Flat, multipliers) -> Bool[Array, ""]:
+    """Whether λ agrees with the forces that it brings about."""
+    return jnp.all(jnp.isfinite(multipliers)) if flat.needs_multipliers else jnp.array(True)
 
 
 def _acceleration(flat, t, q, v):
@@ -77,11 +85,15 @@ def _acceleration(flat, t, q, v):
 
     def known(t, q, v):
         qddot, multipliers, sound = constrained_acceleration(mode, t, q, v)
-        known = sound.determined & sound.satisfied
+        known = _is_sound(sound)
         return jnp.where(known, qddot, jnp.nan), jnp.where(known, multipliers, jnp.nan), sound
 
     qddot, multipliers, sound = scalarised(known)(t, q, v)
-    return Acceleration(flat.unravel(qddot), flat.unravel_multipliers(multipliers)), sound
+    return Acceleration(flat.unravel(qddot), flat.unravel_multipliers(multipliers)), sound, _agrees(flat, multipliers)
+
+
+def _is_sound(sound: Sound) -> Bool[Array, ""]:
+    return sound.determined & sound.satisfied
 
 
 def constraint_force(
@@ -112,8 +124,8 @@ def constraint_force(
     """
     if at is not None:
         check_function(at, "`at`")
-    force, sound = at_state(_ConstraintForce(at), system, q, qdot, params, t, states)
-    _refuse(sound, system, q, qdot, params, t, states)
+    force, sound, agrees = at_state(_ConstraintForce(at), system, q, qdot, params, t, states)
+    _refuse(sound, agrees, system, q, qdot, params, t, states)
     return force
 
 
@@ -128,7 +140,8 @@ class _ConstraintForce:
         _, G, _ = constraint_rows(flat, t, q, v)
         forces = {name: multipliers[rows] @ G[rows] for name, rows in rows_by_name(flat).items()}
         shown = flat.unravel if self.at is None else _force_on_point(flat, self.at, t, q)
-        return {name: shown(jnp.where(sound.determined & sound.satisfied, Q, jnp.nan)) for name, Q in forces.items()}, sound
+        found = {name: shown(jnp.where(_is_sound(sound), Q, jnp.nan)) for name, Q in forces.items()}
+        return found, sound, _agrees(flat, multipliers)
 
 
 def _force_on_point(flat, at, t, q):

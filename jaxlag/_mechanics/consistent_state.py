@@ -18,9 +18,9 @@ from .._program.implicit import undifferentiated
 from .._program.jit import is_concrete
 from .._program.scalarise import scalarised
 from .._program.sparse_jacobian import MANY
-from .._program.sparse_matrix import SparseMatrix, dense, row_sums
+from .._program.sparse_matrix import SparseMatrix, dense
 from .constrained_root import Linear, is_without_curvature, root_of
-from .constraint_residuals import off, off_constraints
+from .constraint_residuals import off, off_constraints, terms
 from .contact import in_contact
 from .friction_elements import find_elements, with_all_masses
 from .lagrange import inertia, position_rows, velocity_residual, velocity_rows
@@ -31,7 +31,7 @@ from .singular_directions import NOT_AFFINE, UNDEFINED, explained, not_affine_in
 from .stick_slip import first_mode, in_mode
 from .structured_inertia import StructuredInertia
 
-ITERATIONS = 16  # near the constraints four suffice
+FEW, ITERATIONS = 4, 16  # near the constraints four suffice
 WITHOUT_CURVATURE = 200  # of a step that leaves it out: each takes away a part, the more the nearer the start is
 
 
@@ -133,7 +133,7 @@ def _nearest_position(flat: Flat, moving, t, q0, M, found: bool) -> Float[Array,
     def linear(args, w):
         (t, q0, M), (q, multipliers) = args, unpacked(args[1], w)
         g, G = position_rows(flat, t, q)
-        reach = reach_of(q[moving], off(g, row_sums(G), q) > _small(q))
+        reach = reach_of(q[moving], off(g, terms(G, q)) > _small(q))
         metric, G = M, _columns(G, moving)
         if not is_without_curvature(M, G):
             G, straight = dense(G), M.as_matrix()
@@ -147,15 +147,16 @@ def _nearest_position(flat: Flat, moving, t, q0, M, found: bool) -> Float[Array,
         eps, start = jnp.finfo(like.dtype).eps, there(args)
 
         def newton(carry):
-            w, _, i = carry
+            w, before, _, i = carry
             found = linear(args, w).solution()
-            moved = jnp.max(jnp.abs(found.x), initial=0.0) > 4 * eps * jnp.max(jnp.abs(w[:free]), initial=0.0)
-            return jnp.concatenate([w[:free] + found.x, found.multipliers]), moved, i + 1
+            change = jnp.abs(found.x)  # of each coordinate in its own unit, until rounding makes it
+            moves = jnp.any((change > 4 * eps * jnp.abs(w[:free])) & ((change < before) | (i < FEW)))
+            return jnp.concatenate([w[:free] + found.x, found.multipliers]), change, moves, i + 1
 
         step = jax.eval_shape(linear, args, start)
         most = WITHOUT_CURVATURE if is_without_curvature(step.M, step.G) else ITERATIONS
-        going_on = lambda carry: carry[1] & (carry[2] < most)
-        return jax.lax.while_loop(going_on, newton, (start, jnp.array(True), jnp.array(0)))[0], None
+        going_on = lambda carry: carry[2] & (carry[3] < most)
+        return jax.lax.while_loop(going_on, newton, (start, start[:free], jnp.array(True), jnp.array(0)))[0], None
 
     find = (lambda _, args: (there(args), None)) if found else by_newton
     w, _ = root_of(residual, linear, find, (t, q0, M), like)
@@ -179,7 +180,7 @@ def _nearest_velocity(flat: Flat, moving, t, q, v0, found: bool) -> tuple[Float[
     def linear(args, w):
         t, q, v0 = args
         psi, G, _ = velocity_rows(flat, t, q, v0)
-        reach = reach_of(v0[moving], off(psi, row_sums(G), v0) > _small(q))
+        reach = reach_of(v0[moving], off(psi, terms(G, v0)) > _small(q))
         return Linear(_part(inertia(flat, t, q, v0)[0], moving), _columns(G, moving), jnp.zeros_like(v0[moving]), -psi, reach)
 
     def by_one_step(linear, args):

@@ -1,14 +1,16 @@
 """Acceleration and multipliers of a state: Lagrange's equations of the first kind, solved."""
 
+from collections.abc import Callable
+
 import jax
 import jax.numpy as jnp
+from jaxtyping import Array, Float
 
 from .._model.flat import Flat
 from .lagrange import applied_force, inertia, velocity_residual, velocity_rows
 from .massless import completed, first_order, inertial_part
 from .saddle_point import SaddlePoint, Sound, saddle_point
-
-MULTIPLIER_ITERATIONS = 3
+from .self_consistent import others, self_consistent
 
 
 def constrained_acceleration(flat: Flat, t, q, v, feedback=None) -> SaddlePoint:
@@ -34,13 +36,34 @@ def _by_inertia(flat: Flat, t, q, v, feedback) -> SaddlePoint:
     if not flat.needs_multipliers:
         found = saddle_point(M, G, inertial + force(jnp.zeros_like(c)), c)
         return found._replace(multipliers=_pushing(flat, found.multipliers))
-    # The solution is affine in the force, which is part of it by λ: one solve says how.
+    columns, reaction, unit = _by_force(flat, M, G, inertial, c, force)
+    multipliers = _pushing(flat, self_consistent(reaction, unit))
+    return SaddlePoint(_affine(columns.x, force(multipliers)), multipliers, columns.sound)
+
+
+def _by_force(flat: Flat, M, G, inertial, c, force: Callable) -> tuple[SaddlePoint, Callable, Float[Array, " m"]]:
+    """The solution, which is affine in the applied force: beside that without one, what each force adds; λ ↦ the λ that the forces of λ
+    bring about; and a unit of each: as large as the forces of one size, in the metric of M, make it.
+    """
     beside = lambda vector, matrix: jnp.concatenate([vector[:, None], matrix], axis=1)
-    columns = saddle_point(M, G, beside(inertial, jnp.eye(v.size, dtype=v.dtype)), beside(c, jnp.zeros((c.size, v.size), v.dtype)))
-    affine = lambda columns, force: columns[:, 0] + columns[:, 1:] @ force
-    reaction = lambda multipliers: affine(columns.multipliers, force(_pushing(flat, multipliers)))
-    multipliers = _pushing(flat, _self_consistent(reaction, jnp.zeros_like(c)))
-    return SaddlePoint(affine(columns.x, force(multipliers)), multipliers, columns.sound)
+    n, dtype = inertial.size, inertial.dtype
+    columns = saddle_point(M, G, beside(inertial, jnp.eye(n, dtype=dtype)), beside(c, jnp.zeros((c.size, n), dtype)))
+    reaction = lambda multipliers: _affine(columns.multipliers, force(_pushing(flat, multipliers)))
+    by_force = columns.multipliers[:, 1:]
+    size = jnp.sqrt(jnp.sum(by_force.T * jax.vmap(M.mv, 1, 1)(by_force.T), axis=0))
+    return columns, reaction, jnp.where(size > 0, size, 1)
+
+
+def _affine(columns, force):
+    return columns[:, 0] + columns[:, 1:] @ force
+
+
+def other_multipliers(flat: Flat, t, q, v, multipliers) -> Float[Array, "o m"]:
+    """Others than those known with which the forces that depend on λ agree, as far as a search finds some; NaN where it does not."""
+    M, inertial = inertia(flat, t, q, v)
+    _, G, gamma = velocity_rows(flat, t, q, v)
+    _, reaction, unit = _by_force(flat, M, G, inertial, -gamma, lambda multipliers: applied_force(flat, t, q, v, multipliers))
+    return others(reaction, multipliers, unit, jax.random.key(0))
 
 
 def _pushing(flat: Flat, multipliers):
@@ -50,18 +73,3 @@ def _pushing(flat: Flat, multipliers):
     start, end = flat.rows_of_bilateral, flat.rows_of_bilateral + len(flat.contacts)
     before, of_contacts, behind = jnp.split(multipliers, [start, end])
     return jnp.concatenate([before, jnp.where(flat.closed, of_contacts, 0), behind])
-
-
-def _self_consistent(reaction, start):
-    """λ = reaction(λ) by Newton's method, where applied forces depend on the constraint forces they bring about.
-
-    It is exact at once where the forces are linear in λ, as friction is. NaN where 1 − ∂reaction/∂λ has no positive determinant:
-    then no λ, or more than one, solves it (Painlevé's paradox; Genot & Brogliato, Eur. J. Mech. A 18 (1999) 653).
-    """
-
-    def newton(multipliers, _):
-        slope = jnp.eye(start.size, dtype=start.dtype) - jax.jacfwd(reaction)(multipliers)
-        step = jnp.linalg.solve(slope, reaction(multipliers) - multipliers)
-        return jnp.where(jnp.linalg.det(slope) > 0, multipliers + step, jnp.nan), None
-
-    return jax.lax.scan(newton, start, length=MULTIPLIER_ITERATIONS)[0]

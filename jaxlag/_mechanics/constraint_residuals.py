@@ -9,7 +9,6 @@ from jaxtyping import Array, Bool, Float
 
 from .._model.flat import Flat
 from .._program.sparse_jacobian import MANY, jacobian
-from .._program.sparse_matrix import row_sums
 from .lagrange import rows_of, velocity_residual
 from .saddle_point import Rows
 from .singular_directions import not_affine_in
@@ -46,7 +45,7 @@ class Residuals(NamedTuple):
 def off_constraints(flat: Flat, t, q, v) -> Float[Array, ""]:
     """Largest residual of g and ψ, in the units of its row."""
     found = Residuals.of(flat, t, q, v)
-    return jnp.maximum(off(found.g, row_sums(found.of_positions), q), off(found.psi, found.of_psi(row_sums), v))
+    return jnp.maximum(off(found.g, terms(found.of_positions, q)), off(found.psi, found.of_psi(lambda rows: terms(rows, v))))
 
 
 def is_on_constraints(flat: Flat, t, q, v) -> Bool[Array, ""]:
@@ -63,8 +62,12 @@ def is_on_constraints(flat: Flat, t, q, v) -> Bool[Array, ""]:
     return jnp.all(on_positions) & jnp.all(on_velocities) & jnp.all(is_affine) & is_defined
 
 
-def off(residual, rows, x):
-    """Largest residual, in the units of its row, by the sums of them: rounding makes some eps of it."""
-    size = rows * (1 + jnp.max(jnp.abs(x)))
+def terms(rows: Rows, x: Float[Array, " n"]) -> Float[Array, " m"]:
+    """The size of the terms of each row, of coordinates of at least one: those that it does not touch have no part in it."""
+    return abs(rows) @ (1 + jnp.abs(x))
+
+
+def off(residual: Float[Array, " m"], size: Float[Array, " m"]) -> Float[Array, ""]:
+    """Largest residual, beside the size of the terms of its row: rounding makes some eps of it."""
     each = jnp.abs(residual) / jnp.where(size > 0, size, 1)
     return jnp.where(jnp.any(jnp.isnan(each)), jnp.nan, jnp.max(each, initial=0.0))  # a maximum of thousands leaves NaN out on a CPU

@@ -15,13 +15,14 @@ from .._model.system import System
 from .._model.validation import at_state, checked, coordinates, state
 from .._program.scalarise import scalarised
 from . import findings
-from .constrained_acceleration import constrained_acceleration
+from .augmented_inertia import augmented, unit_lengths
+from .constrained_acceleration import constrained_acceleration, other_multipliers
 from .contact import in_contact, in_current_mode
 from .couplings import MATRICES, NOT_READ, couplings, uses_all_numbers
 from .friction_elements import light_coordinates, unread_friction
 from .lagrange import applied_force, constraint_rows, inertia, position_residual, velocity_residual
 from .massless import completed, with_masses
-from .saddle_point import augmented
+from .pseudo_inverse import CLEAR, SEEN
 from .singular_directions import UNDEFINED, is_defined, not_affine_in, tangent_basis
 
 
@@ -105,14 +106,17 @@ def examine(system: System, q: PyTree, qdot: PyTree, params: PyTree = None, *, t
     eps = float(jnp.finfo(found["M"].dtype).eps)
     G, M = found["G"], found["M"]
     rows = {name: found["rows"][name] for name in system.constraints}  # in the order of the rows of G
-    N = tangent_basis(G, eps)
+    units = found["units"]
+    blurred = 10 * max((distance for of in found["distances"].values() for distance in of.values()), default=0.0)
+    least = min(max(blurred, eps**SEEN), eps**CLEAR)  # beside the constraints, rows that follow from others differ by as much
+    N = tangent_basis(G * units, eps, least)
     rank = G.shape[1] - N.shape[1]
-    inertia_on_N = np.linalg.eigvalsh(N.T @ M @ N) if N.shape[1] else np.zeros(0)
+    inertia_on_N = _inertias(M, G, units[:, None] * N, eps, least)
     smallest = float(inertia_on_N[0]) if inertia_on_N.size else float("inf")
     contacts = {name: bool(closed) for (name, _), closed in zip(system.unilateral, found["closed"], strict=True)}
-    redundant = _redundant_rows(G, {name: of for name, of in rows.items() if contacts.get(name, True)}, eps)
+    redundant = _redundant_rows(G * units, {name: of for name, of in rows.items() if contacts.get(name, True)}, eps, least)
     largest = lambda named: {name: float(np.max(np.abs(value), initial=0.0)) for name, value in named.items()}
-    constants = _time_constants(found, N) if np.all(np.isfinite(found["A"])) else (float("nan"), float("nan"))
+    constants = _time_constants(found, N, units) if np.all(np.isfinite(found["A"])) else (float("nan"), float("nan"))
     numbers = {
         "coordinates": leaf_names(q),
         "degrees_of_freedom": N.shape[1],
@@ -126,16 +130,18 @@ def examine(system: System, q: PyTree, qdot: PyTree, params: PyTree = None, *, t
         "time_constants": constants,
     }
     off, size, rows_off, rows_size = found["defects"].max(axis=0)
-    defect = max(off / max(size, eps), rows_off / max(rows_size, eps) if rank == G.shape[0] else 0)  # rows may contradict each other
+    share = lambda off, size: off / size if size > 0 else off
+    defect = max(share(off, size), share(rows_off, rows_size) if rank == G.shape[0] else 0)  # rows may contradict each other
     names = entry_names(q, "q")
     coupled = dict(sorted(found["couplings"].items(), key=lambda of: MATRICES.index(of[0][0])))
     found_out = [
-        *findings.without_inertia(names, M, G),
+        *findings.without_inertia(names, M, G, units),
         *findings.nearly_without_inertia(names, M, G),
         *findings.not_affine(names, found["not_affine_in"]),
-        *findings.pushing(names, M, G, rows, system),
-        *findings.of_numbers(numbers, defect, found["M"].dtype),
+        *findings.pushing(names, M, G, rows, units, system),
+        *findings.of_numbers(numbers, found["distances"], defect, found["M"].dtype),
         *findings.pulling(system, found["multipliers"]),
+        *findings.not_unique(found["multipliers"], found["other_multipliers"]),
         *findings.coupling_all(coupled, found["uses_all_numbers"], len(names)),
         *_unread_friction(system, q, qdot, params, t, states),
     ]
@@ -163,25 +169,32 @@ def _measure(flat: Flat, t, q, v):
     flat = in_contact(flat, closed)
     _, G, _ = constraint_rows(flat, t, q, v)
     light = light_coordinates(flat, t, q, v)
+    M = inertia(with_masses(flat, light, t, q, v) if light.size else flat, t, q, v)[0].as_matrix()
+    units = unit_lengths(M, G)
     beside = jnp.linspace(-0.1, 0.1, q.size, dtype=q.dtype)
     around = jnp.stack([jnp.zeros_like(beside), beside, -beside[::-1]])
-    multipliers, defects = jax.vmap(lambda near: _defects(mode, t, q + near, v + near))(around)
+    aside = lambda x, near: x + near * jnp.where(x == 0, 1, jnp.abs(x))
+    multipliers, defects = jax.vmap(lambda near: _defects(mode, t, aside(q, near), aside(v, near)))(around)
     multipliers = multipliers[0]
 
     def rates(y):
         q, v = jnp.split(y, 2)
         return jnp.concatenate([completed(mode, t, q, v).v, constrained_acceleration(mode, t, q, v).x])
 
-    scale = 1 + jnp.max(jnp.abs(v))
-    near = v[None] + 0.1 * scale * jax.random.normal(jax.random.key(0), (64, v.size), v.dtype)
+    speed = jnp.max(jnp.abs(v / units))  # in the metric of M
+    size = 0.1 * jnp.where(speed > 0, speed, 1) * units
+    near = v[None] + size[None] * jax.random.normal(jax.random.key(0), (64, v.size), v.dtype)
     fed = {name: jax.vmap(lambda v, D=D: v @ jax.grad(D, argnums=2)(t, q, v, multipliers))(near) for name, D in flat.dissipations.items()}
+    search = flat.needs_multipliers and not flat.massless
+    other = other_multipliers(mode, t, q, v, multipliers) if search else jnp.zeros((0, multipliers.size), v.dtype)
     g, _ = position_residual(flat, t, q)
     split = rows_by_name(flat)
     psi, _, _ = constraint_rows(flat, t, q, v)
     return {
         "couplings": couplings(flat, t, q, v),
         "uses_all_numbers": uses_all_numbers(flat, t, q, v),
-        "M": inertia(with_masses(flat, light, t, q, v) if light.size else flat, t, q, v)[0].as_matrix(),
+        "M": M,
+        "units": units,
         "light": jnp.isin(jnp.arange(q.size), light),
         "closed": closed,
         "G": G,
@@ -190,8 +203,13 @@ def _measure(flat: Flat, t, q, v):
         "rows": {name: jnp.asarray(rows) for name, rows in split.items()},
         "position": {name: g[split[name]] for name in flat.holonomic_names},
         "velocity": {name: psi[rows] for name, rows in split.items()},
+        "distances": {
+            "position": {name: _distance(g[split[name]], G[split[name]], q, units) for name in flat.holonomic_names},
+            "velocity": {name: _distance(psi[rows], G[rows], v, units) for name, rows in split.items()},
+        },
         "dissipated": fed,
         "multipliers": {name: multipliers[rows] for name, rows in split.items()},
+        "other_multipliers": {name: other[:, rows] for name, rows in split.items()},
         "defects": defects,
     }
 
@@ -210,31 +228,51 @@ def _defects(mode, t, q, v):
     G = jax.jacfwd(psi, argnums=2)(t, q, v)
     terms = rate, -jax.grad(L, argnums=1)(t, q, v), -applied_force(mode, t, q, v, multipliers), -G.T @ multipliers
     largest = lambda *terms: jnp.max(jnp.abs(jnp.concatenate(terms)), initial=0)
+    M = jax.hessian(L, argnums=2)(t, q, v)
+    units = unit_lengths(M, G)
+    terms = [units * term for term in terms]
     in_equations = largest(sum(terms)), largest(*terms)
-    A, _ = augmented(jax.hessian(L, argnums=2)(t, q, v), G)
-    moved = jnp.abs(jnp.linalg.inv(A)) @ sum(map(jnp.abs, terms))  # by each force alone, before they cancel each other
-    in_rows = largest(G @ qddot + gamma), largest(jnp.abs(G) @ moved, gamma)
+    A, _ = augmented(M, G)
+    moved = units * (jnp.abs(jnp.linalg.inv(A * jnp.outer(units, units))) @ sum(map(jnp.abs, terms)))  # by each force alone
+    length = jnp.linalg.norm(G * units[None], axis=1)
+    of_rows = lambda x: x / jnp.where(length > 0, length, 1)
+    in_rows = largest(of_rows(G @ qddot + gamma)), largest(of_rows(jnp.abs(G) @ moved), of_rows(gamma))
     return multipliers, jnp.where(
         sound.determined & sound.satisfied & jnp.all(jnp.isfinite(qddot)), jnp.stack([*in_equations, *in_rows]), 0
     )
 
 
-def _redundant_rows(G, rows, eps):
+def _distance(residual, G, x, units):
+    """The largest distance of x from what rows ask for, beside the size of x, both in the metric of M."""
+    length = jnp.linalg.norm(G * units[None], axis=1)
+    each, size = jnp.abs(residual) / jnp.where(length > 0, length, 1), jnp.max(jnp.abs(x / units))
+    return jnp.max(each / jnp.where(size > 0, size, 1), initial=0.0)
+
+
+def _inertias(M, G, allowed, eps, least):
+    """The eigenvalues of M on the motions `allowed`, in the units given."""
+    N = tangent_basis(G, eps, least)
+    N = N if N.shape == allowed.shape else np.linalg.qr(allowed)[0]
+    return np.linalg.eigvalsh(N.T @ M @ N) if N.shape[1] else np.zeros(0)
+
+
+def _redundant_rows(G, rows, eps, least):
     """How many rows of each constraint depend on rows before them."""
     redundant, before = {}, np.zeros((0, G.shape[1]))
+    allowed = lambda G: tangent_basis(G, eps, least).shape[1]
     for name, indices in rows.items():
         of_name = np.concatenate([before, G[indices]])
-        dependent = len(indices) - (tangent_basis(before, eps).shape[1] - tangent_basis(of_name, eps).shape[1])
+        dependent = len(indices) - (allowed(before) - allowed(of_name))
         if dependent:
             redundant[name] = dependent
         before = of_name
     return redundant
 
 
-def _time_constants(found, N):
+def _time_constants(found, N, units):
     """1/|λ| of the nonzero eigenvalues of the motion linearised on the constraints, the fastest and the slowest."""
-    allowed = np.kron(np.eye(2), N)  # of positions and of velocities
-    reduced = allowed.T @ found["A"] @ allowed
+    allowed, both = np.kron(np.eye(2), N), np.concatenate([units, units])  # of positions and of velocities
+    reduced = allowed.T @ (found["A"] * both / both[:, None]) @ allowed
     sizes = np.abs(np.linalg.eigvals(reduced))
     sizes = sizes[sizes > 1e-7 * np.max(sizes, initial=0.0)]  # a double eigenvalue 0 is some √eps of the largest, after rounding
     return (1 / np.max(sizes), 1 / np.min(sizes)) if sizes.size else (float("inf"), float("inf"))

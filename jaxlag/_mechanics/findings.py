@@ -4,6 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from .couplings import NOT_READ, OF_L, OF_ROWS
+from .self_consistent import NOT_CONSISTENT
 from .singular_directions import faint_direction, massless_coordinates
 
 FAINT = 5e-4  # of the inertia of each coordinate alone: Euler angles of a ball 2° from their singularity
@@ -20,8 +21,25 @@ def pulling(system, multipliers):
             )
 
 
-def without_inertia(names, M, G):
-    free = [names[i] for i in massless_coordinates(M, G)]
+def not_unique(multipliers, others):
+    """Multipliers of which there is none that agrees with the forces they bring about, or more than one."""
+    if any(np.any(np.isnan(of)) for of in multipliers.values()):
+        yield NOT_CONSISTENT
+        return
+    numbers = lambda of: " ".join(f"{number:.4g}" for number in np.ravel(of))
+    shown = lambda named: ", ".join(f"{name!r} {numbers(of)}" for name, of in named.items())
+    for row in range(min((len(of) for of in others.values()), default=0)):
+        other = {name: of[row] for name, of in others.items()}
+        if all(np.all(np.isfinite(of)) for of in other.values()):
+            yield (
+                f"more than one set of multipliers agrees with the forces that depend on them: {shown(multipliers)}, which the motion "
+                f"takes, since the forces lead there from none, and {shown(other)}: write forces for which there is one only"
+            )
+            return
+
+
+def without_inertia(names, M, G, units):
+    free = [names[i] for i in massless_coordinates(M, G, units)]
     if free:
         yield (
             f"a direction that no constraint holds has no inertia: {', '.join(map(repr, free))}; add the missing mass (a small one with "
@@ -46,12 +64,12 @@ def not_affine(names, where):
         yield f"a nonholonomic constraint is not affine in the velocity of {listed}: write its derivative, or a root of it"
 
 
-def pushing(names, M, G, rows, system):
+def pushing(names, M, G, rows, units, system):
     """Velocity constraints that tie a coordinate without inertia to others: their λ acts on these too, unlike a first-order law."""
-    size = np.max(np.abs(M), axis=1)
+    size = np.max(np.abs(M * np.outer(units, units)), axis=1)
     massless = size <= 100 * len(M) * np.finfo(M.dtype).eps * np.max(size, initial=0.0)
     for name in (name for name, _ in system.nonholonomic):
-        for row in G[rows[name]]:
+        for row in G[rows[name]] * units:
             part = np.abs(row) > 1e-12 * np.max(np.abs(row), initial=0.0)
             driven, pushed = ([names[i] for i in np.flatnonzero(part & of)] for of in (massless, ~massless))
             if driven and pushed:
@@ -62,7 +80,7 @@ def pushing(names, M, G, rows, system):
                 )
 
 
-def of_numbers(numbers, defect, dtype):
+def of_numbers(numbers, distances, defect, dtype):
     if defect > float(jnp.finfo(dtype).eps) ** 0.5:
         yield (
             f"the accelerations miss Lagrange's equations, as JAX alone differentiates them, by {defect:.2g} of the largest term: "
@@ -75,10 +93,9 @@ def of_numbers(numbers, defect, dtype):
             f"of constraint {name!r} {count} of the rows follow from those before: the motion is unique, λ is the one of least norm; "
             "leave these rows out where each reaction matters"
         )
-    tolerance = float(jnp.finfo(dtype).eps) ** 0.5
-    for what, off in (("position", numbers["off_position"]), ("velocity", numbers["off_velocity"])):
-        for name, value in off.items():
-            if value > tolerance:
+    for what in ("position", "velocity"):
+        for name, value in numbers[f"off_{what}"].items():
+            if distances[what][name] > float(jnp.finfo(dtype).eps) ** 0.5:
                 yield f"the {what} is off constraint {name!r} by {value:.2g}: `consistent_state` corrects it, `simulate` does so by itself"
     for name, least in numbers["dissipated"].items():
         if least < 0:

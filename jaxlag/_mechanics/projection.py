@@ -13,9 +13,10 @@ from .._model.flat import Flat
 from .._model.numbers import count, number
 from .._program.scalarise import scalarised
 from .._program.sparse_jacobian import jacobian
+from .augmented_inertia import augmented
 from .lagrange import inertia, position_rows, velocity_residual, velocity_rows
 from .massless import completed, inertial_part
-from .saddle_point import augmented, reach_of, saddle_point
+from .saddle_point import reach_of, saddle_point
 
 
 @dataclasses.dataclass(frozen=True)

@@ -27,13 +27,13 @@ def _for_all_members(axis_size, in_batched, conditions):
 
 class Request(NamedTuple):
     """Of a constrained solve, in the metric of M: the `rows` of G, what is asked of them, the `free` motion without them, and, where
-    that is given, how far x may `reach` in directions that are barely held.
+    that is given, how far what each row sees may `reach` in directions that are barely held.
     """
 
     rows: Float[Array, "m n"]
     c: Float[Array, "m k"]
     free: Float[Array, "n k"]
-    reach: Float[Array, ""] | None
+    reach: Float[Array, " m"] | None
 
 
 class Inverse(NamedTuple):
@@ -73,15 +73,17 @@ def by_rows(asked: Request, D) -> tuple[Float[Array, "m m"], Bool[Array, ""]]:
     Values above `CLEAR` of the largest count. Those down to `SEEN` count where what they ask for is no more than `FARTHER` times all the
     rest, or `reach`. Others are left out: below `NOISE`, where dependent rows have them by rounding, for good; above it, unsatisfied.
     """
-    eps = jnp.finfo(D.dtype).eps
-    U, values = _left_singular_vectors(jnp.concatenate([D[:, None] * asked.rows, _absent(D)], axis=1))
-    wanted, rest = D[:, None] * asked.c, U.T @ (D[:, None] * (asked.c - asked.rows @ asked.free))
+    eps, rows = jnp.finfo(D.dtype).eps, D[:, None] * asked.rows
+    U, values = _left_singular_vectors(jnp.concatenate([rows, _absent(D)], axis=1))
+    wanted, rest = D[:, None] * asked.c, U.T @ (D[:, None] * asked.c - rows @ asked.free)
     clear, seen = values > eps**CLEAR * values[0], values > eps**SEEN * values[0]
     step = rest / jnp.where(seen, values, 1)[:, None]
-    length = lambda x: jnp.linalg.norm(x, axis=0, keepdims=True)
-    bound = FARTHER * (length(asked.free) + length(jnp.where(clear[:, None], step, 0))) if asked.reach is None else asked.reach
+    of_rows = lambda sizes: jnp.abs(U.T) @ sizes  # of what the rows in a direction have, so that what these do not touch has no say
+    length = lambda x: of_rows(jnp.sqrt((rows != 0) @ x**2))
+    moved = rows.T @ (U @ (jnp.where(clear[:, None], step, 0) / jnp.where(clear, values, 1)[:, None]))
+    bound = FARTHER * (length(asked.free) + length(moved)) if asked.reach is None else of_rows(asked.reach)[:, None]
     held = clear | (seen & jnp.all(jnp.abs(step) <= bound, axis=1))
-    contradicts = jnp.abs(rest) > eps**FOLLOWS * (length(wanted) + length(asked.free))
+    contradicts = jnp.abs(rest) > eps**FOLLOWS * (of_rows(jnp.abs(wanted)) + length(asked.free))
     satisfied = ~jnp.any(~held & ((values > eps**NOISE * values[0]) | jnp.any(contradicts, axis=1)))
     return _by_values(values**2, U, held, D), satisfied
 

@@ -13,6 +13,7 @@ from .._program.scalarise import scalarised
 from .._program.sparse_jacobian import MANY
 from .._program.sparse_matrix import SparseMatrix, dense
 from . import block_saddle_point, sparse_saddle_point
+from .augmented_inertia import augmented
 from .pseudo_inverse import Inverse, Request, applied, by_rows, everywhere, inverse_of
 from .structured_inertia import MOST_FULL, StructuredInertia, by_inertia, is_positive, root_of_inverse
 from .structured_inertia import factorised as structure_factorised
@@ -34,8 +35,8 @@ def reach_of(state: Float[Array, " n"], off: Bool[Array, ""] | None = None) -> F
     """How far each number of a state may go in a direction that is barely held, where a solve puts the state right: by rounding alone,
     or, where it is clearly `off`, as far as need be.
     """
-    near = jnp.finfo(state.dtype).eps ** 0.5
-    return (1 + jnp.abs(jax.lax.stop_gradient(state))) * (near if off is None else jnp.where(off, 1 / near, near))
+    near = jnp.finfo(state.dtype).eps ** 0.5 * jnp.abs(jax.lax.stop_gradient(state))
+    return near if off is None else jnp.where(off, jnp.inf, near)
 
 
 class SaddlePoint(NamedTuple):
@@ -51,7 +52,7 @@ def saddle_point(M: lx.AbstractLinearOperator, G: Rows, f, c, reach: Float[Array
 
     f and c are vectors, or as many columns each. M need be positive definite on the null space of G only, and rows of G may
     depend on each other. Where M is seen to be diagonal, as of points in Cartesian coordinates, it is divided by, unless a mass is
-    (next to) nothing beside another. Beside it G may be sparse.
+    missing. Beside it G may be sparse.
 
     A direction that G barely holds is held where that takes x about as far as all else does, or, where x puts a state right, no farther
     than its `reach`. What is asked beyond that, the error of a state asks for, as of a mechanism that passes a singular position.
@@ -66,10 +67,10 @@ def saddle_point(M: lx.AbstractLinearOperator, G: Rows, f, c, reach: Float[Array
         return _with_all_numbers_where_singular(M, G, lambda M: _saddle_point(M, G, f, c, reach))
     if not c.size and f.shape[0] >= MANY:
         return _free(M, f, c)
-    heavy = M.diagonal > jnp.finfo(f.dtype).eps ** 0.25 * jnp.max(jnp.abs(M.diagonal))
-    divided = _saddle_point(lx.DiagonalLinearOperator(jnp.where(heavy, M.diagonal, 1)), G, f, c, reach)
+    there = M.diagonal > 0
+    divided = _saddle_point(lx.DiagonalLinearOperator(jnp.where(there, M.diagonal, 1)), G, f, c, reach)
     full = lambda: _saddle_point(lx.MatrixLinearOperator(M.as_matrix()), G, f, c, reach)
-    return jax.lax.cond(everywhere(jnp.all(heavy)), lambda: divided, full)
+    return jax.lax.cond(everywhere(jnp.all(there)), lambda: divided, full)
 
 
 def _for_rows(M, G):
@@ -168,14 +169,22 @@ def _factorised(M, G, f, c, reach) -> Factors:
         by_root = lambda B: jax.scipy.linalg.solve_triangular(cholesky, B, lower=True)
 
     def request():
-        size = lambda x: x @ M.mv(x) if isinstance(M, StructuredInertia) else x @ M.as_matrix() @ x
-        length = None if reach is None else jnp.sqrt(size(reach))
-        return Request(by_root(G.T).T, c, by_root(_load(G, W, f, c)), length)
+        return Request(by_root(G.T).T, c, by_root(_load(G, W, f, c)), _reach_of_rows(M, G, W, reach))
 
     S = G @ _by_inertia(M, G, W, cholesky)(G.T)
     judged = scalarised(by_rows) if len(G) == 2 else by_rows
     inverse, satisfied = inverse_of(S, c, lambda D: judged(request(), D))
     return Factors(W, cholesky, inverse, determined, satisfied)
+
+
+def _reach_of_rows(M, G, W, reach):
+    """How far, in the metric of M, what each row sees may go: a coordinate that it does not touch has no say, in whatever unit."""
+    if reach is None:
+        return None
+    if isinstance(M, StructuredInertia):
+        return jnp.full(len(G), jnp.sqrt(reach @ M.mv(reach)))
+    of_each = jnp.sqrt(jnp.diagonal(M.as_matrix()) + (0 if W is None else W @ G**2)) * reach
+    return jnp.linalg.norm(jnp.where(G != 0, of_each, 0), axis=1)
 
 
 def _load(G, W, f, c):
@@ -226,7 +235,10 @@ def _solver(M, G, factors):
     def solve(f, c):
         free = by_inertia(_load(G, factors.W, f, c))
         multipliers = applied(S, inverse, c - G @ free)
-        return free + mobility @ multipliers, multipliers
+        x = free + mobility @ multipliers
+        # What is light beside what holds it flies far without it, and in the sum rounding of that is left.
+        left = applied(S, inverse, c - G @ x)
+        return x + mobility @ left, multipliers + left
 
     def rotated(dG, multipliers):
         change = dG @ (mobility @ applied(S, inverse, multipliers))
@@ -251,13 +263,6 @@ def _is_definite(M, G):
         return jnp.all(M.diagonal > 0)
     A = augmented(M.as_matrix(), G)[0]
     return _is_positive(jnp.linalg.cholesky(A), A)
-
-
-def augmented(M, G):
-    """M + GᵀWG, with W such that a row of it is as heavy as M is on average; the solution does not depend on W."""
-    size, mean = jnp.sum(G**2, axis=1), jnp.mean(jnp.diagonal(M))
-    W = jax.lax.stop_gradient(jnp.where(mean > 0, mean, 1.0) / jnp.where(size > 0, size, jnp.inf))
-    return M + G.T @ (W[:, None] * G), W
 
 
 def _is_positive(factor, A):

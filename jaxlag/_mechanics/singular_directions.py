@@ -13,9 +13,12 @@ from .._model.system import System
 from .._model.validation import at_state, coordinates
 from .._program.jit import is_concrete
 from .._program.walker import used_arguments
+from .augmented_inertia import unit_lengths
 from .lagrange import constraint_rows, inertia
 from .massless import first_order, with_masses
+from .pseudo_inverse import CLEAR
 from .saddle_point import NO_INERTIA
+from .self_consistent import NOT_CONSISTENT
 
 UNDEFINED = (
     "the functions of the system must return finite numbers, but one returns a NaN or an infinity there. Look for what is undefined, such "
@@ -29,7 +32,7 @@ NOT_AFFINE = (
 
 def explained(reason: str, system: System, q: PyTree, qdot: PyTree, params: PyTree, t: Any, states: PyTree = None) -> str:
     """The reason, and the coordinates concerned, where there are any and the numbers are known; or that numbers are undefined."""
-    about = {NO_INERTIA: _without_inertia, NOT_AFFINE: _nonaffine}.get(reason)
+    about = {NO_INERTIA: _without_inertia, NOT_AFFINE: _nonaffine, NOT_CONSISTENT: lambda found: []}.get(reason)
     if about is None or not is_concrete(q, qdot, params, t):
         return reason
     found = jax.tree.map(np.asarray, at_state(_matrices, system, q, qdot, params, t, states))
@@ -37,23 +40,25 @@ def explained(reason: str, system: System, q: PyTree, qdot: PyTree, params: PyTr
         return UNDEFINED
     names = entry_names(coordinates(q, "q"), "q")
     listed = [repr(names[i]) for i in about(found)]
-    says = {NO_INERTIA: "Without inertia and unconstrained here: ", NOT_AFFINE: "It is not affine in the velocity of: "}[reason]
-    return f"{reason} {says}{', '.join(listed)}." if listed else reason
+    says = {NO_INERTIA: "Without inertia and unconstrained here: ", NOT_AFFINE: "It is not affine in the velocity of: "}
+    return f"{reason} {says[reason]}{', '.join(listed)}." if listed else reason
 
 
-def tangent_basis(G: np.ndarray, eps: float) -> np.ndarray:
-    """A basis of the motions that the constraints allow, as columns: the null space of G, its rows scaled to unit length."""
+def tangent_basis(G: np.ndarray, eps: float, least: float | None = None) -> np.ndarray:
+    """A basis of the motions that the constraints allow, as columns: the null space of G, its rows scaled to unit length. Singular values
+    below the `least` beside the largest count as zero.
+    """
     size = np.linalg.norm(G, axis=1, keepdims=True)
     if not G.shape[0]:
         return np.eye(G.shape[1])
     _, s, Vt = np.linalg.svd(G / np.where(size > 0, size, 1))
-    return Vt[int(np.sum(s > eps**0.3125 * max(s[0], eps))) :].T
+    return Vt[int(np.sum(s > (eps**CLEAR if least is None else least) * max(s[0], eps))) :].T
 
 
-def massless_coordinates(M: np.ndarray, G: np.ndarray) -> list[int]:
-    """Coordinates that take part in a direction that G allows and to which M gives no inertia."""
+def massless_coordinates(M: np.ndarray, G: np.ndarray, units: np.ndarray) -> list[int]:
+    """Coordinates that take part in a direction that G allows and to which M gives no inertia, in `units` in which each has about one."""
     eps = float(np.finfo(M.dtype).eps)
-    N = tangent_basis(G, eps)
+    N, M = tangent_basis(G * units, eps), M * np.outer(units, units)
     if not N.size:
         return []
     inertias, directions = np.linalg.eigh(N.T @ M @ N)
@@ -79,7 +84,8 @@ def is_defined(found: dict) -> bool:
 
 def _without_inertia(found):
     """Those that nothing decides; where that is none, D does not resist at this velocity, and all are named."""
-    return massless_coordinates(found["with_masses"], found["G"]) or massless_coordinates(found["M"], found["G"])
+    G = found["G"]
+    return massless_coordinates(found["with_masses"], G, found["units_with_masses"]) or massless_coordinates(found["M"], G, found["units"])
 
 
 def _nonaffine(found):
@@ -87,11 +93,14 @@ def _nonaffine(found):
 
 
 def _matrices(flat: Flat, t, q, v):
-    decided = first_order(flat, t, q, v).coordinates
+    decided, G = first_order(flat, t, q, v).coordinates, constraint_rows(flat, t, q, v)[1]
+    M, with_all = (inertia(of, t, q, v)[0].as_matrix() for of in (flat, with_masses(flat, decided, t, q, v) if decided.size else flat))
     return {
-        "M": inertia(flat, t, q, v)[0].as_matrix(),
-        "with_masses": inertia(with_masses(flat, decided, t, q, v) if decided.size else flat, t, q, v)[0].as_matrix(),
-        "G": constraint_rows(flat, t, q, v)[1],
+        "M": M,
+        "with_masses": with_all,
+        "G": G,
+        "units": unit_lengths(M, G),
+        "units_with_masses": unit_lengths(with_all, G),
         "not_affine_in": not_affine_in(flat, t, q, v),
     }
 

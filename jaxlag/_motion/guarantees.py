@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from .._model.injection import asks_for
 from .first_order import EquationsOfMotion
 from .results import RESULTS
 from .sample import Evidence, Sample
@@ -26,11 +27,14 @@ def verified(
     """
     reached = ts[-1]
     result = RESULTS.where((result == RESULTS.dt_min_reached) & _locks(equations, ts, samples[0]), RESULTS.beyond_reach, result)
+    agree = _agree(equations, *samples)
+    result = RESULTS.where((result == RESULTS.undefined) & ~agree[-1], RESULTS.no_multipliers, result)
     ts, ys, (sample, evidence) = jax.tree.map(lambda leaf: leaf[:-1], (ts, ys, samples))
     finite = jnp.all(jnp.isfinite(ys), axis=1)
     passed = ts < reached if equations.events else ts <= reached  # behind the end of a motion there is nothing
     there = finite | (passed & (result == RESULTS.successful))
-    for projected, reason in [(finite, RESULTS.undefined), *_guarantees(equations, ts, sample, evidence, rtol)]:
+    of_numbers = [(finite, RESULTS.undefined), (agree[:-1], RESULTS.no_multipliers)]
+    for projected, reason in [*of_numbers, *_guarantees(equations, ts, sample, evidence, rtol)]:
         broken = there & ~projected
         first = jnp.argmax(broken)
         there = there & (jnp.cumsum(broken) == 0)
@@ -41,6 +45,16 @@ def verified(
         return nan_unless(there.reshape(-1, *[1] * (leaf.ndim - 1)), leaf) if jnp.issubdtype(leaf.dtype, jnp.floating) else leaf
 
     return jax.tree.map(masked, sample), result, reached
+
+
+def _agree(equations: EquationsOfMotion, sample: Sample, evidence: Evidence) -> Bool[Array, " T"]:
+    """At which samples multipliers agree with the forces that depend on them, if the constraints alone leave a solution."""
+    agree = jnp.ones_like(evidence.off, bool)
+    if not any(asks_for(term, "multipliers") for _, term in (*equations.system.dissipation, *equations.system.force)):
+        return agree
+    for leaf in jax.tree.leaves(sample.multipliers):
+        agree = agree & ~jnp.any(jnp.isnan(leaf.reshape(len(leaf), -1)), axis=1)
+    return agree | ~(evidence.sound.determined & evidence.sound.satisfied)
 
 
 def _guarantees(equations: EquationsOfMotion, ts, sample: Sample, evidence: Evidence, rtol) -> list[tuple[Bool[Array, " T"], Any]]:

@@ -11,6 +11,7 @@ import numpy as np
 
 from .._mechanics.consistent_state import IMPOSSIBLE
 from .._mechanics.saddle_point import NO_INERTIA
+from .._mechanics.self_consistent import NOT_CONSISTENT
 from .._mechanics.singular_directions import NOT_AFFINE, UNDEFINED
 
 
@@ -41,6 +42,7 @@ class RESULTS(dfx.RESULTS):  # pyright: ignore
         "no mode of sliding and sticking is consistent with the friction forces it causes, or more than one is (Painlevé's paradox). "
         "Lower the coefficient of friction, or give the contact its compliance."
     )
+    no_multipliers = NOT_CONSISTENT
     inside_obstacle = (
         "`q0` must lie outside of all obstacles, but a gap of `unilateral` is negative there. Start outside, or on the contact, g = 0."
     )

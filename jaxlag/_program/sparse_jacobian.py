@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 import lineax as lx
 import numpy as np
+import scipy.sparse
 from jaxtyping import Array, Bool, Float
 
 from .array_dependence import dependence
@@ -119,6 +120,27 @@ def sparsity_pattern(function: Callable, x: Array) -> Bool[np.ndarray, "m n"]:
             reached[node] = reached.get(node, 0) | reached.get(operand, 0)
     rows = [reached.get(node, 0) if isinstance(node, Node) else 0 for node in outputs[0].flat]
     return np.array([[row >> j & 1 for j in range(x.size)] for row in rows], bool).reshape(out.size, x.size)
+
+
+def underdetermined(pattern: Bool[np.ndarray, "m k"]) -> Bool[np.ndarray, " k"]:
+    """Unknowns that the equations of this pattern do not determine, whatever their numbers.
+
+    Source: Dulmage & Mendelsohn, Canad. J. Math. 10 (1958) 517: what alternating paths from unmatched columns reach.
+    """
+    if not pattern.size:
+        return np.ones(pattern.shape[1], bool)
+    from scipy.sparse.csgraph import maximum_bipartite_matching  # imported here because that takes a while
+
+    row_of = maximum_bipartite_matching(scipy.sparse.csr_matrix(pattern))  # of a column; −1 where none is left for it
+    column_of = np.full(pattern.shape[0], -1)
+    column_of[row_of[row_of >= 0]] = np.flatnonzero(row_of >= 0)
+    reached = row_of < 0
+    front = np.flatnonzero(reached)
+    while front.size:
+        behind = column_of[np.any(pattern[:, front], axis=1)]
+        front = np.setdiff1d(behind[~reached[behind]], -1)
+        reached[front] = True
+    return reached
 
 
 class _Dependence(Algebra):

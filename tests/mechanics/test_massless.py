@@ -7,6 +7,7 @@ import pytest
 from scipy.optimize import brentq
 
 import jaxlag as jl
+from jaxlag._program.sparse_jacobian import underdetermined
 
 RANDOM = np.random.default_rng(5)
 HEAVY, LIGHT = slice(0, 3), slice(3, 6)
@@ -227,3 +228,41 @@ def test_many_coordinates_of_which_constraints_hold_one_without_mass(kinetic, wh
     whole = np.block([[M, -G.T], [G, np.zeros((wheels, wheels))]])
     expected = np.linalg.solve(whole, np.append(jax.grad(lagrangian)(q, jnp.zeros(n)), np.zeros(wheels)))
     np.testing.assert_allclose(np.append(found.qddot, found.multipliers["gears"]), expected, rtol=0, atol=1e-12)
+
+
+# Seen in the program
+
+
+def of_differences(qdot, units, linear):
+    a, b = units * qdot
+    return (a - b) ** 4 / 4 + linear * (a - b) ** 2 / 2 + a**2 / 2
+
+
+DIFFERENCES = jl.System(lambda q, units: units[1] * q[1], dissipation=of_differences)
+
+
+@pytest.mark.parametrize("linear", [0.1, 0.0])
+@pytest.mark.parametrize("units", [[1.0, 1.0], [1e9, 1e-9], [1e-9, 1e9]])
+def test_dissipation_by_differences_of_velocities(units, linear):
+    """x³ + linear x = 1 for x = ḃ − ȧ, and ȧ = 1, in any units of a and b: along velocities that are all alike D looked linear."""
+    root = brentq(lambda x: x**3 + linear * x - 1, 0, 2, xtol=1e-15)
+    for guess in (np.zeros(2), np.array([1.0, -1.0])):
+        _, found = jl.consistent_state(DIFFERENCES, np.zeros(2), guess, {"units": np.array(units), "linear": linear})
+        np.testing.assert_allclose(found * np.array(units), [1, 1 + root], rtol=1e-14)
+
+
+def test_flat_pieces_are_seen_in_any_unit():
+    """Inside a dead zone of 0.5, in units from 1e-9 to 1e9, nothing decides the velocity of what nothing pushes."""
+    zone = jl.System(lambda q, F: F * q, dissipation=lambda qdot, u: jnp.maximum(jnp.abs(u * qdot) - 0.5, 0) ** 2)
+    for u in (1e-9, 1.0, 1e9):
+        _, found = jl.consistent_state(zone, 0.0, 0.0, {"F": 2.0 * u, "u": u})
+        np.testing.assert_allclose(found * u, 1.5, rtol=1e-14)
+        with pytest.raises(ValueError, match="inertia"):
+            jl.acceleration(zone, 0.0, 0.0, {"F": 0.0, "u": u})
+
+
+def test_long_chains_of_equations_that_determine_each_other():
+    """Each equation holds two neighbours. With one unknown too many, none is determined; where an end is known, all are."""
+    n = 3000
+    pairs = np.eye(n, n + 1, dtype=bool) | np.eye(n, n + 1, 1, dtype=bool)
+    assert np.all(underdetermined(pairs)) and not np.any(underdetermined(pairs[:, 1:]))

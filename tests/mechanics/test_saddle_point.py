@@ -1,8 +1,11 @@
 """The constrained solve: redundant rows, singular mass matrices, published accelerations."""
 
+import functools
+
 import jax
 import jax.numpy as jnp
 import lineax as lx
+import mpmath
 import numpy as np
 import pytest
 
@@ -10,6 +13,11 @@ import jaxlag as jl
 from jaxlag._mechanics.pseudo_inverse import _left_singular_vectors, pseudo_inverse
 from jaxlag._mechanics.saddle_point import saddle_point
 from jaxlag.examples import pendulum
+
+
+@functools.partial(jax.jit, static_argnums=4)
+def _solved(M, G, f, c, form=lx.MatrixLinearOperator):
+    return saddle_point(form(M), G, f, c)
 
 
 def random_problem(rng, n, m, rank=None):
@@ -375,6 +383,79 @@ def test_rows_of_zeros_among_rows_that_depend_on_each_other(seed):
     assert worst < 1e-10
 
 
-@jax.jit
-def _solved(M, G, f, c):
-    return saddle_point(lx.MatrixLinearOperator(M), G, f, c)[:2]
+# In any units, beside anything
+
+
+def exactly(M, G, f, c):
+    """x and λ in a hundred digits."""
+    n, m = len(f), len(c)
+    K = mpmath.matrix(np.block([[M, -G.T], [G, np.zeros((m, m))]]).tolist())
+    with mpmath.workdps(100):
+        found = mpmath.lu_solve(K, mpmath.matrix([*f, *c]))
+    return np.array([float(x) for x in found[:n]]), np.array([float(x) for x in found[n:]])
+
+
+def drawn_in_units(rng, kind, n, m):
+    """A problem whose numbers are near one, and the units (of coordinates, rows, and mass) in which it is stated."""
+    root, G = rng.normal(size=(n, n)), rng.normal(size=(m, n))
+    M, f, c, hidden = root @ root.T + 0.3 * np.eye(n), rng.normal(size=n), rng.normal(size=m), np.ones(n)
+    if kind == "diagonal":
+        M = np.diag(np.diag(M))
+    if kind == "light and heavy":  # some tied to others a million times as heavy
+        hidden = 10.0 ** rng.uniform(-3, 3, n)
+    if kind == "beside":  # two systems that nothing couples, one of them 1e±9 times as heavy
+        M[: n // 2, n // 2 :], M[n // 2 :, : n // 2], G[0, n // 2 :], G[1:, : n // 2] = 0, 0, 0, 0
+        heavy = 10.0 ** rng.uniform(-9, 9)
+        M[: n // 2, : n // 2], f[: n // 2] = heavy * M[: n // 2, : n // 2], heavy * f[: n // 2]
+    if kind == "without mass":
+        M[-m:], M[:, -m:] = 0, 0
+    units = 10.0 ** rng.uniform(-9, 9, n), 10.0 ** rng.uniform(-3, 3, m), 10.0 ** rng.uniform(-9, 9)
+    return M * np.outer(hidden, hidden), G, f, c, units
+
+
+@pytest.mark.parametrize("kind", ["full", "diagonal", "light and heavy", "beside", "without mass"])
+def test_any_units_of_coordinates_rows_and_mass(kind):
+    """Against mpmath, each number beside the sum of what makes it (Skeel's condition): a coordinate in its own unit."""
+    rng, worst = np.random.default_rng(0), 0.0
+    form = lx.DiagonalLinearOperator if kind == "diagonal" else lx.MatrixLinearOperator
+    for _ in range(40):
+        M, G, f, c, (s, r, mass) = drawn_in_units(rng, kind, 6, 3)
+        stated = mass * M * np.outer(s, s), r[:, None] * G * s, mass * s * f, r * c
+        found = _solved(stated[0].diagonal() if kind == "diagonal" else stated[0], *stated[1:], form)
+        assert found.sound.determined and found.sound.satisfied
+        exact = np.concatenate([s, r / mass]) * np.concatenate(exactly(*stated))
+        K, given = np.block([[M, -G.T], [G, np.zeros((3, 3))]]), np.append(f, c)
+        size = np.abs(np.linalg.inv(K)) @ (np.abs(K) @ np.abs(exact) + np.abs(given))
+        worst = max(worst, np.max(np.abs(np.concatenate([s * found.x, r / mass * found.multipliers]) - exact) / size))
+    assert worst < 1e-10
+
+
+beside = jl.System(
+    lambda q, qdot, M, J: 0.5 * M * qdot["X"] ** 2 + J * (0.5 * (qdot["a"] ** 2 + 2 * qdot["b"] ** 2) - q["a"]),
+    holonomic={"pair": lambda q: q["a"] - q["b"]},
+)
+
+
+@pytest.mark.parametrize("M", [1.0, 1e3, 1e6, 2e6, 1e9, 1e15])
+def test_a_light_pair_beside_a_mass(M):
+    """φ̈ = −1/3 whatever the mass: it was off by 1.4e-3 at 1e6, and refused at 1e9."""
+    at = {"X": 0.0, "a": 0.0, "b": 0.0}
+    found = jl.acceleration(beside, at, at, {"M": M, "J": 1e-9})
+    np.testing.assert_allclose([found.qddot[name] for name in "Xab"], [0, -1 / 3, -1 / 3], rtol=1e-14, atol=1e-300)
+    np.testing.assert_allclose(found.multipliers["pair"], 2e-9 / 3, rtol=1e-13)
+    assert not jl.examine(beside, at, at, {"M": M, "J": 1e-9}).findings
+
+
+crossing = jl.System(
+    lambda q, qdot, s: 0.5 * qdot["x"] ** 2 + 0.5 * (s * qdot["y"]) ** 2 - s * q["y"],
+    holonomic={"rows": lambda q, s, e: jnp.stack([q["x"] + e * s * q["y"], q["x"] - e * s * q["y"]])},
+)
+
+
+@pytest.mark.parametrize("s", [1e-9, 1.0, 1e6])
+def test_the_rank_of_rows_in_any_units(s):
+    """x ± 1e-6 y = 0 are two rows in metres and in micrometres, as in the motion; x ± 1e-12 y, one."""
+    at = {"x": 0.0, "y": 0.0}
+    for e, rank in ((1e-6, 2), (1e-12, 1)):
+        assert jl.examine(crossing, at, at, {"s": s, "e": e}).rank == rank
+    np.testing.assert_allclose(s * jl.acceleration(crossing, at, at, {"s": s, "e": 1e-6}).qddot["y"], 0, atol=1e-9)

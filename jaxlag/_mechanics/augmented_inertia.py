@@ -1,0 +1,35 @@
+"""M + GᵀWG, which says the same as M on the null space of G and is positive there and beside; and units that make all inertias alike."""
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from .pseudo_inverse import everywhere
+
+
+def augmented(M, G):
+    """M + GᵀWG, with W such that a row of it is as heavy as what it moves; the solution does not depend on W."""
+    W = jax.lax.stop_gradient(_weights(jnp.diagonal(M), G**2))
+    return M + G.T @ (W[:, None] * G), W
+
+
+def unit_lengths(M: Float[Array, "n n"], G: Float[Array, "m n"]) -> Float[Array, " n"]:
+    """Units of the coordinates in which each has inertia of order one, whatever units they are given in; of what has no mass, by rows."""
+    size = jnp.diagonal(augmented(M, G)[0])
+    return jnp.where(size > 0, jax.lax.rsqrt(jnp.where(size > 0, size, 1)), 1)
+
+
+def _weights(masses: Float[Array, " n"], squares: Float[Array, "m n"]) -> Float[Array, " m"]:
+    """What each row weighs: one over its length² in units in which all that it moves has mass 1, whatever the units are. What has no
+    mass weighs what the rows do that hold it to masses; and a row that moves nothing else, what makes its length one.
+    """
+    inverse = lambda x: jnp.where(x > 0, 1 / jnp.where(x > 0, x, 1), 0)
+
+    def added(W):
+        return jnp.where(W > 0, W, inverse(squares @ inverse(masses + W @ squares)))
+
+    W = added(jnp.zeros_like(squares[:, 0]))
+    if len(W) > 1:
+        behind = lambda: jax.lax.fori_loop(1, len(W), lambda _, W: added(W), W)
+        W = jax.lax.cond(everywhere(jnp.all(W > 0)), lambda: W, behind)
+    return jnp.where(W > 0, W, inverse(jnp.sum(squares, axis=1)))

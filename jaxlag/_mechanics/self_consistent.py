@@ -1,0 +1,94 @@
+"""Multipliers on which applied forces depend that they bring about themselves, λ = r(λ): as of friction of the reactions.
+
+Newton's method from λ = 0, its steps halved until they lead nearer. A λ counts where det(1 − ∂r/∂λ) is positive there and on the way:
+elsewhere none, or more than one, may solve the equation (Painlevé's paradox; Genot & Brogliato, Eur. J. Mech. A 18 (1999) 653).
+"""
+
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from .._program.implicit import implicit_root
+from .._program.sparse_jacobian import sparsity_pattern
+
+ITERATIONS = 60
+HALVINGS = 30
+OTHERS = 40  # starts of a search for other solutions, of sizes from 1e-4 to 1e4 of the one that is known
+
+NOT_CONSISTENT = (
+    "`dissipation` and `force` must allow multipliers that agree with the forces they bring about, but none were found: none exist there, "
+    "or more than one (as in Painlevé's paradox, where friction is large). Lower the coefficient of friction, or write the force such that "
+    "it does not grow with a power of `multipliers`."
+)
+
+
+def is_affine(function: Callable, x: Float[Array, " m"]) -> bool:
+    """Whether the program of a function shows that it is, its slope taken along a direction of which nothing is known."""
+
+    def slope(at_and_along):
+        at, along = jnp.split(at_and_along, 2)
+        return jax.jvp(function, (at,), (along,))[1]
+
+    return not np.any(sparsity_pattern(slope, jnp.concatenate([x, x]))[:, : x.size])
+
+
+def self_consistent(reaction: Callable, unit: Float[Array, " m"]) -> Float[Array, " m"]:
+    """λ = r(λ), where each λ is compared with others in a `unit`; NaN where none is found."""
+    start = jnp.zeros_like(unit)
+    if is_affine(reaction, start):  # then one step is exact
+        step, sound = _step(reaction, start)
+        return jnp.where(sound, step, jnp.nan)
+    reaction, within = jax.closure_convert(reaction, start)
+    fixed = jax.lax.stop_gradient(within)
+    found = _by_newton(lambda x: reaction(x, *fixed), start, jax.lax.stop_gradient(unit))
+
+    def change(within, w, R):
+        slope = jnp.eye(w.size, dtype=w.dtype) - jax.jacfwd(lambda x: reaction(x, *within))(w)
+        return -jnp.linalg.solve(slope, R)
+
+    return implicit_root(lambda within, w: w - reaction(w, *within), change, within, jax.lax.stop_gradient(found))
+
+
+def _step(reaction: Callable, x: Float[Array, " m"]) -> tuple[Float[Array, " m"], Bool[Array, ""]]:
+    """What Newton's method adds to x; and whether the determinant is positive."""
+    slope = jnp.eye(x.size, dtype=x.dtype) - jax.jacfwd(reaction)(x)
+    return jnp.linalg.solve(slope, reaction(x) - x), jnp.linalg.det(slope) > 0
+
+
+def _by_newton(reaction: Callable, start: Float[Array, " m"], unit: Float[Array, " m"], anywhere: bool = False) -> Float[Array, " m"]:
+    """λ = r(λ); NaN where it does not converge or, but `anywhere`, where the determinant is not positive on the way."""
+    eps, size = jnp.finfo(unit.dtype).eps, lambda x: jnp.linalg.norm(x / unit)
+    left = lambda x: size(reaction(x) - x)
+
+    def newton(carry):
+        x, _, sound, i = carry
+        d, positive = _step(reaction, x)
+        nearer = lambda share: left(x + share * d) <= (1 - share / 4) * left(x)
+        share, _ = jax.lax.while_loop(
+            lambda s: ~nearer(s[0]) & (s[1] < HALVINGS), lambda s: (s[0] / 2, s[1] + 1), (jnp.ones((), unit.dtype), 0)
+        )
+        there = x + share * d
+        better = left(there) < left(x)
+        moves = better & jnp.any(jnp.abs(share * d) > 4 * eps * jnp.abs(there))
+        return jnp.where(better, there, x), moves, sound & (positive | anywhere), i + 1
+
+    yes = jnp.array(True)
+    x, _, sound, _ = jax.lax.while_loop(lambda carry: carry[1] & carry[2] & (carry[3] < ITERATIONS), newton, (start, yes, yes, 0))
+    _, positive = _step(reaction, x)
+    solved = left(x) <= eps**0.5 * (size(x) + size(reaction(jnp.zeros_like(x))))
+    return jnp.where(solved & sound & (positive | anywhere), x, jnp.nan)
+
+
+def others(reaction: Callable, found: Float[Array, " m"], unit: Float[Array, " m"], key: Any) -> Float[Array, "o m"]:
+    """Other solutions, from starts at random of many sizes; NaN where a search ends at none, or at the one `found`."""
+    scale = jnp.linalg.norm(found / unit)
+    sizes = jnp.where(scale > 0, scale, 1) * jnp.logspace(-4, 4, OTHERS, dtype=unit.dtype)
+    starts = sizes[:, None] * unit[None] * jax.random.normal(key, (OTHERS, unit.size), unit.dtype)
+    ends = jax.vmap(lambda start: _by_newton(reaction, start, unit, anywhere=True))(starts)
+    apart = jnp.linalg.norm((ends - found[None]) / unit[None], axis=1, keepdims=True)
+    sizes = jnp.linalg.norm(ends / unit[None], axis=1, keepdims=True) + scale
+    return jnp.where(apart > jnp.finfo(unit.dtype).eps ** 0.25 * sizes, ends, jnp.nan)
