@@ -87,6 +87,7 @@ WINGS = {  # each imports only from those above it, and each file of a wing only
         "constrained_acceleration",
         "singular_directions",
         "friction_elements",
+        "constrained_slip",
         "load_sharing",
         "stick_slip",
         "friction_treatment",

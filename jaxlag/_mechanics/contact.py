@@ -16,6 +16,7 @@ from jaxtyping import Array, Bool, Float
 from .._model.flat import Flat
 from .._program.scalarise import scalarised
 from .constrained_acceleration import constrained_acceleration
+from .constrained_slip import on_constraints
 from .friction_elements import FrictionElements, find_elements, with_all_masses
 from .lagrange import inertia, position_residual
 from .saddle_point import SaddlePoint, reach_of, saddle_point
@@ -221,10 +222,14 @@ def in_current_mode(flat: Flat, t, q, v) -> Flat:
     """
     elements = find_elements(flat, t, q, v)
     if not flat.contacts:
-        return flat if elements is None else in_mode(flat, elements, first_mode(flat, elements, t, q, v)[0].sigma)
+        if elements is None:
+            return flat
+        sigma = first_mode(flat, elements, t, q, v)[0].sigma
+        return in_mode(flat, on_constraints(flat, elements, t, q, v), sigma)
     scales = gap_scales(flat, t, q, v, roundings_beside(flat, t, q, v, q), roundings_beside(flat, t, q, v, v))
     candidates = touching(flat, t, q, v, scales)
     if elements is None:
         return in_contact(flat, select_closed(flat, t, q, v, candidates).closed)
     mode, contacts = first_mode(flat, elements, t, q, v, Contacts.of(flat, t, q, v, candidates))
-    return in_mode(contacts.applied_to(flat), elements, mode.sigma)
+    flat = contacts.applied_to(flat)
+    return in_mode(flat, on_constraints(flat, elements, t, q, v), mode.sigma)

@@ -41,6 +41,9 @@ class FrictionElements(NamedTuple):
     near_rest: Array | float = 0.0  # per element, the slip of several rows below which it keeps its direction
     massless: np.ndarray = np.array(-1)  # of each row the coordinate without inertia that only this friction resists, or −1
     follows: np.ndarray = np.array(False)  # of each element, whether forces decide its slip, for want of inertia
+    free: Array | None = None  # at one state, the projector onto the slips that constraints leave to each element (`constrained_slip`)
+    straight: Array | np.ndarray = np.array(False)  # per element of several rows, whether that is a line, which passes through rest
+    driven: Array | np.ndarray = np.array(False)  # per element, whether constraints drive its slip, so that it cannot rest
 
     @property
     def size(self) -> int:
@@ -141,8 +144,7 @@ def unread_friction(flat: Flat, t, q, v, read: Container[str] | None = None) -> 
     """Dry friction that is not recognised as such, in words: forces that jump with a velocity; and for a motion that has failed, in which
     some terms were `read` as dry friction, what else in D may be nonsmooth.
     """
-    state, structure = (t, q, v, jnp.zeros(flat.rows, v.dtype)), Structure(MOST_NODES)
-    findings = []
+    state, structure, findings = (t, q, v, jnp.zeros(flat.rows, v.dtype)), Structure(MOST_NODES), []
     for slot, terms in (("force", flat.forces), ("dissipation", flat.dissipations)):
         for name, function in terms.items():
             term = _Term.read(structure, function, state)

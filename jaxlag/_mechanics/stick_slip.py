@@ -19,6 +19,7 @@ from .._model.flat import Flat
 from .._program.implicit import undifferentiated
 from .._program.scalarise import scalarised
 from .constrained_acceleration import constrained_acceleration
+from .constrained_slip import directed, extent_of, freely, on_constraints
 from .friction_elements import FrictionElements
 from .load_sharing import shared
 from .massless import completed, nearest_velocity, smooth_force
@@ -27,13 +28,14 @@ from .massless import completed, nearest_velocity, smooth_force
 def in_mode(flat: Flat, elements: FrictionElements, sigma: Float[Array, " r"]) -> Flat:
     """The system in one mode: D with ‖s‖ = σ·s where it slips, and s = 0 among the constraints where it sticks."""
     stuck = sticking(elements, sigma)[elements.element_of_row]
-    extent = lambda t, q, v: _extent(elements, sigma, elements.slip(t, q, v))
+    extent = lambda t, q, v: extent_of(elements, sigma, elements.slip(t, q, v))
+    held_slip = lambda t, q, v: freely(elements, elements.slip(t, q, v))
 
     def slipping(D):
         return lambda t, q, v, multipliers: D(t, q, v, multipliers, extent(t, q, v))
 
     def with_rows(t, q, v, otherwise):
-        return jnp.concatenate([flat.nonholonomic(t, q, v), jnp.where(stuck, elements.slip(t, q, v), otherwise)])
+        return jnp.concatenate([flat.nonholonomic(t, q, v), jnp.where(stuck, held_slip(t, q, v), otherwise)])
 
     held = {name: flat.rows + rows for name, rows in elements.own_rows.items()}
     mode = flat._replace(dissipations={name: slipping(D) for name, D in elements.potentials.items()}, held=held)
@@ -64,17 +66,9 @@ def sticking(elements: FrictionElements, sigma: Float[Array, " r"]) -> Bool[Arra
     return elements.norms(sigma) == 0
 
 
-def _extent(elements, sigma, slip):
-    """u = ‖s‖ of each element: σ s for a single row, smooth through s = 0; for several rows σ·s near rest only."""
-    along, norm = elements.sums(sigma * slip), elements.norms(slip)
-    near_rest = norm <= jnp.maximum(elements.near_rest, jnp.finfo(slip.dtype).tiny ** 0.25)
-    extent = jnp.where(elements.is_vector & ~near_rest, norm, along) if np.any(elements.is_vector) else along
-    return jnp.where(sticking(elements, sigma), 0, extent)
-
-
 class Friction(NamedTuple):
-    """At one state in one mode: acceleration and multipliers; per row, friction force and rate of the slip; per element, its bound and
-    the margin of its mode, negative where that has ended.
+    """At one state in one mode: acceleration and multipliers; per row, friction force and rate of the slip; per element, its bound, the
+    margin of its mode, negative where that has ended, and whether constraints drive its slip.
     """
 
     qddot: Float[Array, " n"]
@@ -83,6 +77,7 @@ class Friction(NamedTuple):
     slip_rate: Float[Array, " r"]
     bound: Float[Array, " e"]
     margin: Float[Array, " e"]
+    driven: Bool[Array, " e"]
 
 
 # Scalar operations: those of an acceleration that is scalar code, and half as many for what follows from it. One with a rod and an element
@@ -97,6 +92,7 @@ def friction(flat: Flat, elements: FrictionElements, sigma, t, q, v, feedback=No
 
 
 def _friction(flat, elements, sigma, t, q, v, feedback):
+    elements = on_constraints(flat, elements, t, q, v)
     stuck, of = sticking(elements, sigma), elements.element_of_row
     mode = in_mode(flat, elements, sigma)
     qddot, multipliers, _ = constrained_acceleration(mode, t, q, v, feedback)
@@ -107,22 +103,24 @@ def _friction(flat, elements, sigma, t, q, v, feedback):
         at_once = elements.slip(t, q, there)
         moves = elements.follows & (elements.norms(at_once) > slip_of(elements, t, q, there, 1e2 * jnp.finfo(v.dtype).eps * jnp.abs(there)))
         slip_rate = jnp.where(moves[of], at_once, slip_rate)
-    pull = jax.vjp(lambda slip: _extent(elements, sigma, slip), slip)[1]
+    pull = jax.vjp(lambda slip: extent_of(elements, sigma, slip), slip)[1]
     bound = bounds(elements, sigma, t, q, v, multipliers)
-    held = multipliers[flat.rows :]
+    held = freely(elements, multipliers[flat.rows :])
     left = bound - elements.norms(held)
     if elements.are_shared:
-        held, left = shared(elements, jax.jacfwd(elements.slip, argnums=2)(t, q, v), held, bound, stuck)
+        J = freely(elements, jax.jacfwd(elements.slip, argnums=2)(t, q, v))
+        held, left = shared(elements, J, held, bound, stuck)
     force = jnp.where(stuck[of], held, -pull(bound)[0])
-    going = elements.sums(sigma * slip) + 1e-6 * elements.near_rest
-    margin = jnp.where(stuck, left + 1e2 * jnp.finfo(v.dtype).eps * jnp.abs(bound), going)
-    return Friction(qddot, multipliers, force, slip_rate, bound, margin)
+    going = elements.sums(directed(elements, sigma) * slip) + jnp.where(elements.straight, 0, 1e-6 * elements.near_rest)
+    driven = jnp.broadcast_to(elements.driven, stuck.shape)
+    resting = jnp.where(driven, -jnp.abs(bound), left + 1e2 * jnp.finfo(v.dtype).eps * jnp.abs(bound))
+    return Friction(qddot, multipliers, force, slip_rate, bound, jnp.where(stuck, resting, going), driven)
 
 
 def bounds(elements: FrictionElements, sigma, t, q, v, multipliers) -> Float[Array, " e"]:
     """∂D/∂u: what friction is where an element slips, and what it does not exceed where it sticks."""
     total = lambda u: sum(D(t, q, v, multipliers, u) for D in elements.potentials.values())
-    return jax.grad(total)(_extent(elements, sigma, elements.slip(t, q, v)))
+    return jax.grad(total)(extent_of(elements, sigma, elements.slip(t, q, v)))
 
 
 class Mode(NamedTuple):
@@ -196,17 +194,19 @@ def select_mode(
         found = friction_in(jnp.where(freed[of], loose, mode.sigma), search.contacts)
         rate = elements.norms(found.slip_rate)
 
-        over = jnp.where(sticking(elements, mode.sigma), -found.margin, -jnp.inf)
+        stuck = sticking(elements, mode.sigma)
+        over = jnp.where(stuck & ~found.driven, -found.margin, -jnp.inf)
         idle = search.contacts.unloaded(found.bound)  # let go at once, and for good: it has no part in what the others do
         beyond = _greatest(over, (over > 0) & ~idle)
         backwards = -elements.sums(found.slip_rate * mode.sigma)
         returning = _greatest(backwards, released & ~idle & (backwards > jnp.where(search.clearly, 0, 1e-6 * search.free_rate)))
-        torn = _torn(elements, t, q, v, found, search.free_rate, over > -jnp.inf) & ~jnp.any(beyond)
+        torn = _torn(elements, t, q, v, found, search.free_rate, over > -jnp.inf) & ~jnp.any(beyond) | (stuck & found.driven)
         along = (over > -1e-6 * jnp.abs(found.bound)) & elements.are_shared  # those of a share break away together
         leaving = jnp.where((stage == FIRST) & jnp.any(breaking), breaking | along, beyond | torn)
         leaving = (leaving & (stage != LOOSE)) | (idle & (over > -jnp.inf))
         returning = returning & ~jnp.any(leaving)
-        way = jnp.where((beyond | breaking | along)[of], -found.force, found.slip_rate)
+        onward = jnp.where((rate > 0)[of], found.slip_rate, elements.slip(t, q, v))
+        way = jnp.where(((beyond | breaking | along) & ~found.driven)[of], -found.force, onward)
         size = elements.norms(way)[of]
         away = jnp.where(idle[of], 1, way / jnp.where(size > 0, size, 1))
         sigma = jnp.where(leaving[of], away, jnp.where(returning[of], 0, mode.sigma))
@@ -281,9 +281,9 @@ def slip_of(elements: FrictionElements, t, q, v, errors: Float[Array, " n"]) -> 
 def redirected(elements: FrictionElements, sigma, held, t, q, v):
     """σ, with the direction of slipping elements of several rows updated to their motion."""
     of, slip = elements.element_of_row, elements.slip(t, q, v)
-    several, size = elements.is_vector, elements.norms(slip)
+    several, size = elements.is_vector & ~elements.straight, elements.norms(slip)
     turns = (several & (size > slip_of(elements, t, q, v, jnp.finfo(v.dtype).eps * jnp.abs(v))) & ~sticking(elements, sigma) & ~held)[of]
-    return jnp.where(turns, slip / jnp.where(turns, size[of], 1), sigma) if np.any(several) else sigma
+    return jnp.where(turns, slip / jnp.where(turns, size[of], 1), directed(elements, sigma)) if np.any(elements.is_vector) else sigma
 
 
 def friction_by_term(elements: FrictionElements, sigma, held, t, q, v, found: Friction) -> dict[str, tuple[Array, Array]]:
@@ -291,7 +291,7 @@ def friction_by_term(elements: FrictionElements, sigma, held, t, q, v, found: Fr
     a share of the force in proportion to its bound.
     """
     of, stuck = elements.element_of_row, sticking(elements, sigma) | held
-    extent, forces = _extent(elements, sigma, elements.slip(t, q, v)), {}
+    extent, forces = extent_of(elements, sigma, elements.slip(t, q, v)), {}
     for name, rows in elements.rows_of_term.items():
         bound = jax.grad(lambda u, D=elements.potentials[name]: D(t, q, v, found.multipliers, u))(extent)
         share = bound / jnp.where(found.bound != 0, found.bound, 1)

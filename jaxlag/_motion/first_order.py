@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, PyTree
 
 from .._mechanics.constrained_acceleration import constrained_acceleration
+from .._mechanics.constrained_slip import on_constraints
 from .._mechanics.contact import free, in_contact
 from .._mechanics.friction_elements import FrictionElements, light_coordinates
 from .._mechanics.friction_treatment import Regularised, StickSlip
@@ -99,6 +100,7 @@ class EquationsOfMotion:
             return flat, treatment.smoothed(flat, t, q, v), None
         elements = treatment.elements(flat, t, q, v)
         assert elements is not None  # rows were counted from them
+        elements = on_constraints(flat, elements, t, q, v)
         if args.scales is not None and np.any(elements.is_vector):
             slow = slip_of(elements, t, q, v, args.scales.slow)
             elements = elements._replace(near_rest=jax.lax.stop_gradient(jnp.where(elements.is_vector, slow, 0)))

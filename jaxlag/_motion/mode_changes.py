@@ -175,7 +175,8 @@ def changed(equations: EquationsOfMotion, t, y, args: Arguments, ended: Bool[Arr
     if not equations.contacts:
         assert elements is not None
         stuck, slow = sticking(elements, parts.sigma) | (parts.held > 0), _slow(elements, t, parts, args.scales.of_velocities(parts.v))
-        along, given = in_other(equations, t, parts, args), (parts.sigma, stuck | of_friction | slow, of_friction & stuck)
+        at_rest = stuck | of_friction | (slow & ~elements.driven)
+        along, given = in_other(equations, t, parts, args), (parts.sigma, at_rest, of_friction & stuck)
         mode, _ = select_mode(flat, elements, t, parts.q, parts.v, *given, friction_in=along)
         after = equations.in_new_mode(t, in_other_mode(elements, parts, mode).y, args)
         return Change(after, mode.consistent, jnp.array(True), jnp.array(True), jnp.all(~of_friction | stuck | slow))
@@ -227,7 +228,7 @@ def behind_contact(equations: EquationsOfMotion, t, parts: Parts, args: Argument
         slip = elements.slip(t, q, found.v)
         size = elements.norms(slip)[elements.element_of_row]
         anew = is_impact | anew | jnp.any(of_contact & ~closed)
-        at_rest = jnp.where(anew, slow | elements.follows, stuck | of_friction | slow)
+        at_rest = jnp.where(anew, slow | elements.follows, stuck | of_friction | (slow & ~elements.driven))
         breaking = jnp.where(anew, elements.follows & ~stuck, of_friction & stuck)  # at its bound: the forces tell where it goes on
         along = jnp.where(anew, slip / jnp.where(size > 0, size, 1), parts.sigma)
         given = along, at_rest, breaking

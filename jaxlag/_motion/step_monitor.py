@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from .._program.time_bounds import TimeDependence, time_dependence
 
@@ -105,17 +105,23 @@ def first_end(
         )
 
     def going_on(search):
-        wide = search.high - search.low > jnp.maximum(4 * scales.rounding, 1e-13 * (t1 - t0))
+        middle, wide = (search.low + search.high) / 2, search.high - search.low > jnp.maximum(4 * scales.rounding, 1e-13 * (t1 - t0))
+        wide |= jnp.any(_jumps(search)) & (search.low < middle) & (middle < search.high)  # to the very time at which it jumps
         narrowing = exactly & wide & (search.sections < SECTIONS)
         return jnp.where(search.found, narrowing, (search.low < t1) & (search.rounds < ROUNDS))
 
     nothing, time = jnp.zeros(2 * elements, path(t0).dtype), jnp.asarray(t0, path(t0).dtype)
     start = _Search(time, jnp.asarray(t1, time.dtype), jnp.array(False), 0, 0, *[nothing] * 4)
     done = jax.lax.while_loop(going_on, closer, start)
-    steep = 10 * jnp.abs(done.slope) * (done.high - done.low) + 1e-9 * done.largest
-    slope = jnp.where((done.behind < 0) & (done.before - done.behind > steep), -jnp.inf, done.slope)
+    slope = jnp.where(_jumps(done), -jnp.inf, done.slope)
     is_margin = jnp.any(done.behind[:elements] < 0)
     return Seen(done.found & is_margin, done.found & ~is_margin, ~done.found & (done.low < t1), done.high, slope[:elements])
+
+
+def _jumps(search: _Search) -> Bool[Array, " m"]:
+    """Which margins fall below zero within the interval, and more than smooth ones would."""
+    steep = 10 * jnp.abs(search.slope) * (search.high - search.low) + 1e-9 * search.largest
+    return (search.behind < 0) & (search.before - search.behind > steep)
 
 
 def is_hidden(rates: Callable, nodes: np.ndarray, t0, t1, y, scales: Any) -> Any:

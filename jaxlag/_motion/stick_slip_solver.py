@@ -42,7 +42,7 @@ class SplitInterpolation(dfx.AbstractLocalInterpolation):
     def evaluate(self, t0, t1=None, left=True):
         if t1 is not None:
             return self.evaluate(t1) - self.evaluate(t0)
-        before = (t0 < self.cut) | ((t0 == self.cut) & left)
+        before = t0 < self.cut  # at the cut itself the next mode holds: where a bound jumps, the one before has ended there
         return jnp.where(before, self.first.evaluate(t0), self.second.evaluate(t0))
 
 
@@ -158,7 +158,7 @@ class StickSlipSolver(ProjectedSolver):
         until = jnp.where(falling, jnp.abs(value) / jnp.where(falling, -slope, 1), jnp.inf)
         nearest = jax.lax.stop_gradient(jnp.argmin(until))
         estimate = end - value[nearest] / jnp.where(falling[nearest], slope[nearest], -jnp.inf)
-        usable = jnp.any(falling) & (end >= t0 - late[nearest]) & (end < t1)
+        usable = jnp.any(falling) & (end >= t0 - late[nearest]) & (end <= t1)
         located = split._replace(first=done, cut=split.cut._replace(time=end, estimate=estimate, usable=usable))
         simultaneous = falling & (value <= -slope * SIMULTANEOUS * args.scales.rounding)
         ended = (jnp.arange(value.size) == nearest) | simultaneous

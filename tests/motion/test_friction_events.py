@@ -215,3 +215,23 @@ def test_friction_stands_in_few_places_of_a_program():
     )
     motion = lambda F: jl.simulate(rod, *start, np.linspace(0, 10, 201), {"m": 2.0, "l": 1.5, "F": F}).q["x"]
     assert len(jax.jit(motion).lower(2.0).as_text().splitlines()) < 20_000
+
+
+clutch = jl.System(
+    lambda qdot: 0.5 * qdot @ qdot,
+    dissipation={"clutch": lambda t, qdot, opens: jnp.where(t >= opens, 0.0, 10.0) * jnp.abs(qdot[0] - qdot[1])},
+    force=lambda t: jnp.stack([1.0 + 0 * t, 0 * t]),
+)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("opens", [0.4, 0.37, 1.0])
+def test_a_clutch_opens_at_a_sample_or_between_two(opens):
+    """Both turn with q̈ = ½ until it opens, at which very time nothing is transmitted any more, and the first with q̈ = 1 from there."""
+    ts = np.linspace(0, 1, 11)
+    motion = jl.simulate(clutch, jnp.zeros(2), jnp.zeros(2), ts, {"opens": opens})
+    later = np.maximum(ts - opens, 0)
+    both = ts**2 / 4
+    np.testing.assert_allclose(motion.q, np.stack([both + later**2 / 4, both - later**2 / 4], axis=1), atol=1e-14)
+    np.testing.assert_allclose(motion.friction["clutch"].force, np.where(ts < opens, -0.5, 0), atol=1e-14)
+    assert list(np.asarray(motion.friction["clutch"].sticking)) == list(ts < opens)
