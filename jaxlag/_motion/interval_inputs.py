@@ -1,5 +1,6 @@
 """Measured inputs as the loop from node to node reads them: row by row, out of one vector."""
 
+import dataclasses
 import functools
 import math
 import warnings
@@ -11,8 +12,12 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
-from .._model.signal import CalledElsewhere, Piece, Signal, broken_signals, is_broken, is_signal
+from .._model.flat import Flat
+from .._model.injection import needs
+from .._model.signal import CalledElsewhere, Piece, Signal, SinceOrigin, broken_signals, is_broken, is_signal
 from .._model.signal_interpolation import AbstractInterpolation
+from .._model.system import System
+from .._program.walker import used_arguments
 
 
 class Rows(NamedTuple):
@@ -141,6 +146,29 @@ def called_elsewhere(values: Callable, params: PyTree) -> frozenset[int]:
             found.add(error.args[0])
         else:
             return frozenset(found)
+
+
+def values_of(flat: Flat, t, q, v) -> PyTree:
+    """What all functions of a system return."""
+    multipliers = jnp.zeros(flat.rows, v.dtype)
+    given = [D(t, q, v, multipliers) for D in (*flat.dissipations.values(), *flat.forces.values())]
+    of_states = flat.state_rates(t, q, v), flat.updates(t, q, v)
+    return flat.lagrangian(t, q, v), flat.bilateral(t, q), flat.gaps(t, q), flat.nonholonomic(t, q, v), given, of_states
+
+
+def at_events(system: System, flat: Flat, t, q, v) -> PyTree:
+    """What the functions of events return."""
+    changing = [name for name, event in system.events if event.then is not None]
+    return flat.witnesses(t, q, v, jnp.zeros(flat.rows, v.dtype)), [flat.happened(name, t, q, v) for name in changing]
+
+
+def sees_time(values: Callable, system: System, params: PyTree) -> bool:
+    """Whether functions ask for the time, beside signals at that time; `values(params)` is what those that are no events' return."""
+    if not isinstance(params, SinceOrigin):
+        return False
+    of_events = [function for _, event in system.events for function in (event.when, event.then) if callable(function)]
+    of_origin = lambda origin: values(dataclasses.replace(params, origin=origin))
+    return any(needs(function, "t") for function in of_events) or bool(used_arguments(of_origin, params.origin)[0])
 
 
 def warn_of_delays(params: PyTree, elsewhere: frozenset[int]) -> None:

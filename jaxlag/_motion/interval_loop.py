@@ -18,6 +18,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
+from .._model.signal import origin_of
 from .._model.states import flow
 from .._program.single_kernel import in_one_kernel
 from .event_record import has_stopped, with_events
@@ -97,13 +98,14 @@ class IntervalLoop(NamedTuple):
         controller = ResumingController(rtol, atol, smallest=4 * rounding, norm=norm)
         if self.dense:  # no node cuts a step short
             controller = GuardedController(rtol, atol, dtmin=4 * rounding, force_dtmin=False, norm=norm)
+        same = rounding + jnp.finfo(y0.dtype).eps * jnp.abs(origin_of(numbers.varied[0]))  # times as given, which round with the user's
         stepping = self._replace(solver=with_tolerances(self.solver, controller))
         now = lambda x: _alone(x, numbers)
 
         def turn(carry):
             moving, steps, saved, meter = carry
             sample, before = steps.sample, jax.tree.map(now, moving)
-            (moving, reached), (steps, is_sample) = stepping._varied(controller, rounding, steps, numbers)(moving)
+            (moving, reached), (steps, is_sample) = stepping._varied(controller, same, steps, numbers)(moving)
             meter = self.meter.step(meter, (now(moving.t) - first) / (last - first))
             if self.dense:
                 steps, saved = stepping._sampled(steps, (before.t, now(moving.t)), reached.dense, numbers, saved, write)
@@ -148,10 +150,10 @@ class IntervalLoop(NamedTuple):
         zero = jnp.array(0)
         return moving, Steps(t1 - first, rest, controller_state, jnp.array(is_new), following, sample, dfx.RESULTS.successful, zero, zero)
 
-    def _varied(self, controller, rounding, steps: Steps, numbers: Numbers) -> Callable:
+    def _varied(self, controller, same, steps: Steps, numbers: Numbers) -> Callable:
         """A step of what moves and its value at a sample, with their variations along the directions of what is varied, for each order."""
 
-        function = lambda moving, given: self._step(controller, rounding, moving, given, steps, numbers.args)
+        function = lambda moving, given: self._step(controller, same, moving, given, steps, numbers.args)
         function = varied_along(function, numbers.directions)
         return lambda moving: function(moving, numbers.varied)
 
@@ -169,8 +171,10 @@ class IntervalLoop(NamedTuple):
         i, saved = jax.lax.while_loop(is_within, sampled, (steps.sample, saved))
         return steps._replace(sample=i), saved
 
-    def _step(self, controller, rounding, moving: Moving, given, steps: Steps, args) -> tuple[tuple[Moving, Reached], tuple[Steps, Any]]:
-        """One step, tried, up to the next node at most and behind the jumps there."""
+    def _step(self, controller, same, moving: Moving, given, steps: Steps, args) -> tuple[tuple[Moving, Reached], tuple[Steps, Any]]:
+        """One step, tried, up to the next node at most and behind the jumps there; nodes are at one time where they are no further apart
+        than the `same` time may be by rounding.
+        """
         (params, origin), t = given, moving.t
         sample = self.ts.at(self.ts.shape[0] - 1)[0] if self.dense else self.sample_time(steps.sample)
         inputs, periods = self.inputs(params), self.equations.periods(params)
@@ -178,16 +182,16 @@ class IntervalLoop(NamedTuple):
         ticks = [(origin + i * period).astype(t.dtype) for i, period in zip(steps.following[signals:], periods, strict=True)]
         ticks = [jnp.where(tick > t, tick, jnp.inf) for tick in ticks]  # a period that is not positive has none
         coming = [*inputs.times(steps.following, t), *ticks]
-        node, end = functools.reduce(lambda first, time: jnp.where(time + rounding < first, time, first), coming, sample), t + steps.length
-        t1 = jnp.where(end + rounding >= node, node, end)
+        node, end = functools.reduce(lambda first, time: jnp.where(time + same < first, time, first), coming, sample), t + steps.length
+        t1 = jnp.where(end + same >= node, node, end)
         args, after = args._replace(params=inputs.pieces(steps.following)), args
         state = eqx.combine(moving.solver_state, steps.solver_state)
         keep, y, state, dense, planned, control, result = self._tried(controller, t, t1, moving.y, args, state, steps)
 
         t = jnp.where(keep, t1, t)
-        passed = [keep & (t1 == node) & (time <= node + rounding) for time in coming]
+        passed = [keep & (t1 == node) & (time <= node + same) for time in coming]
         following = tuple(i + by for i, by in zip(steps.following, passed, strict=True))
-        is_sample = keep & (t1 == node) & (sample <= node + rounding)
+        is_sample = keep & (t1 == node) & (sample <= node + same)
         for time, by, moves in zip(coming, passed, self.moving, strict=True):
             if moves:  # two nodes at one time are so for these numbers alone
                 y = jnp.where(by, self._moved(time, t, y, args), y)

@@ -10,25 +10,28 @@ import jax.numpy as jnp
 from jaxtyping import Array, PyTree
 
 from .._mechanics.projection import Projection
-from .._model.signal import least_spacing
+from .._model.signal import least_spacing, origin_of
 from .._program.jit import jitted
 
 
 class Scales(NamedTuple):
-    """What counts as small in a motion: tolerances, its duration, the sample spacing of its inputs, the rounding of its times."""
+    """What counts as small in a motion: tolerances, its duration, the sample spacing of its inputs, the rounding of its times, and that of
+    the times that functions see, where they ask for them.
+    """
 
     rtol: Any
     atol: Any
     duration: Any
     spacing: Any
     rounding: Any
+    grain: Any
 
     @classmethod
-    def of(cls, tolerances: tuple[Array, Array], ts: Array, params: PyTree) -> "Scales":
-        """The scales of a motion at the times `ts`."""
-        end = jnp.maximum(jnp.abs(ts[0]), jnp.abs(ts[-1]))
-        rtol, atol = tolerances
-        found = cls(rtol, atol, ts[-1] - ts[0], least_spacing(params, ts.dtype), jnp.finfo(ts.dtype).eps * end)
+    def of(cls, tolerances: tuple[Array, Array], ts: Array, params: PyTree, sees_time: bool) -> "Scales":
+        """The scales of a motion at the times `ts` since the origin of `params`."""
+        end, (rtol, atol), eps = jnp.maximum(jnp.abs(ts[0]), jnp.abs(ts[-1])), tolerances, jnp.finfo(ts.dtype).eps
+        seen = end + jnp.abs(origin_of(params)) if sees_time else end
+        found = cls(rtol, atol, ts[-1] - ts[0], least_spacing(params, ts.dtype), eps * end, eps * seen)
         return jax.lax.stop_gradient(found)
 
     @property

@@ -12,7 +12,7 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, PyTree
 
 from .._model.flat import StatesAt
-from .._model.signal import with_second_derivatives
+from .._model.signal import SinceOrigin, origin_of, with_second_derivatives
 from .._model.state_values import start_values
 from .._model.system import System
 from .._model.validation import check
@@ -77,13 +77,13 @@ class SolutionMap:
 
     def _solve(self, inputs: Inputs, ts: Array, adjoint: dfx.AbstractAdjoint) -> tuple[Samples, Unchanging]:
         equations, at = self._equations(inputs, ts)
-        params, tolerances = inputs.params, inputs.tolerances
+        params, times, tolerances = _counted(inputs, ts), ts - ts[0], inputs.tolerances
         smooth = with_second_derivatives(params)
-        args = Arguments(smooth, Scales.of(tolerances, ts, smooth))
+        args = Arguments(smooth, Scales.of(tolerances, times, smooth, equations.sees_time))
         start = initialised(equations, at, smooth, args.scales, self.search)
-        ys, result, stats = states_at(equations, self.options, adjoint, at.t, start.y, ts, args, tolerances)
+        ys, result, stats = states_at(equations, self.options, adjoint, at.t, start.y, times, args, tolerances)
         ys, result = with_status(ys, result, start.conditions, (inputs, ts))
-        return samples_at(equations, ts, ys, params, result, stats | {"start_moved": start.moved}, tolerances)
+        return samples_at(equations, times, ys, params, result, stats | {"start_moved": start.moved}, tolerances)
 
     def push(self, inputs: Inputs, directions: tuple[Inputs, ...], ts: Array) -> tuple[Any, Unchanging]:
         """The samples and their derivatives along directions, for each order; by the variational equations where they hold."""
@@ -91,27 +91,31 @@ class SolutionMap:
             return pushforward(self.solve)(inputs, directions, ts)
         equations, at = self._equations(inputs, ts)
         varying = [split_varying(inputs, of_order)[0].params for of_order in directions]
+        times = ts - ts[0]
+
+        def given(inputs):
+            params = with_second_derivatives(_counted(inputs, ts))
+            return Arguments(params, Scales.of(inputs.tolerances, times, params, equations.sees_time))
 
         def initial(inputs):
-            params = with_second_derivatives(inputs.params)
-            start = initialised(equations, self._at(inputs, ts), params, Scales.of(inputs.tolerances, ts, params), self.search)
+            args = given(inputs)
+            start = initialised(equations, self._at(inputs, ts), args.params, args.scales, self.search)
             return start.y, start
 
-        arguments = lambda inputs: (_first_time(inputs, ts), Arguments(with_second_derivatives(inputs.params)))
+        arguments = lambda inputs: (_first_time(inputs, ts), given(inputs)._replace(scales=None))
         variations = Variations(equations, initial)
         for of_order in directions:
-            variations = variations.along(of_order, (of_order.params, None), of_order.t0, arguments)
+            variations = variations.along(of_order, (SinceOrigin(of_order.params, None), None), of_order.t0, arguments)
         y0, start = variations.initial(inputs)
-        smooth, tolerances = with_second_derivatives(inputs.params), inputs.tolerances
-        args = Arguments(smooth, Scales.of(tolerances, ts, smooth))
+        args, tolerances = given(inputs), inputs.tolerances
         if is_variational(equations, self.options, varying, inputs.params):
             args = args._replace(directions=variations.directions)
-            ys, result, stats = in_one_loop(variations.equations, self.options, at.t, y0, ts, args, tolerances)
+            ys, result, stats = in_one_loop(variations.equations, self.options, at.t, y0, times, args, tolerances)
             last_t, last_y = stats["last"]
             stats = stats | {"last": (last_t, last_y[(..., *[0] * len(directions))])}
         else:
-            along = tuple((of_order.params, of_order.t0) for of_order in directions)
-            ys, result, stats = in_one_loop(equations, self.options, at.t, y0, ts, args, tolerances, directions=along)
+            along = tuple((SinceOrigin(of_order.params, None), of_order.t0) for of_order in directions)
+            ys, result, stats = in_one_loop(equations, self.options, at.t, y0, times, args, tolerances, directions=along)
         return self._samples_and_variations(equations, inputs, directions, ts, ys, result, stats, start)
 
     def _samples_and_variations(self, equations, inputs, directions, ts, ys, result, stats, start):
@@ -122,7 +126,8 @@ class SolutionMap:
 
         def samples(ys_and_params):
             ys, params = ys_and_params
-            return samples_at(equations, ts, ys, params, result, stats, inputs.tolerances)
+            of_these = _counted(inputs._replace(params=params), ts)
+            return samples_at(equations, ts - ts[0], ys, of_these, result, stats, inputs.tolerances)
 
         def with_more(function, directions):
             """Of states with the variations of one order more."""
@@ -143,45 +148,54 @@ class SolutionMap:
     def drift(self, inputs: Inputs, ts: Array, samples: Samples) -> Samples:
         """The change of each sample with its own time."""
         equations, _ = self._equations(inputs, ts)
+        params = _counted(inputs, ts)
 
         def at(t, y):
-            shown, _ = sample_at(equations, t, y, inputs.params, inputs.tolerances)
+            shown, _ = sample_at(equations, t, y, params, inputs.tolerances)
             return y, eqx.filter(shown, eqx.is_inexact_array)
 
         def of_one(t, y):
-            rate = equations.rates(t, y, Arguments(inputs.params))
+            rate = equations.rates(t, y, Arguments(params))
             found, change = jax.jvp(at, (t, y), (jnp.ones_like(t), rate))
             return jax.tree.map(lambda x, dx: jnp.where(jnp.isfinite(x), dx, 0), found, change)
 
-        ys, shown = jax.vmap(of_one)(ts, samples.ys)
+        ys, shown = jax.vmap(of_one)(ts - ts[0], samples.ys)
         return Samples(ys, shown, jax.tree.map(jnp.zeros_like, samples.events))
 
     def _equations(self, inputs: Inputs, ts: Array) -> tuple[EquationsOfMotion, StatesAt]:
         at = self._at(inputs, ts)
         check(self.system, at.t, inputs.q0, inputs.qdot0, inputs.params, at.values)
-        return EquationsOfMotion.of(self.system, inputs.q0, self.options.formulation, inputs.params, at), at
+        return EquationsOfMotion.of(self.system, inputs.q0, self.options.formulation, _counted(inputs, ts), at), at
 
     def _at(self, inputs: Inputs, ts: Array) -> StatesAt:
-        """The start as it is given."""
+        """The start as it is given, on the clock of the motion."""
         q, v = (ravel_pytree(tree)[0] for tree in (inputs.q0, inputs.qdot0))
-        t0, given = _first_time(inputs, ts), (inputs.q0, inputs.qdot0, inputs.params)
-        return StatesAt(start_values(self.system, inputs.states, t0, *given), t0, q, v)
+        t0, given = ts[0] if inputs.t0 is None else inputs.t0, (inputs.q0, inputs.qdot0, inputs.params)
+        return StatesAt(start_values(self.system, inputs.states, t0, *given), _first_time(inputs, ts), q, v)
+
+
+def _counted(inputs: Inputs, ts: Array) -> SinceOrigin:
+    """The params on the clock of the motion, τ = t − ts[0]: in t itself a late motion would have no digits left for its steps."""
+    return SinceOrigin.of(inputs.params, ts[0])
 
 
 def _first_time(inputs: Inputs, ts: Array) -> Array:
-    return ts[0] if inputs.t0 is None else inputs.t0
+    """That of the start on the clock of the motion: zero, but it moves with t0."""
+    return ts[0] - ts[0] if inputs.t0 is None else inputs.t0 - ts[0]
 
 
 def samples_at(equations: EquationsOfMotion, ts, ys, params, result, stats, tolerances) -> tuple[Samples, Unchanging]:
     """The samples of a motion with these states, as far as they keep what a successful motion guarantees; behind them are its events."""
-    ys, events = ys[: ts.size], records(equations, ys[ts.size :])
+    ys, events = ys[: ts.size], records(equations, ys[ts.size :], origin_of(params))
     last_t, last_y = stats["last"]
     times, states = jnp.concatenate([ts, last_t[None]]), jnp.concatenate([ys, last_y[None]])
     samples = jax.vmap(lambda t, y: sample_at(equations, t, y, params, tolerances))(times, states)
     if equations.events:  # behind the end of a motion there is none
         states = jnp.where(states[:, -1:] > 0, jnp.nan, states)
     shown, result, reached = verified(equations, times, states, samples, result, tolerances)
-    counts = {name: count for name, count in stats.items() if name != "last"} | {"reached": jax.lax.stop_gradient(reached)}
+    counts = {name: count for name, count in stats.items() if name != "last"} | {
+        "reached": jax.lax.stop_gradient(origin_of(params) + reached)
+    }
     changing, rest = eqx.partition(shown, eqx.is_inexact_array)
     return Samples(ys, changing, events), Unchanging(result, counts, rest)
 

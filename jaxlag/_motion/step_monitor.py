@@ -70,7 +70,8 @@ def first_end(
     `between(low, high)` are those of the elements' margins that may be negative between two times, for all that is known of them.
     """
     of_time_alone = time_dependence(lambda t, y: margins(t, y, y), t0, path(t0))
-    look, near = _looking(margins, path, t0, t1, of_time_alone), NEAR * scales.rounding
+    look, near = _looking(margins, path, t0, t1, of_time_alone), NEAR * scales.grain
+    grain = 4 * scales.grain  # within which what follows the time has steps that are no jumps
     brief = jnp.maximum(BRIEF * scales.duration, near)
     none = np.zeros(elements, bool)
     hides = lambda low, high: jnp.concatenate([none if between is None else between(low, high), none])
@@ -105,14 +106,14 @@ def first_end(
         )
 
     def going_on(search):
-        wide = search.high - search.low > jnp.maximum(4 * scales.rounding, 1e-13 * (t1 - t0))
+        wide = search.high - search.low > jnp.maximum(grain, 1e-13 * (t1 - t0))
         narrowing = exactly & wide & (search.sections < SECTIONS)
         return jnp.where(search.found, narrowing, (search.low < t1) & (search.rounds < ROUNDS))
 
     nothing, time = jnp.zeros(2 * elements, path(t0).dtype), jnp.asarray(t0, path(t0).dtype)
     start = _Search(time, jnp.asarray(t1, time.dtype), jnp.array(False), 0, 0, *[nothing] * 4)
     done = jax.lax.while_loop(going_on, closer, start)
-    steep = 10 * jnp.abs(done.slope) * (done.high - done.low) + 1e-9 * done.largest
+    steep = 10 * jnp.abs(done.slope) * jnp.maximum(done.high - done.low, grain) + 1e-9 * done.largest
     slope = jnp.where((done.behind < 0) & (done.before - done.behind > steep), -jnp.inf, done.slope)
     is_margin = jnp.any(done.behind[:elements] < 0)
     return Seen(done.found & is_margin, done.found & ~is_margin, ~done.found & (done.low < t1), done.high, slope[:elements])

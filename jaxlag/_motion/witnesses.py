@@ -8,6 +8,7 @@ from jaxtyping import Array, Bool, Float
 from .._mechanics.contact import roundings
 from .._model.event import Either, Rising
 from .._model.flat import Flat
+from .._model.signal import origin_of
 from .first_order import EquationsOfMotion
 from .protocol import Arguments
 from .state_vector import Parts
@@ -28,11 +29,13 @@ def _value_and_scale(equations, t, parts, args):
     multipliers = _multipliers(equations, t, parts, args)(t, parts.q, parts.v)
     of_loads = roundings(jnp.max(jnp.abs(multipliers), initial=0.0) * jnp.ones_like(multipliers))
     at = t, parts.q, parts.v, multipliers
+    late = 4 * jnp.finfo(t.dtype).eps * jnp.abs(origin_of(args.params))  # the rounding of the user's time, which functions see
+    of_times = late * np.array([callable(event.when) for _, event in equations.system.events])
     slopes = [jnp.abs(by).reshape(equations.events, -1) for by in jax.jacfwd(flat.witnesses, argnums=(0, 1, 2, 3))(*at)]
 
     def scale(of_q, of_v):
-        errors = roundings(t[None]), of_q, of_v, of_loads
-        return jax.lax.stop_gradient(sum(jnp.sum(by * of[None], axis=1) for by, of in zip(slopes, errors, strict=True)))
+        errors = (roundings(t[None]) + of_times)[:, None], of_q[None], of_v[None], of_loads[None]
+        return jax.lax.stop_gradient(sum(jnp.sum(by * of, axis=1) for by, of in zip(slopes, errors, strict=True)))
 
     return flat.witnesses(*at), scale
 
