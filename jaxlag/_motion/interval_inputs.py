@@ -204,20 +204,39 @@ def packed(small: PyTree, large: list[Array]) -> tuple[Array, Callable, Callable
     numbers, rest = eqx.partition(small, _is_packable)
     leaves, structure = jax.tree.flatten(numbers)
     dtype = jnp.result_type(float, *(x.dtype for x in (*leaves, *large) if x.dtype.kind == "f"))
-    arrays = [*leaves, *large]
+    arrays = [*(_exact_in_floats(x) for x in leaves), *large]
     starts = [0]
     for x in arrays:
         starts.append(starts[-1] + x.size)
 
     def unpack(vector):
-        parts = [vector[a : a + x.size].reshape(x.shape) for a, x in zip(starts, leaves, strict=False)]
-        exact = [p.astype(x.dtype) if x.dtype.kind == "f" else jnp.round(p).astype(x.dtype) for p, x in zip(parts, leaves, strict=True)]
+        parts = [vector[a : a + x.size].reshape(x.shape) for a, x in zip(starts, arrays[: len(leaves)], strict=False)]
+        exact = [_from_floats(part, x) for part, x in zip(parts, leaves, strict=True)]
         return eqx.combine(jax.tree.unflatten(structure, exact), rest)
 
     def rows(vector):
         return [Rows(vector, a, x.shape, x.dtype) for a, x in zip(starts[len(leaves) :], large, strict=False)]
 
     return jnp.concatenate([jnp.ravel(x).astype(dtype) for x in arrays]), unpack, rows
+
+
+def _exact_in_floats(x: Any) -> Array:
+    """Integers of more than 16 bits as their halves or quarters, in a first axis: single precision holds no integers beyond 2²⁴."""
+    x = jnp.asarray(x)
+    if x.dtype.kind not in "iu" or x.dtype.itemsize <= 2:
+        return x
+    bits = x.astype(f"u{x.dtype.itemsize}")
+    return jnp.stack([(bits >> 16 * k) & 0xFFFF for k in range(x.dtype.itemsize // 2)])
+
+
+def _from_floats(found: Array, like: Any) -> Array:
+    """An array out of the numbers that stand for it."""
+    if like.dtype.kind == "f":
+        return found.astype(like.dtype)
+    if like.dtype.kind == "b" or like.dtype.itemsize <= 2:
+        return jnp.round(found).astype(like.dtype)
+    bits = jnp.round(found).astype(f"u{like.dtype.itemsize}")
+    return functools.reduce(jnp.bitwise_or, (part << 16 * k for k, part in enumerate(bits))).astype(like.dtype)
 
 
 def _is_packable(x: Any) -> Bool[Array, ""] | bool:
