@@ -117,7 +117,9 @@ class Dynamics:
         states = self.states.unravelled(y.z) | self.sampled.unravelled(moved_states(self.inputs, self.held, motion))
         state = dict(t=self.t, q=flat.unravel(y.q), qdot=flat.unravel(y.v), qddot=flat.unravel(qddot))
         forces = flat.unravel_multipliers(multipliers)
-        return call(self.outputs, "`outputs`", at_time(self._params(motion), self.t), **state, multipliers=forces, **states, states=states)
+        return call(
+            self.outputs, "`outputs`", at_time(self._params(motion), self.t)[0], **state, multipliers=forces, **states, states=states
+        )
 
     def output_shapes(self, y: Whole, rows: int) -> PyTree:
         """What the outputs return, in shapes alone."""

@@ -15,7 +15,7 @@ from .._program.sparse_jacobian import empty_rows
 from .contact import Poisson
 from .event import Every, merged
 from .injection import asks_for, call, described, needs
-from .signal import at_time
+from .signal import at_time, origin_of
 from .state_values import of_first_order, sampled, shaped_like
 from .states import flowing, values_at
 from .system import CONSTRAINT_SLOTS, System, role
@@ -150,9 +150,9 @@ class _Bound:
         return self._called(function, role(slot, name), t, q, v, **more)
 
     def _called(self, function, label, t, q, v, **more):
-        state = {"t": t, "q": self.unravel(q)} | ({} if v is None else {"qdot": self.unravel(v)})
-        states = values_at(self.states, t) | {"states": self.states}
-        return call(function, label, at_time(self.params, t), **state, **states, **more)
+        params, now = at_time(self.params, t)
+        state = {"t": now, "q": self.unravel(q)} | ({} if v is None else {"qdot": self.unravel(v)})
+        return call(function, label, params, **state, **values_at(self.states, t), states=self.states, **more)
 
     def lagrangian(self, t, q, v):
         return sum((self.energy(term, t, q, v) for term in self.system.lagrangian), start=jnp.zeros((), q.dtype))
@@ -180,7 +180,7 @@ class _Bound:
         def of_one(name, given, speed):
             if not callable(given):
                 return jnp.asarray(given, speed.dtype)
-            e = jnp.asarray(call(given, f"`restitution` of {name!r}", at_time(self.params, t), speed=speed), speed.dtype)
+            e = jnp.asarray(call(given, f"`restitution` of {name!r}", at_time(self.params, t)[0], speed=speed), speed.dtype)
             return jnp.where(e < 0, 0, jnp.where(e > 1, 1, e))  # not `clip`, which halves the derivative at 0 and 1
 
         found = [of_one(*term, speed) for term, speed in zip(self.system.restitution, speeds, strict=True)]
@@ -211,11 +211,11 @@ class _Bound:
         if isinstance(when, str):  # an impact is seen otherwise
             return jnp.ones((), q.dtype)
         if isinstance(when, tuple):
-            until = np.array(when, q.dtype) - t
+            until = jnp.asarray(np.array(when) - origin_of(self.params) - t, q.dtype)
             return jnp.prod(jnp.where(until < 0, -1, 1)) * jnp.min(jnp.abs(until))
         if isinstance(when, Every):
-            given = call(when.period, f"`period` of {name!r}", at_time(self.params, t)) if callable(when.period) else when.period
-            return jnp.sin(jnp.pi * t / jnp.asarray(given, q.dtype))
+            given = call(when.period, f"`period` of {name!r}", at_time(self.params, t)[0]) if callable(when.period) else when.period
+            return jnp.sin(jnp.pi * (jnp.fmod(origin_of(self.params), 2 * given) + t) / jnp.asarray(given, q.dtype))
         w = self._called(when, f"`when` of {name!r}", t, q, v, multipliers=self.unravel_multipliers(multipliers))
         return jnp.asarray(w, q.dtype)
 

@@ -148,20 +148,21 @@ def least_spacing(params: PyTree, dtype: Any) -> Float[Array, ""]:
 
 
 class Piece(eqx.Module):
-    """A signal between two of its samples: called with the time `now`, it need not look for them."""
+    """A signal between two of its samples: called with the time `now`, it need not look for them. Its samples are at `elapsed` times."""
 
     ts: Float[Array, "2"]
     values: Float[Array, "2 ..."]
     interpolation: AbstractInterpolation = eqx.field(static=True)
     number: int = eqx.field(static=True)
     now: Any = None
+    elapsed: Any = None  # this time on the clock of the samples
 
     def __call__(self, t: ArrayLike) -> Float[Array, "..."]:
         """u(now)."""
         if t is not self.now:
             raise CalledElsewhere(self.number)
-        assert isinstance(t, jax.Array)
-        return self.interpolation.evaluate(self, self.ts.astype(t.dtype), t, 0)
+        assert isinstance(self.elapsed, jax.Array)
+        return self.interpolation.evaluate(self, self.ts.astype(self.elapsed.dtype), self.elapsed, 0)
 
 
 class CalledElsewhere(Exception):
@@ -178,13 +179,66 @@ def broken_signals(params: PyTree) -> list[Signal]:
     return [leaf for leaf in jax.tree.leaves(params, is_leaf=is_signal) if is_broken(leaf)]
 
 
-def at_time(params: PyTree, t: Any) -> PyTree:
-    """`params` with each piece of a signal, and each entry that flows, at the time t."""
-    moves = lambda node: isinstance(node, (Piece, Flowing))
-    if not any(map(moves, jax.tree.leaves(params, is_leaf=moves))):
-        return params
-    now = lambda node: dataclasses.replace(node, now=t) if isinstance(node, Piece) else node(t) if isinstance(node, Flowing) else node
-    return jax.tree.map(now, params, is_leaf=moves)
+class SinceOrigin(eqx.Module):
+    """`params` on a clock that counts from an `origin`, t = origin + τ: samples of signals are at times τ, functions are handed t.
+
+    However late a motion is, what is computed in τ keeps its digits, differences of times above all.
+    """
+
+    params: PyTree
+    origin: Float[Array, ""] | None  # None of directions, along which it stays
+
+    @classmethod
+    def of(cls, params: PyTree, origin: Float[Array, ""]) -> "SinceOrigin":
+        """Those of `params` whose signals count as the user does."""
+        earlier = lambda node: eqx.tree_at(lambda signal: signal.ts, node, (node.ts - origin).astype(node.ts.dtype))
+        return cls(jax.tree.map(lambda node: earlier(node) if is_signal(node) else node, params, is_leaf=is_signal), origin)
+
+
+class SignalSinceOrigin(eqx.Module):
+    """A signal whose samples count from an origin, called with times that do not."""
+
+    counted: Signal
+    origin: Float[Array, ""]
+    now: Any
+    elapsed: Any  # this time since the origin, which has more digits
+
+    def __call__(self, t: ArrayLike) -> Float[Array, "..."]:
+        """u(t)."""
+        return self.counted(self.elapsed if t is self.now else t - self.origin)
+
+    @property
+    def ts(self) -> Float[Array, " T"]:
+        """The sample times as given."""
+        return self.counted.ts + self.origin
+
+    @property
+    def values(self) -> Float[Array, "T ..."]:
+        """One for each time."""
+        return self.counted.values
+
+
+def origin_of(params: PyTree) -> Any:
+    """Where the clock of `params` begins."""
+    return params.origin if isinstance(params, SinceOrigin) else 0
+
+
+def at_time(params: PyTree, t: Any) -> tuple[PyTree, Any]:
+    """`params` and the time as the user's functions are handed them, at the time t of the clock: each signal, and each entry that flows."""
+    is_counted = isinstance(params, SinceOrigin)
+    given, now = (params.params, params.origin + t) if is_counted else (params, t)
+    moves = lambda node: isinstance(node, (Piece, Flowing)) or (is_counted and is_signal(node))
+    if not any(map(moves, jax.tree.leaves(given, is_leaf=moves))):
+        return given, now
+
+    def of(node):
+        if isinstance(node, Piece):
+            return dataclasses.replace(node, now=now, elapsed=t)
+        if isinstance(node, Flowing):
+            return node(t)
+        return SignalSinceOrigin(node, params.origin, now, t) if moves(node) else node
+
+    return jax.tree.map(of, given, is_leaf=moves), now
 
 
 def moves_smoothly(moving: PyTree, params: PyTree) -> bool:

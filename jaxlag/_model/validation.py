@@ -15,7 +15,7 @@ from .._program.walker import used_arguments
 from .event import merged
 from .flat import Flat, StatesAt, bind, flat_like
 from .given import Given, known, remember
-from .injection import call, check_entries, described, missing
+from .injection import asks_for, call, check_entries, described, missing
 from .numbers import Label, in_dtype, number, numbers
 from .state_values import given_states, of_first_order, sampled, shaped_like, start_values
 from .system import CONSTRAINT_SLOTS, SLOTS, System, role
@@ -218,6 +218,13 @@ def _check_state_names(system, q, params):
     check_entries(params, names)
     for name in set(names) & set(q if isinstance(q, Mapping) else ()):
         raise ValueError(f"`states` must not have a state named {name!r}, but has one, and so has q. Rename the state.")
+    if isinstance(params, Mapping) and "speed" in params:
+        for name, e in system.restitution:
+            if callable(e) and asks_for(e, "speed"):
+                raise ValueError(
+                    f"`params` must not have an entry named 'speed' where `restitution` of {name!r} asks for the speed of approach under "
+                    "that name, but has one. Rename the entry."
+                )
 
 
 def without_contacts(system: System, label: str) -> None:

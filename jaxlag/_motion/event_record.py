@@ -1,6 +1,7 @@
 """What is recorded of events: each is a row behind the samples of a motion."""
 
 from collections.abc import Callable
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -33,14 +34,18 @@ def with_events(equations: FirstOrderSystem, write: Callable, saved, samples: in
     return saved
 
 
-def records(equations: EquationsOfMotion, rows: Float[Array, "r y"]) -> dict[str, tuple[Array, PyTree, PyTree, dict[str, PyTree]]]:
-    """By name, the times of events and q, q̇ and the states before each, from the rows behind the samples; NaN beyond the last."""
+def records(
+    equations: EquationsOfMotion, rows: Float[Array, "r y"], origin: Any
+) -> dict[str, tuple[Array, PyTree, PyTree, dict[str, PyTree]]]:
+    """By name, the times of events and q, q̇ and the states before each, from the rows behind the samples, on a clock whose zero is the
+    `origin`; NaN beyond the last.
+    """
 
     def of_one(y):
         sizes = 1, equations.size, equations.size, equations.states.size
         t, q, v, z, u = jnp.split(equations.parts(y).seen, np.cumsum(sizes))
         states = equations.states.unravelled(z) | equations.sampled.unravelled(u)
-        return t[0], equations.like.unravelled(q), equations.like.unravelled(v), states
+        return origin + t[0], equations.like.unravelled(q), equations.like.unravelled(v), states
 
     of_each = jnp.split(rows, np.cumsum(most(equations))[:-1])
     return {name: jax.vmap(of_one)(of) for (name, _), of in zip(equations.system.events, of_each, strict=False)}

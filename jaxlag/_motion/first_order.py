@@ -23,13 +23,13 @@ from .._mechanics.projection import Baumgarte, NoStabilisation, Projection
 from .._mechanics.saddle_point import SaddlePoint
 from .._mechanics.stick_slip import Friction, friction, in_mode, redirected, slip_of, sticking
 from .._model.flat import Flat, StatesAt, bind
-from .._model.signal import broken_signals
+from .._model.signal import at_time, broken_signals
 from .._model.state_values import NOTHING, Layout, of_first_order, period, ravelled, sampled
 from .._model.system import System
 from .._program.jit import jitted
 from .._program.scalarise import scalarised
 from .._program.walker import used_arguments
-from .interval_inputs import called_elsewhere, pieces_at, warn_of_delays
+from .interval_inputs import at_events, called_elsewhere, pieces_at, sees_time, values_of, warn_of_delays
 from .protocol import Arguments
 from .state_vector import Parts
 
@@ -60,6 +60,7 @@ class EquationsOfMotion:
     contacts: int = 0
     events: int = 0
     light: tuple[int, ...] = ()  # coordinates without inertia, whose velocities follow from the rest
+    sees_time: bool = False  # whether functions ask for the time, beside signals at that time
 
     @classmethod
     def of(cls, system: System, q0: PyTree, formulation: Formulation, params: PyTree, at: StatesAt) -> "EquationsOfMotion":
@@ -67,14 +68,16 @@ class EquationsOfMotion:
         z, u = (Layout.of({name: at.values[name] for name in of}) for of in (of_first_order(system), sampled(system)))
         alone = cls(system, Layout.of(q0), formulation, states=z, sampled=u, contacts=len(system.unilateral), events=len(system.events))
         if broken_signals(params):
-            elsewhere = called_elsewhere(lambda params: _values(bind(system, q0, params, at), *at[1:]), params)
+            of_all = lambda flat: (values_of(flat, *at[1:]), at_events(system, flat, *at[1:]))
+            elsewhere = called_elsewhere(lambda params: of_all(bind(system, q0, params, at)), params)
             warn_of_delays(params, elsewhere)
             numbers, rest = eqx.partition(params, lambda leaf: isinstance(leaf, (jax.Array, np.ndarray)))
             used = used_arguments(lambda part: alone.flat_at(eqx.combine(part, rest), at).bilateral(*at[1:3]), numbers)[0]
             driving = (k for k, signal in enumerate(broken_signals(used)) if any(jax.tree.leaves(signal)))
             alone = dataclasses.replace(alone, elsewhere=elsewhere, driving=frozenset(driving))
         light = light_coordinates(alone.flat_at(params, at), *at[1:])
-        alone = dataclasses.replace(alone, light=tuple(map(int, light)))
+        sees = sees_time(lambda params: values_of(alone.flat_at(params, at), *at[1:]), system, params)
+        alone = dataclasses.replace(alone, light=tuple(map(int, light)), sees_time=sees)
         elements = formulation.friction.elements(alone.flat_at(params, at), *at[1:])
         if system.unilateral:
             check_impacts(alone.flat_at(params, at), elements, formulation.friction)
@@ -140,7 +143,7 @@ class EquationsOfMotion:
 
     def periods(self, params: PyTree) -> list[Float[Array, ""]]:
         """Those of the sampled states."""
-        return [period(self.system, name, params) for name in self.sampled_names]
+        return [period(self.system, name, at_time(params, 0.0)[0]) for name in self.sampled_names]
 
     @property
     def controlled(self) -> tuple[bool, ...]:
@@ -225,14 +228,6 @@ class EquationsOfMotion:
     def exhausted(self, y):
         """Whether there were more transitions than allowed."""
         return jnp.any(self.parts(y).transitions > self.formulation.friction.max_transitions)
-
-
-def _values(flat: Flat, t, q, v):
-    """What all functions of a system return."""
-    multipliers = jnp.zeros(flat.rows, v.dtype)
-    given = [D(t, q, v, multipliers) for D in (*flat.dissipations.values(), *flat.forces.values())]
-    of_states = flat.state_rates(t, q, v), flat.updates(t, q, v)
-    return flat.lagrangian(t, q, v), flat.bilateral(t, q), flat.gaps(t, q), flat.nonholonomic(t, q, v), given, of_states
 
 
 @jitted  # so that diffrax's many calls trace it once

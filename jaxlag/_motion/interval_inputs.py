@@ -1,5 +1,6 @@
 """Measured inputs as the loop from node to node reads them: row by row, out of one vector."""
 
+import dataclasses
 import functools
 import math
 import warnings
@@ -11,8 +12,12 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
-from .._model.signal import CalledElsewhere, Piece, Signal, broken_signals, is_broken, is_signal
+from .._model.flat import Flat
+from .._model.injection import needs
+from .._model.signal import CalledElsewhere, Piece, Signal, SinceOrigin, broken_signals, is_broken, is_signal
 from .._model.signal_interpolation import AbstractInterpolation
+from .._model.system import System
+from .._program.walker import used_arguments
 
 
 class Rows(NamedTuple):
@@ -143,6 +148,29 @@ def called_elsewhere(values: Callable, params: PyTree) -> frozenset[int]:
             return frozenset(found)
 
 
+def values_of(flat: Flat, t, q, v) -> PyTree:
+    """What all functions of a system return."""
+    multipliers = jnp.zeros(flat.rows, v.dtype)
+    given = [D(t, q, v, multipliers) for D in (*flat.dissipations.values(), *flat.forces.values())]
+    of_states = flat.state_rates(t, q, v), flat.updates(t, q, v)
+    return flat.lagrangian(t, q, v), flat.bilateral(t, q), flat.gaps(t, q), flat.nonholonomic(t, q, v), given, of_states
+
+
+def at_events(system: System, flat: Flat, t, q, v) -> PyTree:
+    """What the functions of events return."""
+    changing = [name for name, event in system.events if event.then is not None]
+    return flat.witnesses(t, q, v, jnp.zeros(flat.rows, v.dtype)), [flat.happened(name, t, q, v) for name in changing]
+
+
+def sees_time(values: Callable, system: System, params: PyTree) -> bool:
+    """Whether functions ask for the time, beside signals at that time; `values(params)` is what those that are no events' return."""
+    if not isinstance(params, SinceOrigin):
+        return False
+    of_events = [function for _, event in system.events for function in (event.when, event.then) if callable(function)]
+    of_origin = lambda origin: values(dataclasses.replace(params, origin=origin))
+    return any(needs(function, "t") for function in of_events) or bool(used_arguments(of_origin, params.origin)[0])
+
+
 def warn_of_delays(params: PyTree, elsewhere: frozenset[int]) -> None:
     """Of jumps at times that are not known, which steps go over and derivatives leave out."""
     if any(signal.interpolation.jumps for k, signal in enumerate(broken_signals(params)) if k in elsewhere):
@@ -176,20 +204,39 @@ def packed(small: PyTree, large: list[Array]) -> tuple[Array, Callable, Callable
     numbers, rest = eqx.partition(small, _is_packable)
     leaves, structure = jax.tree.flatten(numbers)
     dtype = jnp.result_type(float, *(x.dtype for x in (*leaves, *large) if x.dtype.kind == "f"))
-    arrays = [*leaves, *large]
+    arrays = [*(_exact_in_floats(x) for x in leaves), *large]
     starts = [0]
     for x in arrays:
         starts.append(starts[-1] + x.size)
 
     def unpack(vector):
-        parts = [vector[a : a + x.size].reshape(x.shape) for a, x in zip(starts, leaves, strict=False)]
-        exact = [p.astype(x.dtype) if x.dtype.kind == "f" else jnp.round(p).astype(x.dtype) for p, x in zip(parts, leaves, strict=True)]
+        parts = [vector[a : a + x.size].reshape(x.shape) for a, x in zip(starts, arrays[: len(leaves)], strict=False)]
+        exact = [_from_floats(part, x) for part, x in zip(parts, leaves, strict=True)]
         return eqx.combine(jax.tree.unflatten(structure, exact), rest)
 
     def rows(vector):
         return [Rows(vector, a, x.shape, x.dtype) for a, x in zip(starts[len(leaves) :], large, strict=False)]
 
     return jnp.concatenate([jnp.ravel(x).astype(dtype) for x in arrays]), unpack, rows
+
+
+def _exact_in_floats(x: Any) -> Array:
+    """Integers of more than 16 bits as their halves or quarters, in a first axis: single precision holds no integers beyond 2²⁴."""
+    x = jnp.asarray(x)
+    if x.dtype.kind not in "iu" or x.dtype.itemsize <= 2:
+        return x
+    bits = x.astype(f"u{x.dtype.itemsize}")
+    return jnp.stack([(bits >> 16 * k) & 0xFFFF for k in range(x.dtype.itemsize // 2)])
+
+
+def _from_floats(found: Array, like: Any) -> Array:
+    """An array out of the numbers that stand for it."""
+    if like.dtype.kind == "f":
+        return found.astype(like.dtype)
+    if like.dtype.kind == "b" or like.dtype.itemsize <= 2:
+        return jnp.round(found).astype(like.dtype)
+    bits = jnp.round(found).astype(f"u{like.dtype.itemsize}")
+    return functools.reduce(jnp.bitwise_or, (part << 16 * k for k, part in enumerate(bits))).astype(like.dtype)
 
 
 def _is_packable(x: Any) -> Bool[Array, ""] | bool:

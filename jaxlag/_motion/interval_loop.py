@@ -18,6 +18,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
+from .._model.signal import origin_of
 from .._model.states import flow
 from .._program.single_kernel import in_one_kernel
 from .event_record import has_stopped, with_events
@@ -104,6 +105,7 @@ class IntervalLoop(NamedTuple):
         """From the first sample to the last, or as far as it goes; with what was saved at the samples. `sample` is the first one later."""
         first, last = (self.ts.at(i)[0] for i in (0, self.ts.shape[0] - 1))
         rounding = jnp.finfo(y0.dtype).eps * jnp.maximum(jnp.abs(first), jnp.abs(last))
+        same = rounding + jnp.finfo(y0.dtype).eps * jnp.abs(origin_of(numbers.varied[0]))  # times as given, which round with the user's
         variations = self.variations + len(numbers.directions)
         control = StepControl.of(numbers.tolerances, (first, last), self.equations, variations, resumes=not self.dense)
         now = lambda x: _alone(x, numbers)
@@ -114,7 +116,7 @@ class IntervalLoop(NamedTuple):
             size = steps.control[0].size
             stepping = self._replace(solver=with_tolerances(self.solver, control, now(size)))
             scaled = numbers._replace(args=numbers.args._replace(scales=_at_scale(numbers.args.scales, size)))
-            (moving, reached), (steps, is_sample) = stepping._varied(control, rounding, steps, scaled)(moving)
+            (moving, reached), (steps, is_sample) = stepping._varied(control, same, steps, scaled)(moving)
             meter = self.meter.step(meter, (now(moving.t) - first) / (last - first))
             if self.dense:
                 steps, saved = self._sampled(steps, (before.t, now(moving.t)), reached.dense, numbers, saved, write)
@@ -157,13 +159,13 @@ class IntervalLoop(NamedTuple):
         zero = jnp.array(0)
         return moving, Steps(t1 - first, rest, state, jnp.array(is_new), following, sample, dfx.RESULTS.successful, zero, zero)
 
-    def _varied(self, control: StepControl, rounding, steps: Steps, numbers: Numbers) -> Callable:
+    def _varied(self, control: StepControl, same, steps: Steps, numbers: Numbers) -> Callable:
         """A step of what moves and its value at a sample, with their variations along the directions of what is varied, for each order.
 
         It is tried first, then it is decided whether its errors are small enough, those of the variations among them.
         """
         args = numbers.args
-        tried = varied_along(lambda moving, given: self._tried(rounding, moving, given, steps, args), numbers.directions)
+        tried = varied_along(lambda moving, given: self._tried(same, moving, given, steps, args), numbers.directions)
 
         def step(moving):
             found, (solved, rest) = tried(moving, numbers.varied)
@@ -171,7 +173,7 @@ class IntervalLoop(NamedTuple):
             t0, t1 = (_alone(t, numbers) for t in now[:2])
             decided = control.adapt_step_size(t0, t1, *now[2:4], args, now[4], self.solver.error_order(self._term()), steps.control)
             decided = jax.lax.stop_gradient((decided, solved, rest))
-            done = lambda both, given: self._done(rounding, *both, given, steps, args, decided)
+            done = lambda both, given: self._done(same, *both, given, steps, args, decided)
             return varied_along(done, numbers.directions)((moving, found), numbers.varied)
 
         return step
@@ -199,12 +201,15 @@ class IntervalLoop(NamedTuple):
         ticks = [jnp.where(tick > t, tick, jnp.inf) for tick in ticks]  # a period that is not positive has none
         return [*inputs.times(steps.following, t), *ticks]
 
-    def _tried(self, rounding, moving: Moving, given, steps: Steps, args) -> tuple[Tried, Any]:
-        """A step of the solver up to the next node at most; and, not differentiated, its result and the rest of the solver's state."""
+    def _tried(self, same, moving: Moving, given, steps: Steps, args) -> tuple[Tried, Any]:
+        """A step of the solver up to the next node at most; and, not differentiated, its result and the rest of the solver's state.
+
+        Nodes are at one time where they are no further apart than the `same` time may be by rounding.
+        """
         t, coming = moving.t, self._coming(given, moving.t, steps)
         sample = self.ts.at(self.ts.shape[0] - 1)[0] if self.dense else self.sample_time(steps.sample)
-        node, end = functools.reduce(lambda first, time: jnp.where(time + rounding < first, time, first), coming, sample), t + steps.length
-        t1 = jnp.where(end + rounding >= node, node, end)
+        node, end = functools.reduce(lambda first, time: jnp.where(time + same < first, time, first), coming, sample), t + steps.length
+        t1 = jnp.where(end + same >= node, node, end)
         args = args._replace(params=self.inputs(given[0]).pieces(steps.following))
         state = eqx.combine(moving.solver_state, steps.solver_state)
         y, error, dense, new, result = self.solver.step(self._term(), t, t1, moving.y, args, state, steps.has_jumped)
@@ -212,7 +217,7 @@ class IntervalLoop(NamedTuple):
         result = None if result is dfx.RESULTS.successful else result  # always, as of an explicit scheme: to compare them would be compiled
         return Tried(t1, node, y, error, changing, dense if self.dense else None), jax.lax.stop_gradient((result, rest))
 
-    def _done(self, rounding, moving: Moving, tried: Tried, given, steps: Steps, args, decided) -> tuple[tuple[Moving, Reached], Any]:
+    def _done(self, same, moving: Moving, tried: Tried, given, steps: Steps, args, decided) -> tuple[tuple[Moving, Reached], Any]:
         """What follows a step, tried and `decided` on: where it is kept, behind the jumps at its end."""
         (keep, begin, end, _, control, result), solved, rest = decided
         old = moving.y, moving.solver_state, steps.solver_state
@@ -225,9 +230,9 @@ class IntervalLoop(NamedTuple):
         args, after = args._replace(params=inputs.pieces(steps.following)), args
 
         t = jnp.where(keep, t1, moving.t)
-        passed = [keep & (t1 == node) & (time <= node + rounding) for time in coming]
+        passed = [keep & (t1 == node) & (time <= node + same) for time in coming]
         following = tuple(i + by for i, by in zip(steps.following, passed, strict=True))
-        is_sample = keep & (t1 == node) & (sample <= node + rounding)
+        is_sample = keep & (t1 == node) & (sample <= node + same)
         for time, by, moves in zip(coming, passed, self.moving, strict=True):
             if moves:  # two nodes at one time are so for these numbers alone
                 y = jnp.where(by, self._moved(time, t, y, args), y)

@@ -10,6 +10,7 @@ from .._mechanics.constraint_residuals import off_constraints
 from .._mechanics.contact import contact_rows, gap_scales, idle
 from .._mechanics.saddle_point import Sound
 from .._mechanics.stick_slip import friction_by_term, slip_of, sticking
+from .._model.signal import origin_of
 from .._program.implicit import undifferentiated
 from .._program.scalarise import scalarised
 from .first_order import EquationsOfMotion
@@ -76,7 +77,7 @@ def sample_at(equations: EquationsOfMotion, t, y, params, scales: Scales) -> tup
     named = dict(zip(equations.works, works, strict=True)) if equations.works else None
     if equations.contacts:
         violation = violation.beside(*_contact_violation(flat, t, parts, multipliers, scales))
-    of_contact = parts.closed > 0.5, parts.impacts, parts.changed, parts.impulse
+    of_contact = parts.closed > 0.5, parts.impacts, origin_of(params) + parts.changed, parts.impulse
     contacts = dict(zip(flat.contacts, zip(*of_contact, strict=True), strict=True))
     events = dict(zip(dict(equations.system.events), parts.happened, strict=True))
     unraveled = flat.unravel(q), flat.unravel(v), flat.unravel(qddot), flat.unravel_multipliers(multipliers)

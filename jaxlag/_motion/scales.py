@@ -14,7 +14,7 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, PyTree
 
 from .._model.numbers import number, numbers
-from .._model.signal import least_spacing
+from .._model.signal import least_spacing, origin_of
 from .._program.jit import is_concrete
 
 SHARE = 0.01  # of its own scale, what of a coordinate near zero is compared with
@@ -22,8 +22,8 @@ LEAST = 1e-3  # of a coordinate's own scale, what its velocity has to move it by
 
 
 class Scales(NamedTuple):
-    """What counts as small in a motion: tolerances, its duration, the sample spacing of its inputs, the rounding of its times, and beside
-    q and q̇, the scale of each along the motion so far.
+    """What counts as small in a motion: tolerances, its duration, the sample spacing of its inputs, the rounding of its times, and that of
+    the times that functions see, where they ask for them; and of q and q̇ the scale of each along the motion so far.
     """
 
     rtol: Any
@@ -31,16 +31,17 @@ class Scales(NamedTuple):
     duration: Any
     spacing: Any
     rounding: Any
+    grain: Any
     of_q: Any
     of_v: Any
     driven: Any = None  # of each velocity, the least scale that dry friction in a plane gives it
 
     @classmethod
-    def of(cls, tolerances: tuple[Array, Array | None], ts: Array, params: PyTree, q: Array, v: Array) -> "Scales":
-        """The scales of a motion at the times `ts`, where q and q̇ have been as large as this."""
-        end = jnp.maximum(jnp.abs(ts[0]), jnp.abs(ts[-1]))
-        spacing = least_spacing(params, ts.dtype)
-        found = cls(*tolerances, ts[-1] - ts[0], spacing, jnp.finfo(ts.dtype).eps * end, q, v)
+    def of(cls, tolerances: tuple[Array, Array | None], ts: Array, params: PyTree, q: Array, v: Array, sees_time: bool) -> "Scales":
+        """The scales of a motion at the times `ts` since the origin of `params`, where q and q̇ have been as large as this."""
+        end, eps = jnp.maximum(jnp.abs(ts[0]), jnp.abs(ts[-1])), jnp.finfo(ts.dtype).eps
+        seen = end + jnp.abs(origin_of(params)) if sees_time else end
+        found = cls(*tolerances, ts[-1] - ts[0], least_spacing(params, ts.dtype), eps * end, eps * seen, q, v)
         return jax.lax.stop_gradient(found.at(jnp.abs(jnp.concatenate([q, v]))))
 
     def at(self, sizes: Array) -> "Scales":

@@ -18,7 +18,7 @@ from .._model.deprecation import renamed
 from .._model.event import Event
 from .._model.flat import StatesAt
 from .._model.paths import is_within, leaf_names, listed
-from .._model.signal import is_signal, jump_times, with_second_derivatives
+from .._model.signal import SinceOrigin, is_signal, jump_times, with_second_derivatives
 from .._model.state_values import start_values
 from .._model.system import System
 from .._model.validation import check, coordinates, parameters, sample_times, state
@@ -208,18 +208,25 @@ def _batch(system, equations, options, own, shared, ts, tolerances):
     def one(ys, last_y, result, moved, own):
         params = eqx.combine(own, shared)["params"]
         of_member = stats | {"start_moved": moved, "last": (last_t, last_y)}
-        return trajectory_of(system, options, params, ts, *samples_at(equations, ts, ys, params, result, of_member, tolerances))
+        samples = samples_at(equations, ts - ts[0], ys, SinceOrigin.of(params, ts[0]), result, of_member, tolerances)
+        return trajectory_of(system, options, params, ts, *samples)
 
     return jax.vmap(one, in_axes=(-1, -1, 0, 0, 0))(ys, last_ys, result, moved, own)
 
 
 def _motions(equations, options, inputs, ts):
     """States at the samples, (T, size, members); and, not differentiated, why each motion ended, the counts, how far starts were off."""
-    (t0, tolerances, shared), own = inputs
+    (t0, tolerances, _), _ = inputs
     y0, start = _initialised(equations, inputs, ts)
-    args = Arguments(with_second_derivatives(shared["params"]), own=own["params"])
-    ys, result, stats = by_diffrax(BatchedEquations(equations), options, dfx.ForwardMode(), t0, y0, ts, args, tolerances)
+    given = t0 - ts[0], y0, ts - ts[0], _arguments(inputs, ts), tolerances
+    ys, result, stats = by_diffrax(BatchedEquations(equations), options, dfx.ForwardMode(), *given)
     return _with_status(ys, result, stats, start)
+
+
+def _arguments(inputs, ts):
+    """Params on the clock of the motions, as of a `SolutionMap`, with second derivatives of signals."""
+    (_, _, shared), own = inputs
+    return Arguments(SinceOrigin.of(with_second_derivatives(shared["params"]), ts[0]), own=SinceOrigin(own["params"], None))
 
 
 def _motions_and_variations(equations, options, inputs, directions, ts):
@@ -229,12 +236,12 @@ def _motions_and_variations(equations, options, inputs, directions, ts):
     varying = split_varying(inputs, directions)[0][0][2]["params"]
     if not is_variational(equations, options, varying, shared["params"]):
         return pushforward(functools.partial(_motions, equations, options))(inputs, (directions,), ts)
-    args = Arguments(with_second_derivatives(shared["params"]), own=own["params"])
+    args, along = _arguments(inputs, ts), (SinceOrigin(d_shared["params"], None), SinceOrigin(d_own["params"], None))
     variations = Variations(BatchedEquations(equations), lambda inputs: _initialised(equations, inputs, ts))
-    variations = variations.along(directions, (d_shared["params"], d_own["params"]), dt0, lambda _: (t0, args))
+    variations = variations.along(directions, along, dt0, lambda _: (t0 - ts[0], args))
     y0, start = variations.initial(inputs)
     args = args._replace(directions=variations.directions)
-    ys, result, stats = by_diffrax(variations.equations, options, dfx.ForwardMode(), t0, y0, ts, args, tolerances)
+    ys, result, stats = by_diffrax(variations.equations, options, dfx.ForwardMode(), t0 - ts[0], y0, ts - ts[0], args, tolerances)
     last_t, last_y = stats["last"]
     ys, change = ys[..., 0], ys[..., 1:]
     ys, aux = _with_status(ys, result, stats | {"last": (last_t, last_y[..., 0])}, start)
@@ -248,7 +255,8 @@ def _initialised(equations, inputs, ts):
 
     def start(own):
         member = eqx.combine(own, shared)
-        found = initialised(equations, _at(equations.system, t0, *(member[name] for name in ("q0", "qdot0", "params"))), member["params"])
+        at = _at(equations.system, t0, *(member[name] for name in ("q0", "qdot0", "params")))
+        found = initialised(equations, at._replace(t=t0 - ts[0]), SinceOrigin.of(member["params"], ts[0]))
         return found.y, (found.moved, with_status(found.y, RESULTS.successful, found.conditions, (member, ts))[1])
 
     y0, start = jax.vmap(start, in_axes=-1, out_axes=(-1, 0))(own)
@@ -262,6 +270,5 @@ def _with_status(ys, result, stats, start):
 
 
 def _drift(equations, inputs, ts, ys):
-    (_, _, shared), own = inputs
-    args = Arguments(shared["params"], own=own["params"])
-    return jax.vmap(lambda t, y: BatchedEquations(equations).rates(t, y, args))(ts, ys)
+    args = _arguments(inputs, ts)
+    return jax.vmap(lambda t, y: BatchedEquations(equations).rates(t, y, args))(ts - ts[0], ys)

@@ -12,7 +12,7 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, PyTree
 
 from .._model.flat import StatesAt
-from .._model.signal import is_signal, with_second_derivatives
+from .._model.signal import SinceOrigin, is_signal, origin_of, with_second_derivatives
 from .._model.state_values import start_values
 from .._model.system import System
 from .._model.validation import check
@@ -78,16 +78,16 @@ class SolutionMap:
 
     def _solve(self, inputs: Inputs, ts: Array, adjoint: dfx.AbstractAdjoint) -> tuple[Samples, Unchanging]:
         equations, at = self._equations(inputs, ts)
-        params, tolerances = inputs.params, inputs.tolerances
+        params, times, tolerances = _counted(inputs, ts), ts - ts[0], inputs.tolerances
         smooth = with_second_derivatives(params)
-        args = Arguments(smooth, Scales.of(tolerances, ts, smooth, at.q, at.v))
+        args = Arguments(smooth, Scales.of(tolerances, times, smooth, at.q, at.v, equations.sees_time))
         start = initialised(equations, at, smooth, args.scales, self.search)
         if isinstance(adjoint, dfx.ForwardMode) or self.options.adjoint or not is_variational(equations, self.options, None, params):
-            ys, result, stats = states_at(equations, self.options, adjoint, at.t, start.y, ts, args, tolerances)
+            ys, result, stats = states_at(equations, self.options, adjoint, at.t, start.y, times, args, tolerances)
         else:
             ys, result, stats = self._accompanied(equations, adjoint, start.y, inputs, ts, args)
         ys, result = with_status(ys, result, start.conditions, (inputs, ts))
-        return samples_at(equations, ts, ys, params, result, stats | {"start_moved": start.moved}, tolerances)
+        return samples_at(equations, times, ys, params, result, stats | {"start_moved": start.moved}, tolerances)
 
     def _accompanied(self, equations, adjoint, y0, inputs: Inputs, ts: Array, args: Arguments):
         """The states of a motion in steps that fit a variation along a direction at random as well: reverse mode asks for all."""
@@ -96,22 +96,27 @@ class SolutionMap:
         of_start = jax.lax.stop_gradient(variations.initial(jax.lax.stop_gradient(inputs))[0][..., 1:])
         args = args._replace(directions=variations.directions)
         y0, accompanied = with_variations(y0, of_start), AccompaniedEquations(equations)
-        ys, result, stats = states_at(accompanied, self.options, adjoint, _first_time(inputs, ts), y0, ts, args, inputs.tolerances)
+        t0, times = _first_time(inputs, ts), ts - ts[0]
+        ys, result, stats = states_at(accompanied, self.options, adjoint, t0, y0, times, args, inputs.tolerances)
         last_t, last_y = stats["last"]
         return ys[..., 0], result, stats | {"last": (last_t, last_y[..., 0])}
+
+    def _arguments(self, equations, inputs: Inputs, ts: Array) -> Arguments:
+        params, at = with_second_derivatives(_counted(inputs, ts)), self._at(inputs, ts)
+        return Arguments(params, Scales.of(inputs.tolerances, ts - ts[0], params, at.q, at.v, equations.sees_time))
 
     def _variations(self, equations, inputs: Inputs, directions: tuple[Inputs, ...], ts: Array) -> Variations:
         """The equations of the motion with its variations along directions, for each order."""
 
         def initial(inputs):
-            at, params = self._at(inputs, ts), with_second_derivatives(inputs.params)
-            start = initialised(equations, at, params, Scales.of(inputs.tolerances, ts, params, at.q, at.v), self.search)
+            args = self._arguments(equations, inputs, ts)
+            start = initialised(equations, self._at(inputs, ts), args.params, args.scales, self.search)
             return start.y, start
 
-        arguments = lambda inputs: (_first_time(inputs, ts), Arguments(with_second_derivatives(inputs.params)))
+        arguments = lambda inputs: (_first_time(inputs, ts), self._arguments(equations, inputs, ts)._replace(scales=None))
         variations = Variations(equations, initial)
         for of_order in directions:
-            variations = variations.along(of_order, (of_order.params, None), of_order.t0, arguments)
+            variations = variations.along(of_order, (SinceOrigin(of_order.params, None), None), of_order.t0, arguments)
         return variations
 
     def push(self, inputs: Inputs, directions: tuple[Inputs, ...], ts: Array) -> tuple[Any, Unchanging]:
@@ -120,18 +125,17 @@ class SolutionMap:
             return pushforward(self.solve)(inputs, directions, ts)
         equations, at = self._equations(inputs, ts)
         varying = [split_varying(inputs, of_order)[0].params for of_order in directions]
-        variations = self._variations(equations, inputs, directions, ts)
+        variations, times = self._variations(equations, inputs, directions, ts), ts - ts[0]
         y0, start = variations.initial(inputs)
-        smooth, tolerances = with_second_derivatives(inputs.params), inputs.tolerances
-        args = Arguments(smooth, Scales.of(tolerances, ts, smooth, at.q, at.v))
+        args, tolerances = self._arguments(equations, inputs, ts), inputs.tolerances
         if is_variational(equations, self.options, varying, inputs.params):
             args = args._replace(directions=variations.directions)
-            ys, result, stats = in_one_loop(variations.equations, self.options, at.t, y0, ts, args, tolerances)
+            ys, result, stats = in_one_loop(variations.equations, self.options, at.t, y0, times, args, tolerances)
             last_t, last_y = stats["last"]
             stats = stats | {"last": (last_t, last_y[(..., *[0] * len(directions))])}
         else:
-            along = tuple((of_order.params, of_order.t0) for of_order in directions)
-            ys, result, stats = in_one_loop(equations, self.options, at.t, y0, ts, args, tolerances, directions=along)
+            along = tuple((SinceOrigin(of_order.params, None), of_order.t0) for of_order in directions)
+            ys, result, stats = in_one_loop(equations, self.options, at.t, y0, times, args, tolerances, directions=along)
         return self._samples_and_variations(equations, inputs, directions, ts, ys, result, stats, start)
 
     def _samples_and_variations(self, equations, inputs, directions, ts, ys, result, stats, start):
@@ -142,7 +146,8 @@ class SolutionMap:
 
         def samples(ys_and_params):
             ys, params = ys_and_params
-            return samples_at(equations, ts, ys, params, result, stats, inputs.tolerances)
+            of_these = _counted(inputs._replace(params=params), ts)
+            return samples_at(equations, ts - ts[0], ys, of_these, result, stats, inputs.tolerances)
 
         def with_more(function, directions):
             """Of states with the variations of one order more."""
@@ -163,30 +168,36 @@ class SolutionMap:
     def drift(self, inputs: Inputs, ts: Array, samples: Samples) -> Samples:
         """The change of each sample with its own time."""
         equations, _ = self._equations(inputs, ts)
-        scales = scales_of(equations, inputs.tolerances, ts, inputs.params, samples.ys)
+        params, times = _counted(inputs, ts), ts - ts[0]
+        scales = scales_of(equations, inputs.tolerances, times, params, samples.ys)
 
         def at(t, y):
-            shown, _ = sample_at(equations, t, y, inputs.params, scales)
+            shown, _ = sample_at(equations, t, y, params, scales)
             return y, eqx.filter(shown, eqx.is_inexact_array)
 
         def of_one(t, y):
-            rate = equations.rates(t, y, Arguments(inputs.params))
+            rate = equations.rates(t, y, Arguments(params))
             found, change = jax.jvp(at, (t, y), (jnp.ones_like(t), rate))
             return jax.tree.map(lambda x, dx: jnp.where(jnp.isfinite(x), dx, 0), found, change)
 
-        ys, shown = jax.vmap(of_one)(ts, samples.ys)
+        ys, shown = jax.vmap(of_one)(ts - ts[0], samples.ys)
         return Samples(ys, shown, jax.tree.map(jnp.zeros_like, samples.events))
 
     def _equations(self, inputs: Inputs, ts: Array) -> tuple[EquationsOfMotion, StatesAt]:
         at = self._at(inputs, ts)
         check(self.system, at.t, inputs.q0, inputs.qdot0, inputs.params, at.values)
-        return EquationsOfMotion.of(self.system, inputs.q0, self.options.formulation, inputs.params, at), at
+        return EquationsOfMotion.of(self.system, inputs.q0, self.options.formulation, _counted(inputs, ts), at), at
 
     def _at(self, inputs: Inputs, ts: Array) -> StatesAt:
-        """The start as it is given."""
+        """The start as it is given, on the clock of the motion."""
         q, v = (ravel_pytree(tree)[0] for tree in (inputs.q0, inputs.qdot0))
-        t0, given = _first_time(inputs, ts), (inputs.q0, inputs.qdot0, inputs.params)
-        return StatesAt(start_values(self.system, inputs.states, t0, *given), t0, q, v)
+        t0, given = ts[0] if inputs.t0 is None else inputs.t0, (inputs.q0, inputs.qdot0, inputs.params)
+        return StatesAt(start_values(self.system, inputs.states, t0, *given), _first_time(inputs, ts), q, v)
+
+
+def _counted(inputs: Inputs, ts: Array) -> SinceOrigin:
+    """The params on the clock of the motion, τ = t − ts[0]: in t itself a late motion would have no digits left for its steps."""
+    return SinceOrigin.of(inputs.params, ts[0])
 
 
 def _at_random(inputs: Inputs) -> Inputs:
@@ -205,12 +216,13 @@ def _at_random(inputs: Inputs) -> Inputs:
 
 
 def _first_time(inputs: Inputs, ts: Array) -> Array:
-    return ts[0] if inputs.t0 is None else inputs.t0
+    """That of the start on the clock of the motion: zero, but it moves with t0."""
+    return ts[0] - ts[0] if inputs.t0 is None else inputs.t0 - ts[0]
 
 
 def samples_at(equations: EquationsOfMotion, ts, ys, params, result, stats, tolerances) -> tuple[Samples, Unchanging]:
     """The samples of a motion with these states, as far as they keep what a successful motion guarantees; behind them are its events."""
-    ys, events = ys[: ts.size], records(equations, ys[ts.size :])
+    ys, events = ys[: ts.size], records(equations, ys[ts.size :], origin_of(params))
     last_t, last_y = stats["last"]
     times, states = jnp.concatenate([ts, last_t[None]]), jnp.concatenate([ys, last_y[None]])
     scales = scales_of(equations, tolerances, ts, params, states)
@@ -218,7 +230,9 @@ def samples_at(equations: EquationsOfMotion, ts, ys, params, result, stats, tole
     if equations.events:  # behind the end of a motion there is none
         states = jnp.where(states[:, -1:] > 0, jnp.nan, states)
     shown, result, reached = verified(equations, times, states, samples, result, tolerances[0])
-    counts = {name: count for name, count in stats.items() if name != "last"} | {"reached": jax.lax.stop_gradient(reached)}
+    counts = {name: count for name, count in stats.items() if name != "last"} | {
+        "reached": jax.lax.stop_gradient(origin_of(params) + reached)
+    }
     changing, rest = eqx.partition(shown, eqx.is_inexact_array)
     return Samples(ys, changing, events), Unchanging(result, counts, rest)
 
@@ -226,7 +240,7 @@ def samples_at(equations: EquationsOfMotion, ts, ys, params, result, stats, tole
 def scales_of(equations: EquationsOfMotion, tolerances, ts, params, ys) -> Scales:
     """The scales of a motion by its samples, as far as it went."""
     largest = jnp.max(jnp.where(jnp.isfinite(ys), jnp.abs(ys), 0), axis=0)
-    return Scales.of(tolerances, ts, params, *jnp.split(largest[: 2 * equations.size], 2))
+    return Scales.of(tolerances, ts, params, *jnp.split(largest[: 2 * equations.size], 2), equations.sees_time)
 
 
 def trajectory_of(system: System, options: SolverOptions, params: PyTree, ts, samples: Samples, unchanging: Unchanging) -> Trajectory:

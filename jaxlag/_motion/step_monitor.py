@@ -70,7 +70,8 @@ def first_end(
     `between(low, high)` are those of the elements' margins that may be negative between two times, for all that is known of them.
     """
     of_time_alone = time_dependence(lambda t, y: margins(t, y, y), t0, path(t0))
-    look, near = _looking(margins, path, t0, t1, of_time_alone), NEAR * scales.rounding
+    look, near = _looking(margins, path, t0, t1, of_time_alone), NEAR * scales.grain
+    grain = 4 * scales.grain  # within which what follows the time has steps that are no jumps
     brief = jnp.maximum(BRIEF * scales.duration, near)
     none = np.zeros(elements, bool)
     hides = lambda low, high: jnp.concatenate([none if between is None else between(low, high), none])
@@ -105,7 +106,7 @@ def first_end(
         )
 
     def going_on(search):
-        middle, wide = (search.low + search.high) / 2, search.high - search.low > jnp.maximum(4 * scales.rounding, 1e-13 * (t1 - t0))
+        middle, wide = (search.low + search.high) / 2, search.high - search.low > jnp.maximum(grain, 1e-13 * (t1 - t0))
         wide |= jnp.any(_jumps(search)) & (search.low < middle) & (middle < search.high)  # to the very time at which it jumps
         narrowing = exactly & wide & (search.sections < SECTIONS)
         return jnp.where(search.found, narrowing, (search.low < t1) & (search.rounds < ROUNDS))

@@ -8,6 +8,7 @@ from jaxtyping import Array, Bool, Float
 from .._mechanics.contact import roundings
 from .._model.event import Either, Rising
 from .._model.flat import Flat
+from .._model.signal import origin_of
 from .first_order import EquationsOfMotion
 from .protocol import Arguments
 from .state_vector import Parts
@@ -35,11 +36,13 @@ def _value_and_scale(equations, t, parts, args):
     largest = jax.lax.stop_gradient(jnp.max(jnp.abs(multipliers), initial=0.0)) * jnp.ones_like(multipliers)
     of_loads, of_time = roundings(largest, largest), roundings(t[None], args.scales.duration)
     at = t, parts.q, parts.v, multipliers
+    late = 4 * jnp.finfo(t.dtype).eps * jnp.abs(origin_of(args.params))  # the rounding of the user's time, which functions see
+    of_times = late * np.array([callable(event.when) for _, event in equations.system.events])
     slopes = [jnp.abs(by).reshape(equations.events, -1) for by in jax.jacfwd(flat.witnesses, argnums=(0, 1, 2, 3))(*at)]
 
     def scale(of_q, of_v):
-        errors = of_time, of_q, of_v, of_loads
-        return jax.lax.stop_gradient(sum(jnp.sum(by * of[None], axis=1) for by, of in zip(slopes, errors, strict=True)))
+        errors = (of_time + of_times)[:, None], of_q[None], of_v[None], of_loads[None]
+        return jax.lax.stop_gradient(sum(jnp.sum(by * of, axis=1) for by, of in zip(slopes, errors, strict=True)))
 
     return flat.witnesses(*at), scale
 

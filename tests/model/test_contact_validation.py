@@ -125,3 +125,12 @@ def test_a_motion_is_saved_and_sliced(tmp_path):
     np.testing.assert_array_equal(again.contacts["floor"].closed, motion.contacts["floor"].closed)
     np.testing.assert_array_equal(motion[5:].contacts["floor"].impacts, motion.contacts["floor"].impacts[5:])
     assert "contacts.floor.closed" in motion.to_dict() and "floor" in repr(motion)
+
+
+def test_speed_names_one_thing():
+    """The speed of approach, where a restitution asks for it; elsewhere an entry of params may be called so."""
+    contact = lambda restitution: {"floor": jl.Contact(lambda q: q, restitution=restitution)}
+    falling = lambda e: jl.System(lambda q, qdot, speed: 0.5 * qdot**2 - speed * q, unilateral=contact(e))
+    assert jl.acceleration(falling(0.5), 1.0, 0.0, {"speed": 9.0}).qddot == -9.0
+    with pytest.raises(ValueError, match=r"`params` must not have an entry named 'speed' where `restitution` of 'floor' asks"):
+        jl.acceleration(falling(lambda speed: 1 / (1 + speed)), 1.0, 0.0, {"speed": 9.0})
