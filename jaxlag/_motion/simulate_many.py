@@ -29,7 +29,7 @@ from .failure import raise_failure
 from .first_order import EquationsOfMotion, Formulation
 from .integrate import SolverOptions, Variations, by_diffrax, initialised, is_variational, tolerances_of, with_status
 from .members import all_devices, check_agreement, of_each, over_devices, padded
-from .protocol import Arguments
+from .protocol import Arguments, Scales
 from .results import RESULTS
 from .simulate import simulate
 from .solution_map import samples_at, trajectory_of
@@ -212,7 +212,8 @@ def _motions(equations, options, inputs, ts):
     """States at the samples, (T, size, members); and, not differentiated, why each motion ended, the counts, how far starts were off."""
     (t0, tolerances, shared), own = inputs
     y0, start = _initialised(equations, inputs, ts)
-    args = Arguments(with_second_derivatives(shared["params"]), own=own["params"])
+    params = with_second_derivatives(shared["params"])
+    args = Arguments(params, Scales.of(tolerances, ts, params), own["params"])
     ys, result, stats = by_diffrax(BatchedEquations(equations), options, dfx.ForwardMode(), t0, y0, ts, args, tolerances)
     return _with_status(ys, result, stats, start)
 
@@ -224,7 +225,8 @@ def _motions_and_variations(equations, options, inputs, directions, ts):
     varying = split_varying(inputs, directions)[0][0][2]["params"]
     if not is_variational(equations, options, varying, shared["params"]):
         return pushforward(functools.partial(_motions, equations, options))(inputs, (directions,), ts)
-    args = Arguments(with_second_derivatives(shared["params"]), own=own["params"])
+    params = with_second_derivatives(shared["params"])
+    args = Arguments(params, Scales.of(tolerances, ts, params), own["params"])
     variations = Variations(BatchedEquations(equations), lambda inputs: _initialised(equations, inputs, ts))
     variations = variations.along(directions, (d_shared["params"], d_own["params"]), dt0, lambda _: (t0, args))
     y0, start = variations.initial(inputs)
