@@ -52,6 +52,7 @@ WINGS = {  # each imports only from those above it, and each file of a wing only
         "substitution",
         "interval_arithmetic",
         "time_bounds",
+        "time_functions",
     ],
     "_model": [
         "user_errors",
@@ -113,6 +114,7 @@ WINGS = {  # each imports only from those above it, and each file of a wing only
         "derivative_rule",
         "tableaux",
         "runge_kutta",
+        "pulses",
         "step_monitor",
         "interval_inputs",
         "state_vector",

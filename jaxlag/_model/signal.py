@@ -31,8 +31,8 @@ class Signal(eqx.Module):
     and beside q̇ in L, where such impulses are left out. `Cubic` where mechanics differentiates u twice: in a position constraint.
 
     **Steps:** `simulate` ends a step at each sample of a zero-order hold or a linear signal in `params`, so leave out samples at which
-    nothing changes. With cubic signals the tolerances alone set the steps, and a short pulse after a long rest may fall between two of
-    them: take another interpolation there. Give a delay as `delay` and not by `u(t - late)`, whose jumps are not looked for.
+    nothing changes. With cubic signals the tolerances alone set the steps, and these are looked at between any two samples. Give a delay
+    as `delay` and not by `u(t - late)`, whose jumps are not looked for.
 
     **Arguments:**
 

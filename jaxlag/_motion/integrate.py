@@ -194,10 +194,8 @@ def _wrapped(options, equations, projected, adjoint, start):
         elif isinstance(solver, dfx.AbstractRungeKutta) and solver.scan_kind is None:
             solver = dataclasses.replace(solver, scan_kind="lax")  # as diffrax does for a solver that is not wrapped
     if isinstance(equations, EquationsOfMotion) and equations.modes:
-        return StickSlipSolver(solver, projected, equations.controlled, equations, reverse=not isinstance(adjoint, dfx.ForwardMode))
-    if projected is not None or options.formulation.works:
-        return ProjectedSolver(solver, projected, equations.controlled)
-    return solver
+        return StickSlipSolver(solver, projected, equations, reverse=not isinstance(adjoint, dfx.ForwardMode))
+    return ProjectedSolver(solver, projected, equations)
 
 
 def has_nodes(equations: FirstOrderSystem, params: PyTree) -> bool:

@@ -31,7 +31,7 @@ from .integrate import SolverOptions, Variations, by_diffrax, initialised, is_va
 from .members import all_devices, check_agreement, of_each, over_devices, padded
 from .protocol import Arguments
 from .results import RESULTS
-from .scales import tolerances_of
+from .scales import Scales, tolerances_of
 from .simulate import simulate
 from .solution_map import samples_at, trajectory_of
 from .trajectory import Trajectory
@@ -225,8 +225,9 @@ def _motions(equations, options, inputs, ts):
 
 def _arguments(inputs, ts):
     """Params on the clock of the motions, as of a `SolutionMap`, with second derivatives of signals."""
-    (_, _, shared), own = inputs
-    return Arguments(SinceOrigin.of(with_second_derivatives(shared["params"]), ts[0]), own=SinceOrigin(own["params"], None))
+    (_, tolerances, shared), own = inputs
+    params, none = SinceOrigin.of(with_second_derivatives(shared["params"]), ts[0]), jnp.zeros(0, ts.dtype)
+    return Arguments(params, Scales.of(tolerances, ts - ts[0], params, none, none, sees_time=False), SinceOrigin(own["params"], None))
 
 
 def _motions_and_variations(equations, options, inputs, directions, ts):

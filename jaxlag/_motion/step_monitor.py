@@ -17,15 +17,12 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float
 
 from .._program.time_bounds import TimeDependence, time_dependence
+from .pulses import BRIEF, UNBOUNDED
 
 LOOKS = 8  # parts of an interval, at whose ends it is looked at
 NEARER = (1e-2, 1e-4, 1e-7)  # of an interval with an end in it, how close around the root of its chord it is looked at next
 SECTIONS = 60  # of an interval with an end in it; some four do where the margin is smooth, and each halves it where it jumps
 ROUNDS = 256  # of looks, after which the step is too long to be watched
-BRIEF = 1e-7  # of the motion, how long anything lasts that is looked for,
-UNBOUNDED = 2e-4  # where part of the time dependence has no bounds
-PARTS = 64  # of a step, over which bounds are taken
-FAINT = 1e-6  # of its largest value, what a pulse may be and be overlooked
 NEAR = 64  # roundings of time, below which no dip is looked for
 
 
@@ -123,26 +120,6 @@ def _jumps(search: _Search) -> Bool[Array, " m"]:
     """Which margins fall below zero within the interval, and more than smooth ones would."""
     steep = 10 * jnp.abs(search.slope) * (search.high - search.low) + 1e-9 * search.largest
     return (search.behind < 0) & (search.before - search.behind > steep)
-
-
-def is_hidden(rates: Callable, nodes: np.ndarray, t0, t1, y, scales: Any) -> Any:
-    """Whether some part of `rates(t, y)` that follows the time alone goes, within a step, far beyond what the stages see of it.
-
-    Such a pulse the error of the step does not know of. `nodes` are the times of the stages, from 0 to 1.
-    """
-    of_time_alone = time_dependence(rates, t0, y)
-    if of_time_alone is None or not of_time_alone.is_bounded:
-        return jnp.array(False)
-    flat = lambda leaves: jnp.concatenate([jnp.ravel(leaf).astype(y.dtype) for leaf in leaves])
-    ends = lambda start, end: [flat(side) for side in zip(*of_time_alone.bounds(start, end), strict=True)]
-    seen = jax.vmap(lambda t: flat(of_time_alone.phi(t)))(t0 + (t1 - t0) * nodes)
-    least, most = jnp.min(seen, axis=0), jnp.max(seen, axis=0)
-    grid = t0 + (t1 - t0) * np.linspace(0, 1, PARTS + 1)
-    low, high = jax.vmap(ends)(grid[:-1], grid[1:])
-    beyond = jnp.maximum(jnp.max(high, axis=0) - most, least - jnp.min(low, axis=0))
-    largest = jnp.max(jnp.abs(jnp.stack(ends(t0, t0 + scales.duration))), axis=0)
-    found = beyond > (most - least) / 2 + FAINT * largest
-    return jax.lax.stop_gradient(jnp.any(found) & (t1 - t0 > BRIEF * scales.duration))
 
 
 def _around(low, high, before, behind):

@@ -16,8 +16,7 @@ from .first_order import EquationsOfMotion
 from .mode_changes import approach, at_end, margins
 from .results import RESULTS, under_diffrax
 from .runge_kutta import ExplicitRungeKutta
-from .step_monitor import Seen, first_end, is_hidden
-from .tableaux import Tableau
+from .step_monitor import Seen, first_end
 from .wrapped_solver import ProjectedSolver
 
 # Phases of a step: the whole step, watched for the end of a mode; where one was seen, Newton's steps for its time, each of them the
@@ -87,7 +86,7 @@ class StickSlipSolver(ProjectedSolver):
     in the new mode. A step with a second end is rejected. All phases are turns of one loop, so that the equations are compiled once.
     """
 
-    equations: EquationsOfMotion = eqx.field(static=True)
+    equations: EquationsOfMotion
     reverse: bool = eqx.field(static=True)  # whether reverse mode may go through the loop over the phases
 
     @property
@@ -108,7 +107,7 @@ class StickSlipSolver(ProjectedSolver):
     def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
         solver_state, is_new = solver_state
         made_jump = made_jump | is_new
-        piece = lambda *given: Piece(*ProjectedSolver.step(self, terms, *given[:3], args, *given[3:]))
+        piece = lambda *given: Piece(*self.projected_step(terms, *given[:3], args, *given[3:]))
         given = t0, t1, y0, solver_state, jnp.asarray(made_jump)
         nothing = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), jax.eval_shape(piece, *given))
         no, zeros = jnp.array(False), jnp.zeros(self.equations.modes, y0.dtype)
@@ -178,10 +177,9 @@ class StickSlipSolver(ProjectedSolver):
         jammed = ended & cut.usable & ~cut.consistent & (self.equations.elements == 0)  # as between walls that close in
         # There, and where a bound has turned negative, steps shrink until the motion has come as far as it goes.
         shrinking = (seen.negative | jammed) & (t1 - t0 > BARELY * args.scales.duration)
-        rates = lambda t, y: self.equations.rates(t, y, args)
         refused = (ended & ~cut.usable) | seen.unsure | shrinking | jammed
         error = jnp.where(refused, jnp.inf, error)
-        error = jnp.where(is_hidden(rates, _nodes(self.solver), t0, t1, y0, args.scales), jnp.inf, error)
+        error = self.refused(error, t0, t1, y0, args)
         consistent = ~ended | cut.consistent | ~cut.usable | shrinking
         none = RESULTS.no_friction if self.equations.elements else RESULTS.beyond_reach
         result = dfx.RESULTS.where(consistent, dfx.RESULTS.successful, under_diffrax(none))
@@ -207,13 +205,3 @@ class StickSlipSolver(ProjectedSolver):
             return watched()
         no = jnp.array(False)
         return jax.lax.cond(between.stays_away(t0, t1), lambda: Seen(no, no, no, t1, jnp.zeros(modes, t1.dtype)), watched)
-
-
-def _nodes(solver) -> np.ndarray:
-    """The times, from 0 to 1, of the stages of a step that its error is estimated from."""
-    tableau = getattr(solver, "tableau", None)
-    if tableau is None:
-        return np.linspace(0, 1, 5)
-    estimates = tableau.errors if isinstance(tableau, Tableau) else [tableau.b_error]
-    times = tableau.c if isinstance(tableau, Tableau) else [0.0, *tableau.c]
-    return np.unique(np.clip([c for weights in estimates for c, weight in zip(times, weights, strict=False) if weight], 0, 1))

@@ -1,4 +1,4 @@
-"""A solver of diffrax, wrapped: the end of each step is put back on the constraints."""
+"""A solver of diffrax, wrapped: the end of each step is put back on the constraints, and no pulse passes within one."""
 
 from collections.abc import Callable
 
@@ -7,6 +7,9 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
+
+from .protocol import FirstOrderSystem
+from .pulses import hides_pulse, nodes_of
 
 
 class SamplingAdjoint(dfx.AbstractAdjoint):
@@ -29,12 +32,17 @@ class SamplingAdjoint(dfx.AbstractAdjoint):
 class ProjectedSolver(dfx.AbstractWrappedSolver, dfx.AbstractAdaptiveSolver):
     """Any solver that estimates its error, with the end of each step put back on the constraints.
 
-    `projected(t, y, args)` does that; the error of those of the first entries of y that are `controlled` alone sets the steps.
+    `projected(t, y, args)` does that; the error of those of the first entries of y that are `controlled` alone sets the steps. A step in
+    which a pulse passes unseen is refused.
     """
 
     solver: dfx.AbstractAdaptiveSolver
     projected: Callable | None = eqx.field(static=True)
-    controlled: tuple[bool, ...] = eqx.field(static=True)
+    equations: FirstOrderSystem = eqx.field(static=True)
+
+    @property
+    def controlled(self):
+        return self.equations.controlled
 
     @property
     def term_structure(self):
@@ -73,6 +81,14 @@ class ProjectedSolver(dfx.AbstractWrappedSolver, dfx.AbstractAdaptiveSolver):
         return self.solver.func(terms, t0, y0, args)
 
     def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
+        y1, error, *rest = self.projected_step(terms, t0, t1, y0, args, solver_state, made_jump)
+        return y1, self.refused(error, t0, t1, y0, args), *rest
+
+    def refused(self, error, t0, t1, y0, args):
+        """The error of a step, infinite where a pulse hides in it: it is tried again, shorter."""
+        return jnp.where(hides_pulse(self.equations, nodes_of(self.solver), t0, t1, y0, args), jnp.inf, error)
+
+    def projected_step(self, terms, t0, t1, y0, args, solver_state, made_jump):
         """One step of the solver, its end put back on the constraints."""
         y1, error, dense, solver_state, result = self.solver.step(terms, t0, t1, y0, args, solver_state, made_jump)
         counts = np.zeros(len(error), bool)

@@ -104,7 +104,7 @@ def _convert(params, x):
     kind = params["new_dtype"]
     if jnp.issubdtype(kind, bool):
         return (x[0] > 0) | (x[1] < 0), (x[0] != 0) | (x[1] != 0)
-    return _rounded_to_integers(kind, *x) if jnp.issubdtype(kind, jnp.integer) else tuple(end.astype(kind) for end in x)
+    return _rounded_to_integers(kind, *x) if jnp.issubdtype(kind, jnp.integer) else tuple(jnp.asarray(end, kind) for end in x)
 
 
 def _rounded_to_integers(kind, low, high) -> Interval:

@@ -26,17 +26,8 @@ class TimeDependence(NamedTuple):
 
 def time_dependence(function: Callable, t: Array, y: Array) -> TimeDependence | None:
     """How `function(t, y)`, an array, depends on t; None where it does not."""
-    closed = jax.make_jaxpr(function)(t, y)
-    steps, constants, (output,) = _inlined(closed)
-
-    def dependents(start):
-        found = {start}
-        for step in steps:
-            if found.intersection(step.operands):
-                found.update(step.results)
-        return found
-
-    of_t, of_y = dependents(T), dependents(Y)
+    steps, constants, (output,) = inlined_steps(jax.make_jaxpr(function)(t, y))
+    of_t, of_y = dependents(steps, T), dependents(steps, Y)
     before_y = [step for step in steps if not of_y.intersection(step.results)]
     with_y = [step for step in steps if of_y.intersection(step.results)]
     used = [output, *(x for step in with_y for x in step.operands)]
@@ -45,20 +36,18 @@ def time_dependence(function: Callable, t: Array, y: Array) -> TimeDependence | 
         return None
 
     def phi(t):
-        found = _run_steps(before_y, constants | {T: t})
+        found = run_steps(before_y, constants | {T: t})
         return [found[x] for x in frontier]
 
     def bounds(start, end):
-        found = {x: (value, value) for x, value in constants.items()} | {T: (start, end)}
-        for step in before_y:
-            found |= dict(zip(step.results, _evaluate_intervals(step.equation, [found[x] for x in step.operands]), strict=True))
+        found = bounds_of_steps(before_y, constants, start, end)
         return [found[x] for x in frontier]
 
     def rest(phi, y):
         always = [step for step in before_y if not of_t.intersection(step.results)]
-        return _run_steps([*always, *with_y], constants | {Y: y} | dict(zip(frontier, phi, strict=True)))[output]
+        return run_steps([*always, *with_y], constants | {Y: y} | dict(zip(frontier, phi, strict=True)))[output]
 
-    return TimeDependence(phi, bounds, rest, all(_has_bounds(step.equation) for step in before_y if of_t.intersection(step.results)))
+    return TimeDependence(phi, bounds, rest, all(has_bounds(step.equation) for step in before_y if of_t.intersection(step.results)))
 
 
 def bounds_over_time(function: Callable, t: Array) -> Callable[..., Interval] | None:
@@ -73,7 +62,7 @@ MAX_ITERATIONS = 100  # of a loop that is bounded; a search in a table takes twe
 T, Y = 0, 1  # the numbers of the arguments among all quantities
 
 
-class _Step(NamedTuple):
+class Step(NamedTuple):
     """One equation over quantities by their numbers."""
 
     equation: Any
@@ -81,10 +70,10 @@ class _Step(NamedTuple):
     results: list[int]
 
 
-def _inlined(closed) -> tuple[list[_Step], dict[int, Any], list[int]]:
+def inlined_steps(closed, calls=CALLS) -> tuple[list[Step], dict[int, Any], list[int]]:
     """The equations of a program with calls inlined, equal ones once; its constants, and the numbers of its outputs."""
     numbers, constants = itertools.count(2), {}
-    steps: list[_Step] = []
+    steps: list[Step] = []
     cache: dict[Any, Any] = {}
 
     def cached(key, make):
@@ -100,11 +89,11 @@ def _inlined(closed) -> tuple[list[_Step], dict[int, Any], list[int]]:
         return number
 
     def step(equation, operands):
-        steps.append(_Step(equation, operands, [next(numbers) for _ in equation.outvars]))
+        steps.append(Step(equation, operands, [next(numbers) for _ in equation.outvars]))
         return steps[-1].results
 
     def evaluate(equation, operands):
-        if equation.primitive.name in CALLS:
+        if equation.primitive.name in calls:
             return inlined(called_program(equation), operands)
         return cached((equation.primitive, tuple(equation.params.items()), tuple(operands)), lambda: step(equation, operands))
 
@@ -114,7 +103,33 @@ def _inlined(closed) -> tuple[list[_Step], dict[int, Any], list[int]]:
     return steps, constants, inlined(closed, (T, Y))
 
 
-def _run_steps(steps, found):
+def dependents(steps: list[Step], start: int) -> set[int]:
+    """A quantity and all that depend on it."""
+    found = {start}
+    for step in steps:
+        if found.intersection(step.operands):
+            found.update(step.results)
+    return found
+
+
+def ancestors(steps: list[Step], ends: list[int]) -> set[int]:
+    """Some quantities and all that they depend on."""
+    found = set(ends)
+    for step in reversed(steps):
+        if found.intersection(step.results):
+            found.update(step.operands)
+    return found
+
+
+def bounds_of_steps(steps, constants, start, end):
+    """The intervals of all quantities from one time to another."""
+    found = {x: (value, value) for x, value in constants.items()} | {T: (start, end)}
+    for step in steps:
+        found |= dict(zip(step.results, _evaluate_intervals(step.equation, [found[x] for x in step.operands]), strict=True))
+    return found
+
+
+def run_steps(steps, found):
     for step in steps:
         found |= dict(zip(step.results, as_function(step.equation)(*(found[x] for x in step.operands)), strict=True))
     return found
@@ -132,7 +147,7 @@ def _evaluate_intervals(equation, operands: list[Interval]) -> list[Interval]:
         return _run_intervals(called_program(equation), operands)
     if name in CONTROL_FLOW and params.get("length", 1) <= MAX_ITERATIONS:
         return CONTROL_FLOW[name](params, operands)
-    if name in CONTROL_FLOW or not _has_bounds(equation):
+    if name in CONTROL_FLOW or not has_bounds(equation):
         return [anything(variable.aval) for variable in equation.outvars]
     kind = equation.outvars[0].aval.dtype
     if name in MAY_OVERFLOW and jnp.issubdtype(kind, jnp.integer):
@@ -187,14 +202,14 @@ def _cond(params, operands):
     return [INTERVAL_RULES["select_n"](None, which, *column) for column in zip(*cases, strict=True)]
 
 
-def _has_bounds(equation) -> bool:
+def has_bounds(equation) -> bool:
     """Whether there are useful bounds on its outputs."""
     name, params = equation.primitive.name, equation.params
     if name in INLINED_CALLS:
-        return all(map(_has_bounds, called_program(equation).jaxpr.eqns))
+        return all(map(has_bounds, called_program(equation).jaxpr.eqns))
     if name in CONTROL_FLOW:
         return params.get("length", 1) <= MAX_ITERATIONS and all(
-            _has_bounds(step) for inner in params.get("branches", [params.get("jaxpr")]) for step in inner.jaxpr.eqns
+            has_bounds(step) for inner in params.get("branches", [params.get("jaxpr")]) for step in inner.jaxpr.eqns
         )
     if any(has_extended_dtype(x) or jnp.issubdtype(x.aval.dtype, jnp.complexfloating) for x in (*equation.invars, *equation.outvars)):
         return False
