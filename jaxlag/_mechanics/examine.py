@@ -22,7 +22,7 @@ from .friction_elements import light_coordinates, unread_friction
 from .lagrange import applied_force, constraint_rows, inertia, position_residual, velocity_residual
 from .massless import completed, with_masses
 from .saddle_point import augmented
-from .singular_directions import UNDEFINED, is_defined, not_affine_in, tangent_basis
+from .singular_directions import UNDEFINED, is_defined, not_affine_in, own_units, tangent_basis
 
 
 @dataclasses.dataclass(frozen=True)
@@ -105,14 +105,15 @@ def examine(system: System, q: PyTree, qdot: PyTree, params: PyTree = None, *, t
     eps = float(jnp.finfo(found["M"].dtype).eps)
     G, M = found["G"], found["M"]
     rows = {name: found["rows"][name] for name in system.constraints}  # in the order of the rows of G
-    N = tangent_basis(G, eps)
-    rank = G.shape[1] - N.shape[1]
+    units = own_units(M, G)
+    allowed = tangent_basis(G * units, eps)  # in which the rank does not depend on the units given
+    N, rank = np.linalg.qr(units[:, None] * allowed)[0], G.shape[1] - allowed.shape[1]
     inertia_on_N = np.linalg.eigvalsh(N.T @ M @ N) if N.shape[1] else np.zeros(0)
     smallest = float(inertia_on_N[0]) if inertia_on_N.size else float("inf")
     contacts = {name: bool(closed) for (name, _), closed in zip(system.unilateral, found["closed"], strict=True)}
-    redundant = _redundant_rows(G, {name: of for name, of in rows.items() if contacts.get(name, True)}, eps)
+    redundant = _redundant_rows(G * units, {name: of for name, of in rows.items() if contacts.get(name, True)}, eps)
     largest = lambda named: {name: float(np.max(np.abs(value), initial=0.0)) for name, value in named.items()}
-    constants = _time_constants(found, N) if np.all(np.isfinite(found["A"])) else (float("nan"), float("nan"))
+    constants = _time_constants(found["A"], units, allowed) if np.all(np.isfinite(found["A"])) else (float("nan"), float("nan"))
     numbers = {
         "coordinates": leaf_names(q),
         "degrees_of_freedom": N.shape[1],
@@ -231,10 +232,10 @@ def _redundant_rows(G, rows, eps):
     return redundant
 
 
-def _time_constants(found, N):
-    """1/|λ| of the nonzero eigenvalues of the motion linearised on the constraints, the fastest and the slowest."""
-    allowed = np.kron(np.eye(2), N)  # of positions and of velocities
-    reduced = allowed.T @ found["A"] @ allowed
+def _time_constants(A, units, N):
+    """1/|λ| of the nonzero eigenvalues of the motion linearised on the constraints, the fastest and the slowest; N in these `units`."""
+    allowed, both = np.kron(np.eye(2), N), np.tile(units, 2)  # of positions and of velocities
+    reduced = allowed.T @ (A * both / both[:, None]) @ allowed
     sizes = np.abs(np.linalg.eigvals(reduced))
     sizes = sizes[sizes > 1e-7 * np.max(sizes, initial=0.0)]  # a double eigenvalue 0 is some √eps of the largest, after rounding
     return (1 / np.max(sizes), 1 / np.min(sizes)) if sizes.size else (float("inf"), float("inf"))

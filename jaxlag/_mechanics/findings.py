@@ -4,7 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from .couplings import NOT_READ, OF_L, OF_ROWS
-from .singular_directions import faint_direction, massless_coordinates
+from .singular_directions import faint_direction, massless_coordinates, own_units
 
 FAINT = 5e-4  # of the inertia of each coordinate alone: Euler angles of a ball 2° from their singularity
 
@@ -48,8 +48,7 @@ def not_affine(names, where):
 
 def pushing(names, M, G, rows, system):
     """Velocity constraints that tie a coordinate without inertia to others: their λ acts on these too, unlike a first-order law."""
-    size = np.max(np.abs(M), axis=1)
-    massless = size <= 100 * len(M) * np.finfo(M.dtype).eps * np.max(size, initial=0.0)
+    massless, G = ~np.any(M, axis=1), G * own_units(M, G)
     for name in (name for name, _ in system.nonholonomic):
         for row in G[rows[name]]:
             part = np.abs(row) > 1e-12 * np.max(np.abs(row), initial=0.0)

@@ -50,14 +50,24 @@ def tangent_basis(G: np.ndarray, eps: float) -> np.ndarray:
     return Vt[int(np.sum(s > eps**0.3125 * max(s[0], eps))) :].T
 
 
+def own_units(M: np.ndarray, G: np.ndarray) -> np.ndarray:
+    """Units of the coordinates in which the inertia of each is 1, and what has none counts in no row of G for more than the others."""
+    mass = np.diagonal(M)
+    units = np.where(mass > 0, 1 / np.sqrt(np.where(mass > 0, mass, 1)), 0)
+    rows, size = np.max(np.abs(G) * units, axis=1, keepdims=True, initial=0.0), np.abs(G)
+    tied = (rows > 0) & (size > 0)
+    beside = np.min(np.where(tied, rows / np.where(tied, size, 1), np.inf), axis=0, initial=np.inf)
+    return np.where(mass > 0, units, np.where(np.isfinite(beside), beside, 1))
+
+
 def massless_coordinates(M: np.ndarray, G: np.ndarray) -> list[int]:
     """Coordinates that take part in a direction that G allows and to which M gives no inertia."""
-    eps = float(np.finfo(M.dtype).eps)
-    N = tangent_basis(G, eps)
+    eps, units = float(np.finfo(M.dtype).eps), own_units(M, G)
+    N = tangent_basis(G * units, eps)
     if not N.size:
         return []
-    inertias, directions = np.linalg.eigh(N.T @ M @ N)
-    free = np.abs(N @ directions[:, inertias <= 100 * len(M) * eps * np.max(np.abs(M), initial=0.0)])
+    inertias, directions = np.linalg.eigh(N.T @ (M * np.outer(units, units)) @ N)
+    free = np.abs(N @ directions[:, inertias <= 100 * len(M) * eps])
     return [i for i, moves in enumerate(free) if np.any(moves > 1e-6)]
 
 
