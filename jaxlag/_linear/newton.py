@@ -72,8 +72,12 @@ def newton(
     Source: Deuflhard, Newton Methods for Nonlinear Problems, section 3.3.2 (natural monotonicity test).
     """
     eps = jnp.finfo(guess.dtype).eps
-    largest = lambda w: jnp.maximum(jnp.max(jnp.abs(w) / units, initial=0.0), jnp.max(jnp.abs(guess) / units, initial=0.0))
-    reach = lambda w: 1 + jnp.abs(w) if units is None else units * largest(w) + eps**0.5
+
+    def reach(w):
+        if units is None:
+            return 1 + jnp.abs(w)
+        return units * jnp.max(jnp.maximum(jnp.abs(w), jnp.abs(guess)) / units, initial=0.0) + eps**0.5
+
     length = lambda step, w: jnp.max(jnp.abs(step) / reach(w), initial=0.0)
 
     def turn(carry):

@@ -25,9 +25,10 @@ def _forces_of_rows(case: Case, u: Units, multipliers) -> dict[str, Seen]:
 
 def acceleration(case: Case, u: Units) -> dict[str, Seen]:
     system, i = in_units(case), inputs_of(case, u)
-    t, states = i.ts[0], _states(case, u)
-    found = jl.acceleration(system, i.q, i.qdot, i.params, t=t, states=states)
-    force = jl.constraint_force(system, i.q, i.qdot, i.params, t=t, states=states) if _rows(case) else {}
+    t, states = i.ts[3], _states(case, u)
+    q = i.q + u.drift * (t - i.ts[0])
+    found = jl.acceleration(system, q, i.qdot, i.params, t=t, states=states)
+    force = jl.constraint_force(system, q, i.qdot, i.params, t=t, states=states) if _rows(case) else {}
     total = {"Gᵀλ": Seen(sum(map(np.asarray, force.values())), u.energy / u.length)} if force else {}
     return {"q̈": Seen(found.qddot, _rates(u) / u.time)} | total | _forces_of_rows(case, u, found.multipliers)
 

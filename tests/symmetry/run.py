@@ -8,6 +8,7 @@ import collections
 import itertools
 import sys
 import time
+import warnings
 
 import jax
 
@@ -71,6 +72,7 @@ def main():
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--verbose", action="store_true")
     args = parser.parse_args()
+    warnings.filterwarnings("ignore", message=".*must be made once")  # each kind of system is made anew for each statement
     pairs = [(q, k, n) for q, k, n in itertools.product(args.questions, args.kinds, args.sizes) if asked(q, k)]
     count = -(-args.count // len(pairs))
     total, failed, shown, begin = collections.Counter(), collections.Counter(), set(), time.perf_counter()

@@ -84,7 +84,7 @@ def _translated(params, t_given):
     k = params["units"].params
 
     def one(name, x):
-        if isinstance(x, jl.Signal):
+        if callable(x):  # a signal, or what stands for it between two of its samples
             return lambda t: x(t_given) / k[name]
         return jax.tree.map(lambda y: y / k[name], x)
 

@@ -49,9 +49,14 @@ def reordered(case: Case) -> Variant:
     """Coordinates backwards, terms and parameters too."""
     back = lambda q, p: q[::-1]
     new = _each_term(case, _in_coordinates(back, lambda q, v, p: v[::-1]))
-    turned = {slot: dict(reversed(named.items())) for slot, named in new.terms.items()}
+    forces = {name: Term(_backwards(term.f), term.names) for name, term in new.terms["force"].items()}
+    turned = {slot: dict(reversed(named.items())) for slot, named in (new.terms | {"force": forces}).items()}
     params = dict(reversed(case.params.items()))
     return Variant(new._replace(terms=turned, params=params, q0=case.q0[::-1], qdot0=case.qdot0[::-1]), _columns(np.arange(case.n)[::-1]))
+
+
+def _backwards(f: Callable) -> Callable:
+    return lambda *args, **z: f(*args, **z)[::-1]
 
 
 def beside(mass: float, stiffness: float, q0: float, first: bool) -> Callable[[Case], Variant]:
@@ -211,6 +216,6 @@ def applies(name: str, kind: str) -> bool:
         return kind in ("dry", "dry loop")
     if name == "as force":
         return kind != "massless"
-    if name in ("curved", "turned", "gauged"):
-        return kind not in ("massless", "controller") or name != "turned"
+    if name in ("curved", "turned"):  # the velocities of what has no inertia are not those given
+        return kind != "massless"
     return True
