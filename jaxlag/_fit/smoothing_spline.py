@@ -90,7 +90,7 @@ class _Sensors:
         flat = lambda tree: np.concatenate([np.reshape(x, (e.ts.size, -1)) for x in jax.tree.leaves(tree)], axis=1).astype(float)
         self.measured = flat(e.values)
         self.channels = self.measured.shape[1]
-        self.weights = 1 / flat(e.sigma) if e.sigma is not None else np.ones_like(self.measured)
+        self.weights = 1 / (flat(e.sigma) if e.sigma is not None else _spread(self.measured))
 
         def channels(t, x):
             q, v, a = (unravel(part) for part in jnp.split(x, 3))
@@ -121,6 +121,14 @@ class _Sensors:
         change = self.weights[0] * np.where(size > 0, size, 1)
         self.weights = self.weights / change
         return np.max(change) > 1.1 * np.min(change)
+
+
+def _spread(measured):
+    """The standard deviation of each channel, in its unit; one where nothing changes."""
+    there = np.isfinite(measured)
+    mean_of = lambda x: np.sum(np.where(there, x, 0), axis=0) / np.maximum(np.sum(there, axis=0), 1)
+    deviation = np.sqrt(mean_of((measured - mean_of(measured)) ** 2))
+    return np.broadcast_to(np.where(deviation > 0, deviation, 1), measured.shape)
 
 
 class _UnknownForces(dict):
@@ -191,24 +199,25 @@ def _step(sensors, splines, C, r, A):
     """The step of Gauss and Newton, with the known start kept and the third differences penalised."""
     from scipy import sparse
 
-    size = np.sqrt(A.multiply(A).sum() / max(C.size, 1))
+    squares = np.asarray(A.multiply(A).sum(axis=0)).reshape(C.shape).mean(axis=0)
+    size = np.sqrt(np.where(squares > 0, squares, 1))  # of what is seen of each coordinate, in one over its unit
     S, off = _known_start(sensors, splines, C, START_WEIGHT * size)
     S = sparse.csr_matrix(S.reshape(-1, C.size))
     third = sparse.diags([-1.0, 3.0, -3.0, 1.0], [0, 1, 2, 3], shape=(splines.count - 3, splines.count))
-    P = sparse.kron(third, sparse.eye(sensors.n)) * (PENALTY * size)
+    P = sparse.kron(third, sparse.diags(PENALTY * size))
     right = A.T @ r.ravel() + S.T @ off - P.T @ (P @ C.ravel())
     return sparse.linalg.spsolve(A.T @ A + S.T @ S + P.T @ P, right).reshape(C.shape)
 
 
 def _known_start(sensors, splines, C, weight):
-    """Weighted rows of the known start over the coefficients, and how far the start is off."""
+    """Weighted rows of the known start over the coefficients, a `weight` for each coordinate, and how far the start is off."""
     rows, off = [], []
     for i in np.flatnonzero(sensors.known):
         d, j = divmod(i, sensors.n)
         first = np.zeros(splines.count)
         first[splines.near[0]] = splines.values[d][0]
         unit = np.zeros(sensors.n)
-        unit[j] = weight * splines.interval**d
+        unit[j] = weight[j] * splines.interval**d
         rows.append(np.outer(first, unit).ravel())
         off.append(unit[j] * (sensors.start[i] - first @ C[:, j]))
     return np.array(rows), np.array(off)

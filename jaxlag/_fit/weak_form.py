@@ -32,7 +32,8 @@ class WeakForm(eqx.Module):
 
     $$ \int \dot\varphi\, P p \, dt + \int \varphi\, (\dot P p + P F) \, dt = 0 $$
 
-    P depends on t and q alone, since constraints are affine in q̇: its rate needs no acceleration, and nothing is neglected.
+    P depends on t and q alone, since constraints are affine in q̇: its rate needs no acceleration, and nothing is neglected. Coordinates
+    are taken in units in which all move as fast, so that what P mixes has one unit, that of a power.
     """
 
     system: System = eqx.field(static=True)
@@ -40,6 +41,7 @@ class WeakForm(eqx.Module):
     own: dict[str, Any]
     nodes: Any  # of the quadrature, (N,)
     motion: tuple  # q, v, a there
+    units: Any  # of the coordinates: how fast each moves, (n,)
 
     def linearised(self, free: Free, y: Any) -> tuple[np.ndarray, np.ndarray]:
         """P p, Ṗ p + P F and the constraints at all nodes, (N, 2n + m), and their Jacobian, (N, 2n + m, p)."""
@@ -49,18 +51,19 @@ class WeakForm(eqx.Module):
     def terms(self, params, t, q, v, a):
         """P p, Ṗ p + P F, then the residuals of the constraints."""
         flat = bind(self.system, self.like, with_own(params, self.own))
-        p, force = jax.grad(flat.lagrangian, argnums=2)(t, q, v), jax.grad(flat.lagrangian, argnums=1)(t, q, v)
-        applied = lambda multipliers: applied_force(flat, t, q, v, multipliers)
-        G = constraint_rows(flat, t, q, v)[1]
+        p, force = (self.units * jax.grad(flat.lagrangian, argnums=i)(t, q, v) for i in (2, 1))
+        applied = lambda multipliers: self.units * applied_force(flat, t, q, v, multipliers)
+        rows = lambda t, q: constraint_rows(flat, t, q, v)[1] * self.units[None]
+        G = rows(t, q)
         multipliers = jnp.zeros(len(G), q.dtype)
         if not len(G):
             return jnp.concatenate([p, force + applied(multipliers)])
         if flat.needs_multipliers:  # the only place where the acceleration is needed
             M, inertial = inertia(flat, t, q, v)
-            multipliers = pseudo_inverse(G @ G.T) @ (G @ (M.mv(a) - inertial - applied(multipliers)))
+            multipliers = pseudo_inverse(G @ G.T) @ (G @ (self.units * (M.mv(a) - inertial) - applied(multipliers)))
 
         def projected(t, q, x):
-            G = constraint_rows(flat, t, q, v)[1]
+            G = rows(t, q)
             return x - G.T @ (pseudo_inverse(G @ G.T) @ (G @ x))
 
         Pp, rate = jax.jvp(lambda t, q: projected(t, q, p), (t, q), (jnp.ones_like(t), v))
@@ -84,7 +87,9 @@ class Record(NamedTuple):
         own, ts = with_own(params, e.params), np.asarray(e.ts, float)
         nodes, quadrature = _quadrature(ts, jump_times(own, float))
         motion = tuple(jnp.asarray(x, e.ts.dtype) for x in smooth(e, params, nodes)[1:])
-        form = WeakForm(system, e.q0, e.params, jnp.asarray(nodes, e.ts.dtype), motion)
+        speeds = np.sqrt(np.mean(np.asarray(motion[1]) ** 2, axis=0))
+        units = jnp.asarray(np.where(speeds > 0, speeds, 1), e.ts.dtype)
+        form = WeakForm(system, e.q0, e.params, jnp.asarray(nodes, e.ts.dtype), motion, units)
         arrays = jax.tree.map(lambda x: jnp.asarray(x) if isinstance(x, float) else x, own)
         slip, moves = _slips(system, e.q0, arrays, form.nodes, *motion[:2]), np.ones(nodes.size, bool)
         if slip is not None:

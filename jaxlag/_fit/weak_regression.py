@@ -15,6 +15,7 @@ from .window_scatter import COLOUR, OVERLAP, scatter
 from .windows import APART
 
 TINY = 1e-20  # of a term: its variation counts as none
+ROUNDING = 1e-9  # of the terms of an equation, what is left of them
 ROUNDS = 3  # of weighting the equations by their residuals
 
 
@@ -65,11 +66,12 @@ class Problem:
         spare = max(APART * count - self.free.size / equations, APART)
         if sum(r.size for r, _ in parts) < self.free.size:
             return None
-        weights = [_one_over_rms(np.abs(r) + np.linalg.norm(J, axis=2)) for r, J in parts]
+        sizes = [self._sizes(r, J, y) for r, J in parts]
+        weights = [_one_over(size, size) for size in sizes]
         for _ in range(ROUNDS):
             y = (self._solve_linear if self.linear else self._solve_nonlinear)(residuals, weights, y)
             parts = residuals(y)
-            weights = [_one_over_rms(np.abs(r)) for r, _ in parts]
+            weights = [_one_over(_rms(r), size) for (r, _), size in zip(parts, sizes, strict=True)]
         errors = self._errors(parts, weights, windows, used)
         return Estimate(half, near_rest, y, errors, count, spare, self._explained(parts, weights, y) + np.log(spare / (APART * count)))
 
@@ -107,9 +109,26 @@ class Problem:
         found = levenberg_marquardt(linearise, jnp.asarray(y), freedom=freedom, max_steps=100, tolerance=1e-3, bounds=self.free.bounds)
         return np.asarray(found.best.y)
 
+    def _sizes(self, r, J, y):
+        """Of the terms of each equation, (n + m,), in its unit. Where the equations are linear, of those without a free parameter, and of
+        the others with parameters as large as they can be beside these: a start, which may be 1 in any unit, has no part in it.
+        """
+        if not self.linear:
+            return _rms(np.abs(r) + np.linalg.norm(J, axis=2))
+        size, slopes = _rms(r - J @ self._from_zero(y)), _rms(J)
+        for _ in range(self.free.size):
+            ratio = np.where((size[:, None] > 0) & (slopes > 0), size[:, None] / np.where(slopes > 0, slopes, 1), np.inf)
+            most = np.min(ratio, axis=0, initial=np.inf)
+            size = np.where(size > 0, size, np.max(slopes * np.where(np.isfinite(most), most, 0), axis=1, initial=0.0))
+        return size
+
+    def _from_zero(self, y):
+        """y as counted from where all free parameters are zero."""
+        return np.asarray(self.free.theta(jnp.asarray(y)) / self.free.slope(jnp.asarray(y)))
+
     def _explained(self, parts, weights, y):
         """Terms without a free parameter against the residuals, whose size is one over the weight."""
-        here = np.asarray(self.free.theta(jnp.asarray(y)) / self.free.slope(jnp.asarray(y)))
+        here = self._from_zero(y)
         known = [(r - J @ here) * w for (r, J), w in zip(parts, weights, strict=True)]
         varies = np.mean([np.var(x, axis=0) for x in known if len(x)], axis=0)
         there = varies > TINY * np.mean([np.mean(x**2, axis=0) for x in known if len(x)], axis=0)
@@ -135,10 +154,15 @@ def _terms(record, free, linear):
     return lambda y: (value + J @ y, J)
 
 
-def _one_over_rms(sizes):
-    """For each equation, (n + m,)."""
-    rms = np.sqrt(np.mean(sizes**2, axis=0)) if len(sizes) else np.zeros(sizes.shape[1])
-    return 1 / np.maximum(rms, 1e-9 * np.max(rms, initial=1e-300))
+def _rms(x):
+    """Over the windows; zero of none."""
+    return np.sqrt(np.mean(x**2, axis=0)) if len(x) else np.zeros(x.shape[1:])
+
+
+def _one_over(rms, size):
+    """For each equation, (n + m,); residuals of next to nothing of its terms are rounding."""
+    least = np.maximum(rms, ROUNDING * size)
+    return 1 / np.where(least > 0, least, 1)
 
 
 def _stacked(parts, weights):

@@ -13,6 +13,7 @@ from .._program.implicit import implicit_root
 from .._program.sparse_matrix import SparseMatrix
 
 ITERATIONS = 100
+TIES = 8  # unknowns that a unit is handed on through: a state that follows a state that follows a coordinate
 Residual = Callable[[Any, Float[Array, " u"]], Float[Array, " r"]]  # R(args, w)
 
 
@@ -23,30 +24,61 @@ class Root(NamedTuple):
     found: Bool[Array, ""]
 
 
-def root_near(residual: Residual, args: Any, guess: Float[Array, " u"], ease: Float[Array, " u"] | float = 1.0) -> Root:
-    """The root that Newton's method finds from a guess; of several that nothing decides between, the nearest, where to move one unknown
-    costs less the greater its `ease`.
+def root_near(
+    residual: Residual, args: Any, guess: Float[Array, " u"], units: Float[Array, " u"], ease: Float[Array, " u"] | float = 1.0
+) -> Root:
+    """The root that Newton's method finds from a guess; of several that nothing decides between, the nearest in these `units`, where to
+    move one unknown costs less the greater its `ease`. Those whose unit is zero take it from the others: `units_beside`.
     """
-    fixed = jax.lax.stop_gradient(args)
+    fixed, guess = jax.lax.stop_gradient((args, guess))
     slope = lambda w: jax.jacfwd(residual, 1)(fixed, w)
+    units = jax.lax.stop_gradient(units_beside(slope(guess), units))
 
     def changes(w):
         J = slope(w)
-        return lambda w: -least_change(J, residual(fixed, w), ease * (1 + jnp.abs(w)))
+        return lambda w: -least_change(J, residual(fixed, w), ease * units)
 
-    w = newton(changes, jax.lax.stop_gradient(guess))
-    return Root(differentiable_root(residual, args, w), is_root(slope(w), residual(fixed, w), w))
+    w, reach = newton(changes, guess, units)
+    in_units = lambda args, w: residual(args[0], w)
+    root = implicit_root(in_units, functools.partial(_change_in_units, residual), (args, units), w)
+    return Root(root, is_root(slope(w), residual(fixed, w), w, reach))
 
 
-def newton(changes: Callable[[Array], Callable[[Array], Array]], guess: Float[Array, " u"]) -> Float[Array, " u"]:
-    """Where Newton's method comes to rest; `changes(w)` is w' ↦ −J(w)⁻¹ R(w').
+def units_beside(J: Float[Array, "r u"], units: Float[Array, " u"]) -> Float[Array, " u"]:
+    """Units of all unknowns where those of some are known and others are 0: such that in each equation that holds one whose unit is known
+    the other counts for no more than that. They follow all changes of units. Those that no equation ties to others have 1.
+    """
+    size = jnp.abs(J)
 
-    A step is halved until the step that would follow it is shorter: a test that does not depend on the units of R or w.
+    def turn(_, units):
+        rows = jnp.max(size * units[None], axis=1, initial=0.0)[:, None]
+        ties = (size > 0) & (rows > 0)
+        found = jnp.min(jnp.where(ties, rows / jnp.where(ties, size, 1), jnp.inf), axis=0, initial=jnp.inf)
+        return jnp.where((units > 0) | ~jnp.isfinite(found), units, found)
+
+    units = jax.lax.fori_loop(0, min(TIES, units.size), turn, units.astype(J.dtype))
+    return jnp.where(units > 0, units, 1)
+
+
+def newton(
+    changes: Callable[[Array], Callable[[Array], Array]], guess: Float[Array, " u"], units: Float[Array, " u"] | None = None
+) -> tuple[Float[Array, " u"], Float[Array, " u"]]:
+    """Where Newton's method comes to rest, and within which reach of each unknown what is beside it counts as rounding; `changes(w)` is
+    w' ↦ −J(w)⁻¹ R(w').
+
+    A step is halved until the step that would follow it is shorter: a test that does not depend on the units of R or w. In these `units`
+    the reach is the largest unknown, at the start or now; where all are zero, rounding leaves something of forces that cancel.
 
     Source: Deuflhard, Newton Methods for Nonlinear Problems, section 3.3.2 (natural monotonicity test).
     """
     eps = jnp.finfo(guess.dtype).eps
-    length = lambda step, w: jnp.max(jnp.abs(step) / (1 + jnp.abs(w)), initial=0.0)
+
+    def reach(w):
+        if units is None:
+            return 1 + jnp.abs(w)
+        return units * jnp.max(jnp.maximum(jnp.abs(w), jnp.abs(guess)) / units, initial=0.0) + eps**0.5
+
+    length = lambda step, w: jnp.max(jnp.abs(step) / reach(w), initial=0.0)
 
     def turn(carry):
         w, _, i = carry
@@ -66,13 +98,18 @@ def newton(changes: Callable[[Array], Callable[[Array], Array]], guess: Float[Ar
         return (i < ITERATIONS) & ~done & jnp.all(jnp.isfinite(w))
 
     w, _, _ = jax.lax.while_loop(is_on_its_way, turn, (guess, jnp.array(False), jnp.array(0)))
-    return w
+    return w, reach(w)
 
 
-def is_root(J: Array | SparseMatrix, R: Array, w: Array) -> Bool[Array, ""]:
-    """Whether a residual is zero: a change of w by rounding would bring as much about."""
-    allowed = jnp.finfo(w.dtype).eps ** 0.5 * (abs(J) @ (1 + jnp.abs(w)))
+def is_root(J: Array | SparseMatrix, R: Array, w: Array, reach: Array | None = None) -> Bool[Array, ""]:
+    """Whether a residual is zero: a change of w by rounding, within its reach, would bring as much about."""
+    allowed = jnp.finfo(w.dtype).eps ** 0.5 * (abs(J) @ (1 + jnp.abs(w) if reach is None else reach))
     return jnp.all(jnp.isfinite(w)) & jnp.all(jnp.abs(R) <= allowed)
+
+
+def _change_in_units(residual, args, w, R):
+    args, units = args
+    return -least_change(jax.jacfwd(residual, 1)(args, w), R, units)
 
 
 def differentiable_root(residual: Residual, args: Any, w: Float[Array, " u"]) -> Float[Array, " u"]:

@@ -163,14 +163,24 @@ def steady_state(search: Search, system: System, t: Any, q: PyTree, qdot: PyTree
     nothing = jnp.zeros(flat.rows, q0.dtype), jnp.zeros(equations.friction_rows, q0.dtype)
     of = Unknowns(start[equations.moving], v0[equations.running], ravel_pytree(values)[0].astype(q0.dtype), *nothing)
     f, (_, G, _) = equations.force(flat, given, start, v0, of), constraint_rows(flat, t, start, v0)
-    of = of._replace(multipliers=least_change(G.T, -f, 1.0) if flat.rows else of.multipliers)
+    units = _units(inertia(flat, t, start, v0)[0].as_matrix())
+    sizes = jnp.max(jnp.abs(G) * units[None], axis=1, initial=0.0)
+    of = of._replace(multipliers=least_change(G.T, -f, 1 / jnp.where(sizes > 0, sizes, 1)) if flat.rows else of.multipliers)
     ease = jnp.ones(sum(x.size for x in of), q0.dtype).at[equations.sizes[2] :].set(1e8 if search.held else 1.0)  # q stays if it can
     guess = jax.lax.stop_gradient(jnp.concatenate(of))
     if search.running:
         J = jax.jacfwd(equations, 1)(jax.lax.stop_gradient(given), guess)
         given = given._replace(open=left_open(J, equations.sizes[0] + np.arange(len(search.running))))
-    w, found = root_near(equations, given, guess, ease)
+    known = jnp.zeros_like(ease).at[: equations.moving.size].set(units[equations.moving])
+    w, found = root_near(equations, given, guess, known, ease)
     return _described(equations, given, w, found)
+
+
+def _units(M: Float[Array, "n n"]) -> Float[Array, " n"]:
+    """Of the coordinates, such that the inertia of each is 1; 0 of those without inertia, and 1 of all where none has any."""
+    mass = jax.lax.stop_gradient(jnp.diagonal(M))
+    units = jnp.where(mass > 0, jnp.where(mass > 0, mass, 1) ** -0.5, 0)
+    return jnp.where(jnp.any(mass > 0), units, 1)
 
 
 def _described(equations: Equations, given: Given, w: Array, found: Array) -> Rest:

@@ -78,7 +78,7 @@ def sparse_root_near(equations: SparseEquations, args: Any, guess: Float[Array, 
         factors = newton_factors(A)
         return lambda w: refined(A.__matmul__, A.places, factors, -equations.oriented(equations.residual(fixed, w)))
 
-    w = newton(changes, jax.lax.stop_gradient(guess))
+    w, _ = newton(changes, jax.lax.stop_gradient(guess))
     J, R = equations.jacobian(fixed, w), equations.residual(fixed, w)
     return Root(w, is_root(J, R, w) & is_regular(equations.matrix(J)))
 

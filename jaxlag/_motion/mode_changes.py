@@ -38,9 +38,7 @@ LOW = 10  # or, in roundings of the gap, the height of the last flight
 
 
 class Change(NamedTuple):
-    """y behind the end of a mode; whether a mode is consistent there, whether an impact took energy and followed from impulses, whether
-    slip had come to rest.
-    """
+    """y behind the end of a mode; whether it is consistent there, an impact took energy and followed from impulses, slip had come to rest."""
 
     y: Float[Array, " y"]
     consistent: Bool[Array, ""]

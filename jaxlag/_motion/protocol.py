@@ -5,6 +5,8 @@ import dataclasses
 from collections.abc import Callable
 from typing import Any, ClassVar, NamedTuple, Protocol, runtime_checkable
 
+import equinox as eqx
+import jax
 from jaxtyping import Array, PyTree
 
 from .._mechanics.projection import Projection
@@ -18,6 +20,11 @@ class Arguments(NamedTuple):
     scales: Any = None  # `Scales`; None where no event is located
     own: PyTree = None  # in a batch, the params of each member, members last
     directions: tuple = ()  # of the variational equations, for each order: derivatives of (params, own), directions last
+
+
+def undifferentiated(tree: PyTree) -> PyTree:
+    """The same numbers, not differentiated; params may hold functions beside."""
+    return jax.tree.map(lambda leaf: jax.lax.stop_gradient(leaf) if eqx.is_array(leaf) else leaf, tree)
 
 
 @runtime_checkable

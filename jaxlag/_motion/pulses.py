@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Array, Bool
 
 from .._program.time_functions import TimeFunctions, time_functions
-from .protocol import Arguments, FirstOrderSystem
+from .protocol import Arguments, FirstOrderSystem, undifferentiated
 from .tableaux import Tableau
 
 BRIEF = 1e-7  # of the motion, how long a pulse lasts that is looked for,
@@ -38,7 +38,7 @@ def hides_pulse(equations: FirstOrderSystem, nodes: np.ndarray, t0, t1, y, args:
 
     Of such a pulse the error of the step does not know. Not differentiated.
     """
-    t0, t1, y, args = jax.lax.stop_gradient((t0, t1, y, args))
+    t0, t1, y, args = undifferentiated((t0, t1, y, args))
     functions = time_functions(lambda t, y: equations.rates(t, y, args), t0, y)
     if functions is None:
         return jnp.array(False)

@@ -15,7 +15,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from .protocol import Arguments, AugmentedSystem
+from .protocol import Arguments, AugmentedSystem, undifferentiated
 
 
 def jvp_along(function: Callable, x: Any, directions: Any) -> tuple[Any, Any, Any]:
@@ -92,4 +92,5 @@ class AccompaniedEquations(VariationalEquations):
 
     def along_axis(self, function: Callable, t: Any, y: Any, args: Arguments) -> Array:
         alone = function(t, y[..., 0], args._replace(directions=args.directions[:-1]))
-        return with_variations(alone, jax.lax.stop_gradient(super().along_axis(function, *jax.lax.stop_gradient((t, y, args))))[..., 1:])
+        accompanying = super().along_axis(function, *undifferentiated((t, y, args)))
+        return with_variations(alone, jax.lax.stop_gradient(accompanying[..., 1:]))

@@ -1,5 +1,6 @@
 """Regression on the equations of motion, and the friction of a drive axis by both methods."""
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import oscillator as osc
@@ -165,3 +166,32 @@ def test_standard_errors_hold_for_coloured_noise():
 
     held = np.mean([inside(seed) for seed in range(30)])
     assert 0.85 <= held <= 0.99
+
+
+def swings(q, qdot, s, c):
+    """Two oscillators, x = q/s; s a unit of each."""
+    x, v = q / s, qdot / s
+    return 0.5 * v @ v - 0.5 * c["x"] * x[0] ** 2 - 0.5 * c["y"] * x[1] ** 2
+
+
+@pytest.mark.parametrize("held", [False, True])
+def test_a_regression_does_not_depend_on_units(held):
+    """Neither on those of the coordinates nor on those of what is not known; with a rod that holds both together, in any unit, too."""
+    rod = {"rod": lambda q, s: q[0] / s[0] - q[1] / s[1]} if held else None
+    system = jl.System(swings, holonomic=rod, dissipation=lambda qdot, s: 0.05 * jnp.sum((qdot / s) ** 2))
+    ts = np.linspace(0.0, 8.0, 161)
+    swing = np.array([np.cos(2.0 * ts), np.cos((2.0 if held else 3.0) * ts)]).T
+    noisy = swing + 0.01 * np.random.default_rng(0).standard_normal(swing.shape)
+
+    def found(units):
+        s = np.array(units)
+        record = jl.Experiment(ts, noisy * s, q0=s * 1.0, qdot0=0.0 * s, observe=lambda q: q)
+        c = {"x": np.nan, "y": 4.0} if held else {"x": np.nan, "y": np.nan}
+        return jl.regress(system, record, {"s": s, "c": c}, free=("c.x",) if held else ("c",))
+
+    plain = found([1.0, 1.0])
+    for units in ([1e-9, 1.0], [1.0, 1e9]):
+        other = found(units)
+        assert (other.windows, other.width) == (plain.windows, plain.width)
+        np.testing.assert_allclose(*(jax.tree.leaves(of.estimates) for of in (other, plain)), rtol=1e-6)
+        np.testing.assert_allclose(*(jax.tree.leaves(of.standard_errors) for of in (other, plain)), rtol=1e-4)

@@ -1,5 +1,6 @@
 """What is said of a linear system does not depend on the units of its states, nor on what is stiff or fast beside: closed forms, NumPy."""
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -141,3 +142,30 @@ def test_a_stable_rest_far_away(unit):
     found = jl.equilibrium(jl.System(lambda q, qdot, s: 0.5 * qdot**2 - well(q, s)), 0.05 * unit, {"s": unit}, stable=True)
     assert found.stability == "stable"
     np.testing.assert_allclose(float(found.q) / unit, np.roots([1, 0, -1, 0.1])[0].real, rtol=1e-9)
+
+
+def wells(q, qdot, s, a):
+    """Two double wells, x⁴/4 − x²/2, tilted by a, with a spring between, x = q/s."""
+    x, v = q / s, qdot / s
+    return 0.5 * v @ v + 0.2 * v[0] * v[1] - jnp.sum(x**4 / 4 - x**2 / 2 - a * x) - 0.25 * (x[0] - x[1]) ** 2
+
+
+WELLS = jl.System(wells)
+
+
+@pytest.mark.parametrize("units", [[1.0, 1.0], [1e-9, 1.0], [1e9, 1e-9], [1e-9, 1e-9]])
+def test_a_rest_in_any_units(units):
+    """At x = 1, and dx/da = 1/(3x² − 1)."""
+    s = np.array(units)
+    at_rest = lambda a: jl.equilibrium(WELLS, s * np.array([1.3, 0.8]), {"s": s, "a": a}).q / s
+    np.testing.assert_allclose(at_rest(0.0), [1, 1], rtol=1e-12)
+    np.testing.assert_allclose(jax.jacfwd(at_rest)(0.0), [0.5, 0.5], rtol=1e-10)
+    np.testing.assert_allclose(jax.jacrev(at_rest)(0.0), [0.5, 0.5], rtol=1e-10)
+
+
+@pytest.mark.parametrize("unit", [1.0, 1e-6, 1e6])
+def test_of_many_places_of_rest_the_nearest_in_the_metric_of_the_masses(unit):
+    """Masses of 1 and 4 on a spring between them, q₁ − q₂ = 1, from (0, 0): the heavy one moves a quarter as far; y in any unit."""
+    pair = jl.System(lambda q, qdot, s: 0.5 * qdot[0] ** 2 + 2 * (qdot[1] / s) ** 2 - 0.5 * (q[0] - q[1] / s - 1) ** 2)
+    found = jl.equilibrium(pair, np.zeros(2), {"s": unit})
+    np.testing.assert_allclose(found.q / np.array([1, unit]), [0.8, -0.2], rtol=1e-12)

@@ -1,0 +1,100 @@
+"""Whether a result follows a transformation."""
+
+from typing import NamedTuple
+
+import numpy as np
+from generate import Case
+from questions import QUESTIONS
+from transform import Units, plain
+from variants import Variant
+
+TIGHT = {"rtol": 1e-11, "atol": 1e-13}
+INTEGRATED = {"motion", "gradient_forward", "gradient_reverse"}
+FLOOR = {"motion": 1e-7, "gradient_forward": 1e-6, "gradient_reverse": 1e-6, "periodic": 1e-6, "linear": 1e-7, "locus": 1e-7}
+ROUNDING = 1e-9  # of what is computed without integration: some 1e6 eps, for matrices of condition 1e3 in their own units
+OTHER_STEPS = 3  # times more is allowed where other coordinates make other steps of the same tolerance
+SMALL = 1e-2  # what is smaller is compared with this: numbers are of order one in the units of a case
+
+
+class Miss(NamedTuple):
+    """How a result does not follow: what, by how much, and how much is allowed; or what was raised."""
+
+    what: str
+    off: float
+    allowed: float
+    text: str = ""
+
+    def __str__(self) -> str:
+        return self.text or f"{self.what} off by {self.off:.2g} ({self.allowed:.2g} allowed)"
+
+
+class Reference(NamedTuple):
+    """Results in the units of the case, and how far they may be off."""
+
+    results: dict[str, np.ndarray]
+    allowed: dict[str, np.ndarray]
+
+
+KNOWN: dict = {}
+
+
+def reference(case: Case, question: str) -> Reference:
+    """Those in the units of the case; of motions those of tight tolerances, and ten times the errors of the default ones."""
+    key = id(case), question
+    if key not in KNOWN:
+        ask, u = QUESTIONS[question], plain(case)
+        seen = ask(case, u)
+        results = {name: x.back for name, x in seen.items()}
+        tight = {name: x.back for name, x in ask(case, u, **TIGHT).items()} if question in INTEGRATED else results
+        floor, allowed = FLOOR.get(question, ROUNDING), {}
+        for name, x in tight.items():
+            error = np.max(np.abs(results[name] - x), initial=0.0)
+            allowed[name] = 10 * error + floor * max(SMALL, np.max(np.abs(x), initial=0.0))
+            if np.asarray(seen[name].value).dtype.kind in "ib":
+                allowed[name] = 0.0
+            if seen[name].within is not None:
+                allowed[name] = seen[name].within
+        KNOWN[key] = case, Reference(tight, allowed)
+    return KNOWN[key][1]
+
+
+def inherent(case: Case, u: Units) -> float:
+    """What is lost where the numbers themselves are large beside what changes: the clock's rounding, and offsets of coordinates."""
+    span = float(case.ts[-1] - case.ts[0])
+    late = 1e2 * np.finfo(float).eps * abs(u.start) / (u.time * span)
+    beside = np.max(np.abs(u.shift) + np.abs(u.drift) * span, initial=0.0)
+    return late + 1e-7 * beside
+
+
+def misses(case: Case, u: Units, question: str) -> list[Miss]:
+    """What does not follow."""
+    known = reference(case, question)
+    try:
+        seen = {name: x.back for name, x in QUESTIONS[question](case, u).items()}
+    except Exception as error:
+        return [Miss("raised", np.inf, 0.0, f"{type(error).__name__}: {str(error)[:150]}")]
+    more = inherent(case, u) if question in INTEGRATED | {"periodic"} else 1e-12 * np.max(np.abs(u.shift), initial=0.0)
+    return _compared(known, seen, more)
+
+
+def variant_misses(case: Case, variant: Variant, question: str) -> list[Miss]:
+    """What does not follow where the system is stated otherwise."""
+    known = reference(case, question)
+    try:
+        seen = QUESTIONS[question](variant.case, plain(variant.case))
+        return _compared(known, variant.back({name: x.back for name, x in seen.items()}), 0.0, OTHER_STEPS)
+    except Exception as error:
+        return [Miss("raised", np.inf, 0.0, f"{type(error).__name__}: {str(error)[:150]}")]
+
+
+def _compared(known: Reference, seen: dict[str, np.ndarray], more: float, slack: float = 1.0) -> list[Miss]:
+    found = []
+    for name, right in known.results.items():
+        if name not in seen:  # which depends on the frame, as works do
+            continue
+        got = seen[name]
+        off = np.max(np.abs(got - right), initial=0.0) if got.shape == right.shape else np.inf
+        allowed = slack * known.allowed[name] + (more * max(1.0, np.max(np.abs(right), initial=0.0)) if known.allowed[name] else 0.0)
+        if not off <= allowed:
+            found.append(Miss(name, float(off), float(allowed)))
+    return sorted(found, key=lambda miss: -miss.off / max(miss.allowed, 1e-300))
