@@ -77,7 +77,7 @@ def _moving(equations, params, directions, reverse) -> tuple[bool, ...]:
 
 def _end(moving: Moving, steps: Steps):
     """What is of interest of the last state: t, y, the number of the result, counts of steps, the next sample."""
-    return moving.t, moving.y, number_of(steps.result), steps.accepted, steps.rejected, steps.sample
+    return moving.t, moving.y, *(jnp.asarray(x, int) for x in (number_of(steps.result), steps.accepted, steps.rejected, steps.sample))
 
 
 def _written(length, width, saved, i, y, wanted):

@@ -38,7 +38,7 @@ LOW = 10  # or, in roundings of the gap, the height of the last flight
 
 
 class Change(NamedTuple):
-    """y behind the end of a mode; whether it is consistent there, an impact took energy and followed from impulses, slip had come to rest."""
+    """y behind the end of a mode; whether it is consistent there, an impact took energy and followed from impulses, slip was at rest."""
 
     y: Float[Array, " y"]
     consistent: Bool[Array, ""]

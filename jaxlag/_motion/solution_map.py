@@ -240,7 +240,8 @@ def samples_at(equations: EquationsOfMotion, ts, ys, params, result, stats, tole
 def scales_of(equations: EquationsOfMotion, tolerances, ts, params, ys) -> Scales:
     """The scales of a motion by its samples, as far as it went."""
     largest = jnp.max(jnp.where(jnp.isfinite(ys), jnp.abs(ys), 0), axis=0)
-    return Scales.of(tolerances, ts, params, *jnp.split(largest[: 2 * equations.size], 2), equations.sees_time)
+    q, v = jnp.split(largest[: 2 * equations.size], 2)
+    return Scales.of(tolerances, ts, params, q, v, equations.sees_time)
 
 
 def trajectory_of(system: System, options: SolverOptions, params: PyTree, ts, samples: Samples, unchanging: Unchanging) -> Trajectory:
