@@ -2,7 +2,7 @@
 
 import functools
 import itertools
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import NamedTuple
 
 import numpy as np
@@ -89,7 +89,26 @@ def _transitions(spectrum_at: Callable, before: Spectrum, after: Spectrum) -> li
     bound = np.maximum(before.rounding_of_pairs, after.rounding_of_pairs)
     changed = np.flatnonzero(before.growing(bound) != after.growing(bound))
     found = [_transition(spectrum_at, before, after, bound, int(which)) for which in changed]
-    return sorted((of for of in found if of is not None and of.eigenvalue.imag >= -bound[of.which]), key=lambda of: of.at)
+    if None in found:  # branches that meet, as two frequencies do in flutter without damping, are no longer told apart: they are counted
+        return list(_by_number(spectrum_at, before, after, bound))
+    return sorted((of for of in found if of.eigenvalue.imag >= -bound[of.which]), key=lambda of: of.at)
+
+
+def _by_number(spectrum_at: Callable, before: Spectrum, after: Spectrum, bound: np.ndarray) -> Iterator[Transition]:
+    """Transitions one after the other: each where the number of growing eigenvalues changes."""
+    count = lambda spectrum: np.sum(spectrum.growing(bound))
+    ends = before.at, after.at
+    while count(before) != count(after):
+        low, high = before, after
+        while (middle := (low.at + high.at) / 2) not in (low.at, high.at):
+            between = continued(low, spectrum_at(middle))
+            low, high = (between, high) if count(between) == count(before) else (low, between)
+        grows = bool(count(high) > count(low))
+        growing, other = (high, low) if grows else (low, high)
+        crosses = growing.growing(bound) & ~other.growing(bound) & (growing.values.imag >= -bound)
+        for which in np.flatnonzero(crosses):
+            yield Transition(high.at, int(which), grows, growing, max(ends, key=lambda end: abs(end - high.at)))
+        before = high
 
 
 def _transition(spectrum_at: Callable, before: Spectrum, after: Spectrum, bound: np.ndarray, which: int) -> Transition | None:

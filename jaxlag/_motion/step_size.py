@@ -23,7 +23,7 @@ from jaxtyping import Array
 from .results import RESULTS, under_diffrax
 from .scales import SHARE, reaching
 
-FIRST_STEP = 0.01  # of the motion; each step that is refused may be a fifth as long, each that is kept ten times
+FIRST_STEP = 1e-3  # of the motion; each step that is refused may be a fifth as long, each that is kept ten times
 UNRESOLVED = 1e-4  # of its own scale, the error of what is rounding: a jump of a rate would err less in a step as short as FAR
 FAR = 1e-4  # of the length tried before: six steps that were refused
 MARGIN = 1e3  # times its last error, what rounding may err by: so that it does not hold the next steps back
