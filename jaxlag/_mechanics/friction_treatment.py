@@ -19,8 +19,10 @@ class StickSlip:
     within ±μN. The times of the transitions between the two are located to rounding and differentiated.
 
     Elements that can share a load in more than one way, as the legs of a plate can, hold it as long as one way is possible; the motion
-    is the same for all of them. The reported forces are then one possible share: for slip velocities of several components the one that
-    minimises the largest utilisation, for others that of least norm until one reaches its bound. The share is not differentiated.
+    is the same for all of them. So do normal forces and friction that hold each other, as at the ends of a ladder, where the bounds move
+    with the share. The reported forces are then one possible share: for slip velocities of several components, and where bounds depend on
+    multipliers, the one that leaves most of all bounds, for others that of least norm until one reaches its bound. The share is not
+    differentiated.
 
     **Arguments:** `max_transitions`: limit on changes of mode, beyond which the motion is reported as chattering.
 

@@ -21,7 +21,7 @@ from .._program.scalarise import scalarised
 from .constrained_acceleration import constrained_acceleration
 from .constrained_slip import directed, extent_of, freely, on_constraints
 from .friction_elements import FrictionElements
-from .load_sharing import shared
+from .load_sharing import may_share, shared
 from .massless import completed, nearest_velocity, smooth_force
 
 
@@ -104,13 +104,12 @@ def _friction(flat, elements, sigma, t, q, v, feedback):
         moves = elements.follows & (elements.norms(at_once) > slip_of(elements, t, q, there, 1e2 * jnp.finfo(v.dtype).eps * jnp.abs(there)))
         slip_rate = jnp.where(moves[of], at_once, slip_rate)
     pull = jax.vjp(lambda slip: extent_of(elements, sigma, slip), slip)[1]
-    bound = bounds(elements, sigma, t, q, v, multipliers)
-    held = freely(elements, multipliers[flat.rows :])
-    left = bound - elements.norms(held)
-    if elements.are_shared:
-        J = freely(elements, jax.jacfwd(elements.slip, argnums=2)(t, q, v))
-        held, left = shared(elements, J, held, bound, stuck)
-    force = jnp.where(stuck[of], held, -pull(bound)[0])
+    bound_of = lambda multipliers: bounds(elements, sigma, t, q, v, multipliers)
+    left = bound_of(multipliers) - elements.norms(freely(elements, multipliers[flat.rows :]))
+    if may_share(flat, elements):
+        multipliers, left = shared(mode, elements, t, q, v, multipliers, bound_of, stuck)
+    bound = bound_of(multipliers)
+    force = jnp.where(stuck[of], freely(elements, multipliers[flat.rows :]), -pull(bound)[0])
     going = elements.sums(directed(elements, sigma) * slip) + jnp.where(elements.straight, 0, 1e-6 * elements.near_rest)
     driven = jnp.broadcast_to(elements.driven, stuck.shape)
     resting = jnp.where(driven, -jnp.abs(bound), left + 1e2 * jnp.finfo(v.dtype).eps * jnp.abs(bound))

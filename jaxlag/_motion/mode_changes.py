@@ -172,10 +172,11 @@ def changed(equations: EquationsOfMotion, t, y, args: Arguments, ended: Bool[Arr
     of_friction, of_contact = jnp.split(ended[: equations.elements + equations.contacts], [equations.elements])
     if not equations.contacts:
         assert elements is not None
-        stuck, slow = sticking(elements, parts.sigma) | (parts.held > 0), _slow(elements, t, parts, args.scales.of_velocities(parts.v))
-        at_rest = stuck | of_friction | (slow & ~elements.driven)
-        along, given = in_other(equations, t, parts, args), (parts.sigma, at_rest, of_friction & stuck)
-        mode, _ = select_mode(flat, elements, t, parts.q, parts.v, *given, friction_in=along)
+        stuck, errors = sticking(elements, parts.sigma) | (parts.held > 0), args.scales.of_velocities(parts.v)
+        slow = _slow(elements, t, parts, errors)
+        at_rest, there = stuck | of_friction | (slow & ~elements.driven), parts.without(errors)
+        given = parts.q, there.v, parts.sigma, at_rest, of_friction & stuck
+        mode, _ = select_mode(flat, elements, t, *given, friction_in=in_other(equations, t, there, args))
         after = equations.in_new_mode(t, in_other_mode(elements, parts, mode).y, args)
         return Change(after, mode.consistent, jnp.array(True), jnp.array(True), jnp.all(~of_friction | stuck | slow))
     errors = args.scales.of_positions(parts.q), args.scales.of_velocities(parts.v)
@@ -220,7 +221,7 @@ def behind_contact(equations: EquationsOfMotion, t, parts: Parts, args: Argument
     loose = jnp.where(hits & jnp.array(varies), jnp.finfo(q.dtype).tiny, 0) if any(varies) else None  # they depart as e grows
     if elements is None:
         chosen = select_closed(flat, t, q, found.v, resting, loose)
-        slow, stuck = jnp.ones_like(of_friction), jnp.ones_like(of_friction)
+        slow = stuck = jnp.ones_like(of_friction)
     else:
         stuck, slow = sticking(elements, parts.sigma) | (parts.held > 0), _slow(elements, t, parts, errors[1])
         slip = elements.slip(t, q, found.v)
@@ -229,13 +230,11 @@ def behind_contact(equations: EquationsOfMotion, t, parts: Parts, args: Argument
         at_rest = jnp.where(anew, slow | elements.follows, stuck | of_friction | (slow & ~elements.driven))
         breaking = jnp.where(anew, elements.follows & ~stuck, of_friction & stuck)  # at its bound: the forces tell where it goes on
         along = jnp.where(anew, slip / jnp.where(size > 0, size, 1), parts.sigma)
-        given = along, at_rest, breaking
-        among = Contacts.of(flat, t, q, found.v, resting, loose)
-        mode, contacts = select_mode(flat, elements, t, q, found.v, *given, among, in_other(equations, t, parts, args))
+        among, there = Contacts.of(flat, t, q, found.v, resting, loose), parts.without(errors[1])
+        mode, contacts = select_mode(flat, elements, t, q, there.v, along, at_rest, breaking, among, in_other(equations, t, there, args))
         chosen = Chosen(contacts.closed, mode, mode.consistent)
         parts = in_other_mode(elements, parts, mode)
-    changes = (chosen.closed != closed) & ~hits
-    parts = parts._replace(closed=chosen.closed.astype(q.dtype), changed=jnp.where(changes, t, parts.changed))
+    parts = parts._replace(closed=chosen.closed.astype(q.dtype), changed=jnp.where((chosen.closed != closed) & ~hits, t, parts.changed))
     at_rest = jnp.all(~of_friction | stuck | slow) | anew
     return Change(equations.projected(t, parts.y, args), chosen.consistent & found.consistent, found.dissipates, found.impulsive, at_rest)
 

@@ -43,6 +43,10 @@ class Parts(NamedTuple):
         """Put together again."""
         return jnp.concatenate(self)
 
+    def without(self, errors: Float[Array, " n"]) -> "Parts":
+        """With no velocity that is but an error: where all comes to rest, the square of what is left would pull apart what sticks."""
+        return self._replace(v=jnp.where(jnp.abs(self.v) <= errors, 0, self.v))
+
 
 class Start(NamedTuple):
     """y at the start; whether a friction mode is consistent with its forces; whether no bound is negative; whether it lies outside of all

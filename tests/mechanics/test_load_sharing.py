@@ -10,7 +10,7 @@ from scipy.optimize import minimize
 
 import jaxlag as jl
 from jaxlag._mechanics.friction_elements import FrictionElements
-from jaxlag._mechanics.load_sharing import shared
+from jaxlag._mechanics.load_sharing import best_share
 
 LEGS = {
     2: np.array([[1.0, 0.0], [-1.0, 0.0]]),
@@ -53,7 +53,7 @@ def test_the_most_loaded_element_is_used_as_little_as_can_be(seed):
     of = np.repeat(np.arange(count), rng.integers(1, 3, count))
     J, given, bound = rng.normal(size=(of.size, 3)), rng.normal(size=of.size), rng.uniform(0.5, 2, count)
     elements = FrictionElements(lambda t, q, v: J @ v, {}, of, {"all": np.arange(of.size)})
-    left = jax.jit(lambda given: shared(elements, jnp.asarray(J), given, jnp.asarray(bound), jnp.ones(count, bool)))
+    left = jax.jit(lambda given: best_share(elements, jnp.asarray(J), given, lambda x: jnp.asarray(bound), jnp.ones(count, bool), 1))
     share = left(given)
     np.testing.assert_allclose(J.T @ share.multipliers, J.T @ given, atol=1e-13)
     N = null_space(J.T)
