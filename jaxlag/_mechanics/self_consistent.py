@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from .._program.implicit import implicit_root
+from .._program.implicit import implicit_root, open_function
 from .._program.sparse_jacobian import sparsity_pattern
 
 ITERATIONS = 60
@@ -42,7 +42,7 @@ def self_consistent(reaction: Callable, unit: Float[Array, " m"]) -> Float[Array
     if is_affine(reaction, start):  # then one step is exact
         step, sound = _step(reaction, start)
         return jnp.where(sound, step, jnp.nan)
-    reaction, within = jax.closure_convert(reaction, start)
+    reaction, within = open_function(reaction, start)
     fixed = jax.lax.stop_gradient(within)
     found = _by_newton(lambda x: reaction(x, *fixed), start, jax.lax.stop_gradient(unit))
 

@@ -5,7 +5,11 @@ from collections.abc import Callable
 from typing import Any
 
 import jax
+import jax.numpy as jnp
+from jax.extend import core
 from jaxtyping import Array, Float
+
+from .walker import constants_as_inputs
 
 
 def undifferentiated(function: Callable) -> Callable:
@@ -17,6 +21,24 @@ def undifferentiated(function: Callable) -> Callable:
         return converted(*jax.lax.stop_gradient((*given, *closed_over)))
 
     return call
+
+
+def open_function(function: Callable, *given: Any) -> tuple[Callable, list[Array]]:
+    """A function of `given` and of all arrays that it closes over, and these arrays, as floats.
+
+    `jax.closure_convert` leaves truth values and integers closed over, and a rule of derivatives must hold none that is traced.
+    """
+    closed, shape = jax.make_jaxpr(function, return_shape=True)(*given)
+    run = core.jaxpr_as_fun(core.ClosedJaxpr(constants_as_inputs(closed), ()))
+    numbers = [jnp.asarray(x) for x in closed.consts]
+    counts = [jnp.issubdtype(x.dtype, jnp.integer) or jnp.issubdtype(x.dtype, jnp.bool_) for x in numbers]
+
+    def opened(*given_and_more):
+        values, more = given_and_more[: len(given)], given_and_more[len(given) :]
+        more = [x.astype(like.dtype) if count else x for x, like, count in zip(more, numbers, counts, strict=True)]
+        return jax.tree.unflatten(jax.tree.structure(shape), run(*more, *jax.tree.leaves(values)))
+
+    return opened, [x.astype(float) if count else x for x, count in zip(numbers, counts, strict=True)]
 
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(0, 1))
