@@ -35,6 +35,7 @@ class Scales(NamedTuple):
     of_q: Any
     of_v: Any
     driven: Any = None  # of each velocity, the least scale that dry friction in a plane gives it
+    shares: tuple = ()  # of each direction of variations, for each order, the share by which it changes a number at most
 
     @classmethod
     def of(cls, tolerances: tuple[Array, Array | None], ts: Array, params: PyTree, q: Array, v: Array, sees_time: bool) -> "Scales":

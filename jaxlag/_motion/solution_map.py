@@ -1,6 +1,7 @@
 """The solution map of a motion: from its inputs (start, params, tolerances) and sample times to its samples; and what differentiates it."""
 
 import dataclasses
+import functools
 from typing import Any, NamedTuple
 
 import diffrax as dfx
@@ -128,6 +129,7 @@ class SolutionMap:
         variations, times = self._variations(equations, inputs, directions, ts), ts - ts[0]
         y0, start = variations.initial(inputs)
         args, tolerances = self._arguments(equations, inputs, ts), inputs.tolerances
+        args = args._replace(scales=args.scales._replace(shares=tuple(_shares(inputs, of_order) for of_order in directions)))
         if is_variational(equations, self.options, varying, inputs.params):
             args = args._replace(directions=variations.directions)
             ys, result, stats = in_one_loop(variations.equations, self.options, at.t, y0, times, args, tolerances)
@@ -213,6 +215,16 @@ def _at_random(inputs: Inputs) -> Inputs:
     parts = inputs.q0, inputs.qdot0, inputs.params, inputs.states
     q0, qdot0, params, states = (jax.tree.map(one, part, is_leaf=is_signal) for part in parts)
     return Inputs(None, q0, qdot0, params, jax.tree.map(lambda _: None, inputs.tolerances), states)
+
+
+def _shares(inputs: Inputs, directions: Inputs) -> Array:
+    """Of the motion, 1; of each direction, the share of itself by which a number that is not zero changes at most."""
+    varying, _ = split_varying(inputs, directions)
+    pairs = zip(*map(jax.tree.leaves, (varying, directions)), strict=True)
+    of_each = [jnp.where(x == 0, 0, jnp.abs(dx) / jnp.where(x == 0, 1, jnp.abs(x))) for x, dx in ((x[..., None], dx) for x, dx in pairs)]
+    size = jax.tree.leaves(directions)[0].shape[-1]
+    most = functools.reduce(jnp.maximum, (jnp.max(share.reshape(-1, size), axis=0, initial=0.0) for share in of_each))
+    return jax.lax.stop_gradient(jnp.concatenate([jnp.ones(1, most.dtype), most]))
 
 
 def _first_time(inputs: Inputs, ts: Array) -> Array:

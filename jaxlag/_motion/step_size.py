@@ -79,7 +79,7 @@ class StepControl(dfx.AbstractStepSizeController):
         y1, h = jnp.where(finite, y1, y0), t1 - t0
         size = jnp.maximum(scale.size, jnp.abs(y1))
         reach = self._reach(size, args)
-        allowed = self.allowed(jnp.maximum(jnp.abs(y0), jnp.abs(y1)), reach)
+        allowed = self.allowed(jnp.maximum(jnp.abs(y0), jnp.abs(y1)), reach) + self._rounding(reach, args)
         first = jnp.maximum(scale.first, h)
         found = self._noise(scale.size, error, allowed, reach, h, first)
         growth = jnp.where(scale.growth > 0, scale.growth, found / jnp.where(h > 0, h, jnp.inf))
@@ -108,6 +108,15 @@ class StepControl(dfx.AbstractStepSizeController):
         driven = args.scales.driven
         driven = jnp.concatenate([SHARE * self.duration * driven, driven, jnp.zeros(len(size) - 2 * n)]).astype(size.dtype)
         return jnp.where(self._is_motion(size), jnp.maximum(reach, driven.reshape(-1, *[1] * (size.ndim - 1))), reach)
+
+    def _rounding(self, reach, args):
+        """What a variation that changes no entry of y beyond its rounding, though its number changes by its own size, may err by."""
+        shares = () if getattr(args, "scales", None) is None else args.scales.shares
+        if not shares or len(shares) != self.variations:
+            return 0.0
+        of = functools.reduce(lambda x, share: x[..., None] * share, shares, reach[(..., *[0] * self.variations)])
+        blur = jnp.finfo(reach.dtype).eps * of
+        return jnp.where(~self._is_motion(reach) & (reach < MARGIN * blur), blur, 0)
 
     def allowed(self, near, reach):
         """What of an error is allowed: of the motion, by `atol` where that is given; of variations, by their own scale."""
