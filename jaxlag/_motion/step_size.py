@@ -114,7 +114,7 @@ class StepControl(dfx.AbstractStepSizeController):
         shares = () if getattr(args, "scales", None) is None else args.scales.shares
         if not shares or len(shares) != self.variations:
             return 0.0
-        of = functools.reduce(lambda x, share: x[..., None] * share, shares, reach[(..., *[0] * self.variations)])
+        of = functools.reduce(jnp.multiply.outer, shares, reach[(..., *[0] * self.variations)])
         blur = jnp.finfo(reach.dtype).eps * of
         return jnp.where(~self._is_motion(reach) & (reach < MARGIN * blur), blur, 0)
 
