@@ -88,8 +88,8 @@ def _transitions(spectrum_at: Callable, before: Spectrum, after: Spectrum) -> li
     """
     bound = np.maximum(before.rounding_of_pairs, after.rounding_of_pairs)
     changed = np.flatnonzero(before.growing(bound) != after.growing(bound))
-    found = [_transition(spectrum_at, before, after, bound, int(which)) for which in changed]
-    if None in found:  # branches that meet, as two frequencies do in flutter without damping, are no longer told apart: they are counted
+    found = [of for which in changed if (of := _transition(spectrum_at, before, after, bound, int(which))) is not None]
+    if len(found) < len(changed):  # branches that meet, as in flutter without damping, are not told apart: they are counted
         return list(_by_number(spectrum_at, before, after, bound))
     return sorted((of for of in found if of.eigenvalue.imag >= -bound[of.which]), key=lambda of: of.at)
 

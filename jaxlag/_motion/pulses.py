@@ -50,7 +50,7 @@ def hides_pulse(equations: FirstOrderSystem, nodes: np.ndarray, t0, t1, y, args:
 
 def _in_bounded(functions: TimeFunctions, nodes, t0, t1, duration):
     """Whether one with bounds goes beyond what was seen of it."""
-    at = lambda share: t0 + share * (t1 - t0)
+    at = lambda share: (t0 + share * (t1 - t0)).astype(t0.dtype)
     seen = jax.vmap(functions.values)(at(nodes))
     least, most = jnp.min(seen, axis=0), jnp.max(seen, axis=0)
 
@@ -74,7 +74,7 @@ def _in_bounded(functions: TimeFunctions, nodes, t0, t1, duration):
 
 def _in_read(functions: TimeFunctions, nodes, t0, t1, duration):
     """Whether one that is read of a table goes beyond what was seen of it."""
-    at = lambda share: t0 + share * (t1 - t0)
+    at = lambda share: (t0 + share * (t1 - t0)).astype(t0.dtype)
     seen, _ = jax.vmap(functions.read)(at(nodes))
     least, most = jnp.min(seen, axis=0, keepdims=True), jnp.max(seen, axis=0, keepdims=True)
     beside = (most - least) / 2 + FAINT_IN_TABLE * jnp.maximum(-least, most)

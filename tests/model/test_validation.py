@@ -293,7 +293,7 @@ def test_a_system_that_holds_arrays_is_refused():
 
 def test_out_of_steps():
     with pytest.raises(
-        RuntimeError, match="must reach t = 1, but stopped at t = 0.11 after 1 of 5 samples: The maximum number of solver steps"
+        RuntimeError, match="must reach t = 1, but stopped at t = 0.011 after 1 of 5 samples: The maximum number of solver steps"
     ):
         run(max_steps=2)
     motion = run(max_steps=2, throw=False)
