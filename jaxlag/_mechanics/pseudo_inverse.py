@@ -79,7 +79,7 @@ def by_rows(asked: Request, D) -> tuple[Float[Array, "m m"], Bool[Array, ""]]:
     clear, seen = values > eps**CLEAR * values[0], values > eps**SEEN * values[0]
     step = rest / jnp.where(seen, values, 1)[:, None]
     of_rows = lambda sizes: jnp.abs(U.T) @ sizes  # of what the rows in a direction have, so that what these do not touch has no say
-    length = lambda x: of_rows(jnp.sqrt((rows != 0) @ x**2))
+    length = lambda x: of_rows(jnp.sqrt((rows != 0).astype(x.dtype) @ x**2))
     moved = rows.T @ (U @ (jnp.where(clear[:, None], step, 0) / jnp.where(clear, values, 1)[:, None]))
     bound = FARTHER * (length(asked.free) + length(moved)) if asked.reach is None else of_rows(asked.reach)[:, None]
     held = clear | (seen & jnp.all(jnp.abs(step) <= bound, axis=1))

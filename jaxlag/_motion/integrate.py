@@ -9,7 +9,8 @@ import diffrax as dfx
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, PyTree
+import numpy as np
+from jaxtyping import Array, Bool, PyTree
 
 from .._mechanics.consistent_state import Consistent, has_inertia, nearest_state
 from .._mechanics.contact import outside
@@ -157,6 +158,7 @@ def by_diffrax(
 ) -> tuple[Array, RESULTS, dict]:
     """The same by diffrax's own loop, also of a batch."""
     control = StepControl.of(tolerances, (ts[0], ts[-1]), equations, _variations(equations))
+    args = _told_of_friction(equations, t0, y0, args)
     alone = in_one_kernel if isinstance(adjoint, dfx.ForwardMode) else lambda function: function
     projected = alone(equations.projected) if equations.projection else None
     solution = dfx.diffeqsolve.__wrapped__(  # all is within a program already, and `equinox.filter_jit` would keep what it is given
@@ -213,9 +215,7 @@ def in_one_loop(
     meter, dense = Meter() if options.progress else dfx.NoProgressMeter(), not has_nodes(equations, args.params)
     back = in_one_kernel(equations.projected) if dense else equations.projected
     solver = _wrapped(options, equations, back if equations.projection else None, adjoint, (t0, y0, args))
-    if isinstance(equations, EquationsOfMotion) and args.scales is not None:
-        driven = _driven(equations, t0, y0[(..., *[0] * len(directions))], args)
-        args = args._replace(scales=args.scales._replace(driven=driven))
+    args = _told_of_friction(equations, t0, y0[(..., *[0] * len(directions))], args)
     numbers = y0, t0, args, ts, tolerances
     kind = {"variations": _variations(equations), "reverse": reverse, "dense": dense}
     ys, (result, stats) = integrated(equations, solver, options.max_steps, meter, *numbers, directions, **kind)
@@ -226,20 +226,22 @@ def in_one_loop(
     return ys, from_diffrax(result), stats
 
 
-def _driven(equations: EquationsOfMotion, t, y, args: Arguments) -> Float[Array, " n"] | None:
-    """Of each velocity a tenth of what friction in a plane at its bound would make of it within the motion; None without such friction.
-
-    Where slip begins it has no scale of its own yet, and its direction follows the load at a rate of 1/|v|.
+def _told_of_friction(equations: FirstOrderSystem, t, y, args: Arguments) -> Arguments:
+    """With what dry friction at its bound would make of each velocity: where it holds another force, the rounding of both is a rate of
+    its own; where slip begins in a plane, it has no scale of its own yet, and its direction follows the load at a rate of 1/|v|.
     """
-    if equations.rows == equations.elements:
-        return None
+    if not isinstance(equations, EquationsOfMotion) or not equations.elements or args.scales is None:
+        return args
     args, parts = args._replace(scales=args.scales._replace(driven=None)), equations.parts(y)
     flat, _, elements = equations.mode(t, parts, args)
     assert elements is not None and args.scales is not None
-    bound, slopes = equations.friction(t, parts, args).bound, jax.jacfwd(lambda v: elements.slip(t, parts.q, v))(parts.v)
-    force = jnp.sum(jnp.abs(slopes) * jnp.abs(bound)[elements.element_of_row][:, None], axis=0)
-    mass = jnp.diagonal(inertia(flat, t, parts.q, parts.v)[0].as_matrix())
-    return jax.lax.stop_gradient(0.1 * args.scales.duration * force / jnp.where(mass > 0, mass, jnp.inf))
+    slopes = jax.jacfwd(lambda v: elements.slip(t, parts.q, v))(parts.v)
+    mass, of = jnp.diagonal(inertia(flat, t, parts.q, parts.v)[0].as_matrix()), elements.element_of_row
+    pulls = jnp.abs(slopes * equations.friction(t, parts, args).bound[of][:, None]) / jnp.where(mass > 0, mass, jnp.inf)
+    in_plane = elements.is_vector[of]
+    driven = 0.1 * args.scales.duration * jnp.sum(pulls[in_plane], axis=0) if np.any(in_plane) else None
+    scales = args.scales._replace(driven=driven, held=jnp.sum(pulls, axis=0))
+    return args._replace(scales=jax.lax.stop_gradient(scales))
 
 
 class Variations(NamedTuple):

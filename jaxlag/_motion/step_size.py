@@ -79,7 +79,7 @@ class StepControl(dfx.AbstractStepSizeController):
         y1, h = jnp.where(finite, y1, y0), t1 - t0
         size = jnp.maximum(scale.size, jnp.abs(y1))
         reach = self._reach(size, args)
-        allowed = self.allowed(jnp.maximum(jnp.abs(y0), jnp.abs(y1)), reach) + self._rounding(reach, args)
+        allowed = self.allowed(jnp.maximum(jnp.abs(y0), jnp.abs(y1)), reach) + self._rounding(reach, args) + self._held(reach, args, h)
         first = jnp.maximum(scale.first, h)
         found = self._noise(scale.size, error, allowed, reach, h, first)
         growth = jnp.where(scale.growth > 0, scale.growth, found / jnp.where(h > 0, h, jnp.inf))
@@ -117,6 +117,14 @@ class StepControl(dfx.AbstractStepSizeController):
         of = functools.reduce(jnp.multiply.outer, shares, reach[(..., *[0] * self.variations)])
         blur = jnp.finfo(reach.dtype).eps * of
         return jnp.where(~self._is_motion(reach) & (reach < MARGIN * blur), blur, 0)
+
+    def _held(self, like, args, h):
+        """What the rounding of forces that dry friction holds moves in a step: where a motion rests, it is all that moves."""
+        if getattr(args, "scales", None) is None or args.scales.held is None:
+            return 0.0
+        moved = 10 * jnp.finfo(like.dtype).eps * args.scales.held * h
+        moved = jnp.concatenate([moved * h, moved, jnp.zeros(len(like) - 2 * len(moved))]).astype(like.dtype)
+        return jnp.where(self._is_motion(like), moved.reshape(-1, *[1] * (like.ndim - 1)), 0)
 
     def allowed(self, near, reach):
         """What of an error is allowed: of the motion, by `atol` where that is given; of variations, by their own scale."""
