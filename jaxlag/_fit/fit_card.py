@@ -4,7 +4,7 @@ import itertools
 from collections.abc import Iterator, Sequence
 from typing import Any
 
-import jax.numpy as jnp
+import jax
 import numpy as np
 from jax.flatten_util import ravel_pytree
 
@@ -36,7 +36,7 @@ def card(fit: Any) -> str:
 
 def estimates_by_name(fit: Any) -> Iterator[tuple[str, list[tuple[str, float, float]]]]:
     """A name, and each of its numbers as (name, value, standard error): of the free parameters, then of each experiment's unknowns."""
-    theta = np.asarray(fit.problem.free.theta(jnp.asarray(fit.x[: len(fit.names)])))
+    theta = np.concatenate([np.ravel(x) for x in jax.tree.leaves(list(fit.estimates.values()))])
     triples = list(zip(fit.names, theta, np.sqrt(np.diag(fit.covariance)), strict=True))
     yield from ((name, [triple for triple in triples if is_within(triple[0], name)]) for name in fit.estimates)
     for k, unknowns in enumerate(fit.unknowns):

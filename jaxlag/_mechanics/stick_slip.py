@@ -88,7 +88,7 @@ MOST_OPERATIONS = 1200
 def friction(flat: Flat, elements: FrictionElements, sigma, t, q, v, feedback=None) -> Friction:
     """Friction forces on the slip velocities; `margin` < 0 where a mode has ended: the slip has reversed, or the bound is exceeded."""
     of_state = lambda sigma, t, q, v: _friction(flat, elements, sigma, t, q, v, feedback)
-    return scalarised(of_state, limit=MOST_OPERATIONS)(sigma, t, q, v)
+    return scalarised(of_state, limit=MOST_OPERATIONS, apart=True)(sigma, t, q, v)
 
 
 def _friction(flat, elements, sigma, t, q, v, feedback):

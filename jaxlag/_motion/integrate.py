@@ -237,7 +237,8 @@ def _told_of_friction(equations: FirstOrderSystem, t, y, args: Arguments) -> Arg
     assert elements is not None and args.scales is not None
     slopes = jax.jacfwd(lambda v: elements.slip(t, parts.q, v))(parts.v)
     mass, of = jnp.diagonal(inertia(flat, t, parts.q, parts.v)[0].as_matrix()), elements.element_of_row
-    pulls = jnp.abs(slopes * equations.friction(t, parts, args).bound[of][:, None]) / jnp.where(mass > 0, mass, jnp.inf)
+    bound = equations.friction(t, parts, args).bound[of]
+    pulls = jnp.abs(slopes * jnp.outer(bound, 1 / jnp.where(mass > 0, mass, jnp.inf)))
     in_plane = elements.is_vector[of]
     driven = 0.1 * args.scales.duration * jnp.sum(pulls[in_plane], axis=0) if np.any(in_plane) else None
     scales = args.scales._replace(driven=driven, held=jnp.sum(pulls, axis=0))

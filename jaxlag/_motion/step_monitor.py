@@ -157,7 +157,7 @@ def _looking(margins, path, t0, t1, of_time_alone: TimeDependence | None) -> Cal
     if of_time_alone is None:
         changed = lambda ts: jnp.zeros(())
     else:
-        reach = jnp.max(jax.vmap(lambda t: _reach(of_time_alone, t, path(t)))(jnp.linspace(t0, t1, 3)), axis=0)
+        reach = jnp.max(jax.lax.map(lambda t: _reach(of_time_alone, t, path(t)), jnp.linspace(t0, t1, 3)), axis=0)
         changed = lambda ts: jax.vmap(lambda start, end: _change(of_time_alone, reach, start, end))(ts[:-1], ts[1:])
 
     def looks(ts):
@@ -168,10 +168,13 @@ def _looking(margins, path, t0, t1, of_time_alone: TimeDependence | None) -> Cal
 
 
 def _reach(of_time_alone: TimeDependence, t, y) -> Float[Array, "m p"]:
-    """|∂f/∂φ|."""
+    """|∂f/∂φ|, one entry of φ at a time: where numbers have one axis and their derivatives two, XLA computes long chains of both in one
+    kernel, each term anew for each that asks for it, which does not end.
+    """
     found = of_time_alone.phi(t)
     phi, unravel = ravel_pytree(eqx.filter(found, eqx.is_inexact_array))
-    return jnp.abs(jax.jacfwd(lambda phi: of_time_alone.rest(eqx.combine(unravel(phi), found), y))(phi))
+    rest = lambda phi: of_time_alone.rest(eqx.combine(unravel(phi), found), y)
+    return jnp.abs(jax.lax.map(lambda one: jax.jvp(rest, (phi,), (one,))[1], jnp.eye(phi.size, dtype=phi.dtype))).T
 
 
 def _change(of_time_alone: TimeDependence, reach, start, end):

@@ -157,7 +157,8 @@ class StickSlipSolver(ProjectedSolver):
         until = jnp.where(falling, jnp.abs(value) / jnp.where(falling, -slope, 1), jnp.inf)
         nearest = jax.lax.stop_gradient(jnp.argmin(until))
         estimate = end - value[nearest] / jnp.where(falling[nearest], slope[nearest], -jnp.inf)
-        usable = jnp.any(falling) & (end >= t0 - late[nearest]) & (end <= t1)
+        slack = jnp.maximum(late[nearest], args.scales.rounding)  # times near zero are finer than what happens at them
+        usable = jnp.any(falling) & (end >= t0 - slack) & (end <= t1)
         located = split._replace(first=done, cut=split.cut._replace(time=end, estimate=estimate, usable=usable))
         simultaneous = falling & (value <= -slope * SIMULTANEOUS * args.scales.rounding)
         ended = (jnp.arange(value.size) == nearest) | simultaneous

@@ -32,21 +32,23 @@ class _Jax(Algebra):
 
 
 JAX_ALGEBRA = _Jax()
+FEW = 6  # entries of a result that are put together one by one
 
 
-def scalarised(function: Callable, *, limit: int = 800) -> Callable:
+def scalarised(function: Callable, *, limit: int = 800, apart: bool = False) -> Callable:
     """`function` of pytrees of arrays as scalar code: the same values and derivatives, to rounding, in less time where it is small.
 
     What has no scalar form (a decomposition, a loop of unknown length) still works on arrays. A function of more than `limit` scalar
     operations is left as it is, and so is one whose variables are complex or of half precision. The results that an infinity or a NaN
-    gives in 0·x, x − x or (1/√x)² are not kept, nor is the sign of a zero, except where an angle depends on it.
+    gives in 0·x, x − x or (1/√x)² are not kept, nor is the sign of a zero, except where an angle depends on it. Results `apart` are put
+    together entry by entry: where they are parts of one array, XLA computes what long chains of operations share anew for each part.
     """
     # 700: a chain of 5 links has 633, and takes half the time of arrays; one of 6 links has 838, and its first derivative would take
     # four times as long to compile, a higher one twice as long (tests/benchmarks/bench_entries.py --limit 100000).
-    return jax.jit(functools.wraps(function)(_as_scalar_code(function, limit)))
+    return jax.jit(functools.wraps(function)(_as_scalar_code(function, limit, apart)))
 
 
-def _as_scalar_code(function: Callable, limit: int | float = math.inf) -> Callable:
+def _as_scalar_code(function: Callable, limit: int | float = math.inf, apart: bool = False) -> Callable:
     def in_scalars(*arguments):
         closed, shapes = jax.make_jaxpr(function, return_shape=True)(*arguments)
         leaves, interpreter = jax.tree.leaves(arguments), Interpreter(JAX_ALGEBRA, limit)
@@ -58,7 +60,8 @@ def _as_scalar_code(function: Callable, limit: int | float = math.inf) -> Callab
             arrays = [*closed.consts, *leaves]
             pairs = [(nodes, array) for nodes, array in zip(inputs, arrays, strict=True) if nodes.dtype == object]
             given = {node: x for nodes, array in pairs for node, x in zip(nodes.flat, _scalars(array).flat, strict=True)}
-            results = [_array(x, atom.aval.dtype) for x, atom in zip(interpreter.values(outputs, given), closed.jaxpr.outvars, strict=True)]
+            array, found = _selected if apart else _array, zip(interpreter.values(outputs, given), closed.jaxpr.outvars, strict=True)
+            results = [array(x, atom.aval.dtype) for x, atom in found]
         return jax.tree.unflatten(jax.tree.structure(shapes), results)
 
     return in_scalars
@@ -78,6 +81,15 @@ def _array(array: np.ndarray, dtype) -> jax.Array:
     parts = [np.full((1,), x, dtype) if is_number(x) else lax.reshape(x, (1,)) for x in array.flat]
     whole = lax.concatenate(parts, 0) if len(parts) > 1 else array.flat[0]
     return whole if np.shape(whole) == array.shape else lax.reshape(whole, array.shape)
+
+
+def _selected(array: np.ndarray, dtype) -> jax.Array:
+    """The same of few entries without a concatenation."""
+    if not 1 < array.size <= FEW or all(map(is_number, array.flat)):
+        return _array(array, dtype)
+    wide = [lax.broadcast_in_dim(np.asarray(x, dtype) if is_number(x) else x, (array.size,), ()) for x in array.flat]
+    choose = lambda whole, entry: lax.select_n(np.arange(array.size) == entry[0], whole, entry[1])
+    return lax.reshape(functools.reduce(choose, enumerate(wide[1:], 1), wide[0]), array.shape)
 
 
 def _without_numbers(arrays: Iterable[np.ndarray]) -> tuple[list, Callable[[list], Arrays]]:
