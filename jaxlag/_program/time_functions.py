@@ -40,7 +40,7 @@ def time_functions(function: Callable, t: Array, y: Array) -> TimeFunctions | No
     steps, constants, (output,) = inlined_steps(jax.make_jaxpr(function)(t, y), (*CALLS, *CALLS_WITH_DERIVATIVE_RULE))
     of_t, of_y, needed = dependents(steps, T), dependents(steps, Y), ancestors(steps, [output])
     forms, of_table, are_known = {T: (T, 1)}, set[int](), True
-    bounded, places, used = list[int](), list[int](), [output]
+    bounded, lookups, used = list[int](), list[tuple[set[int], list[int]]](), [output]
     for step in (step for step in steps if needed.intersection(step.results)):
         if of_y.intersection(step.results) or not of_t.intersection(step.results):
             used += step.operands
@@ -48,7 +48,7 @@ def time_functions(function: Callable, t: Array, y: Array) -> TimeFunctions | No
         form = _polynomial(step, [forms.get(x, NO_FORM) for x in step.operands])
         forms |= {x: form or (x, 1) for x in step.results}
         at = [x for x in step.operands[1:] if x in of_t] if step.equation.primitive.name in LOOKUPS else []
-        is_ruled, places = has_bounds(step.equation), places + at
+        is_ruled, lookups = has_bounds(step.equation), [*lookups, (set(step.results), at)]
         if form and form[0] == UNKNOWN:
             used += step.operands
         elif at or not is_ruled or of_table.intersection(step.operands):
@@ -59,6 +59,8 @@ def time_functions(function: Callable, t: Array, y: Array) -> TimeFunctions | No
     read = [x for x in dict.fromkeys(forms[x][0] for x in used if x in of_table) if x in of_table]
     if not bounded + read:
         return None
+    entries = _made_of(steps, read)
+    places = [x for results, at in lookups if entries.intersection(results) for x in at]
     joined = lambda every, which: jnp.concatenate([jnp.zeros(0, y.dtype), *(jnp.ravel(every[x]).astype(y.dtype) for x in which)])
     to_bounded, to_read = _leading_to(steps, bounded), _leading_to(steps, [*read, *places])
 
@@ -79,6 +81,16 @@ def _leading_to(steps: list[Step], ends: list[int]) -> list[Step]:
     """The steps that these quantities depend on."""
     needed = ancestors(steps, ends)
     return [step for step in steps if needed.intersection(step.results)]
+
+
+def _made_of(steps: list[Step], ends: list[int]) -> set[int]:
+    """The numbers that these are computed from: not where they are looked up, nor what is only compared, as in a search of the place."""
+    found = set(ends)
+    for step in reversed(steps):
+        if found.intersection(step.results):
+            given = step.operands[:1] if step.equation.primitive.name in LOOKUPS else step.operands
+            found.update(x for x, of in zip(given, step.equation.invars, strict=False) if of.aval.dtype != bool)
+    return found
 
 
 def _polynomial(step: Step, forms: list[tuple[Any, int]]) -> tuple[Any, int] | None:

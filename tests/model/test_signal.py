@@ -344,7 +344,7 @@ def test_neither_samples_nor_a_smooth_signal_end_steps():
     cart = jl.System(lambda qdot: 0.5 * qdot**2, force={"cubic": lambda t, u: u(t)})
     motion = jl.simulate(cart, 0.0, 0.0, ts, {"u": Signal(ts, 6 * ts, Cubic())})
     np.testing.assert_allclose(motion.q, ts**3, atol=1e-12)
-    assert motion.stats["num_steps"] < 101  # the rounding of u″ = 0 at the knots counts as a pulse for now; 20 would do
+    assert motion.stats["num_steps"] < 20
 
 
 @pytest.mark.filterwarnings("ignore:jaxlag runs in single precision")

@@ -32,14 +32,16 @@ def test_sizes():
 @pytest.mark.parametrize("interpolation", [jl.ZeroOrderHold(), jl.Linear(), jl.Cubic()])
 def test_a_motion_is_that_without_padding(interpolation):
     """Compared with the program that is compiled for its own length within `jit`, in all that a motion shows."""
+    over_knots = isinstance(interpolation, jl.Cubic)  # u‴ jumps within steps, whose error rounding moves
+    exactly = 1e-11 if over_knots else 1e-12
     padded = motion(37, interpolation, works=True)
     plain = jax.jit(lambda b: motion(37, interpolation, b, works=True))(0.3)
     assert len(padded) == 37 and padded.provenance.params["u"].ts.shape == (34,)
     assert jax.tree.structure(padded) == jax.tree.structure(plain)
     for found, expected in zip(jax.tree.leaves(padded), jax.tree.leaves(plain), strict=True):
-        np.testing.assert_allclose(found, expected, rtol=1e-12, atol=1e-12)
-    np.testing.assert_allclose(padded.at(1.234).q, plain.at(1.234).q, rtol=1e-12)
-    np.testing.assert_allclose(padded.balance(), 0, atol=1e-7)
+        np.testing.assert_allclose(found, expected, rtol=exactly, atol=exactly)
+    np.testing.assert_allclose(padded.at(1.234).q, plain.at(1.234).q, rtol=exactly)
+    np.testing.assert_allclose(padded.balance(), 0, atol=3e-7 if over_knots else 1e-7)
 
 
 @pytest.mark.parametrize("derivative, tolerance", [(jax.grad, 1e-8), (jax.jacfwd, 1e-8), (jax.hessian, 1e-12)])
