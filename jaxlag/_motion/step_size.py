@@ -111,11 +111,10 @@ class StepControl(dfx.AbstractStepSizeController):
 
     def _rounding(self, reach, args):
         """What a variation that changes no entry of y beyond its rounding, though its number changes by its own size, may err by."""
-        shares = () if getattr(args, "scales", None) is None else args.scales.shares
-        if not shares or len(shares) != self.variations:
+        shares = self._shares(args)
+        if not shares:
             return 0.0
-        of = functools.reduce(jnp.multiply.outer, shares, reach[(..., *[0] * self.variations)])
-        blur = jnp.finfo(reach.dtype).eps * of
+        blur = jnp.finfo(reach.dtype).eps * functools.reduce(jnp.multiply.outer, shares, reach[(..., *[0] * self.variations)])
         return jnp.where(~self._is_motion(reach) & (reach < MARGIN * blur), blur, 0)
 
     def _held(self, like, args, h):
@@ -124,7 +123,14 @@ class StepControl(dfx.AbstractStepSizeController):
             return 0.0
         moved = 10 * jnp.finfo(like.dtype).eps * args.scales.held * h
         moved = jnp.concatenate([moved * h, moved, jnp.zeros(len(like) - 2 * len(moved))]).astype(like.dtype)
+        if shares := self._shares(args):
+            return functools.reduce(jnp.multiply.outer, shares, moved)
         return jnp.where(self._is_motion(like), moved.reshape(-1, *[1] * (like.ndim - 1)), 0)
+
+    def _shares(self, args):
+        """Of the motion and each direction of its variations, the share by which it changes a number at most, where that is known."""
+        shares = () if getattr(args, "scales", None) is None else args.scales.shares
+        return shares if len(shares) == self.variations else ()
 
     def allowed(self, near, reach):
         """What of an error is allowed: of the motion, by `atol` where that is given; of variations, by their own scale."""

@@ -11,6 +11,11 @@ import jaxlag as jl
 TS = np.array([0.0, 20.0])
 DRIVEN = jl.System(lambda q, qdot, c: 0.5 * qdot**2 - 0.5 * c * q**2, force=lambda t, A: A * jnp.sin(3 * t))
 BY_AMPLITUDE = (np.sin(60.0) - 1.5 * np.sin(40.0)) / (4 - 9)  # of q(20), c = 4, from rest
+PAIR = jl.System(
+    lambda q, qdot, m, T: 0.5 * m * (qdot @ qdot + 0.6 * qdot[0] * qdot[1] - (q[0] - q[1]) ** 2 / T**2),
+    dissipation=lambda qdot, F: F * jnp.sum(jnp.abs(qdot)),
+    force=lambda t, A, T: A * jnp.sin(t / T) * jnp.array([1.0, 0.0]),
+)
 
 
 def driven(A, unit=1.0, **how):
@@ -118,3 +123,15 @@ def test_a_direction_of_rounding_alone_costs_few_steps():
     (slope, of_wheel), steps = jax.grad(last, (0, 1), has_aux=True)(1.0, 0.3)
     np.testing.assert_allclose(slope, 20 * np.sin(40.0), rtol=1e-6)  # q = cos(2t/√m)
     assert of_wheel == 0 and steps < 200
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("length, time, mass", [(1.0, 1.0, 1.0), (3e-8, 2e3, 4e-5)])
+def test_blocks_that_stick_at_first(length, time, mass):
+    """What they hold cancels but for its rounding, and so does what of it varies: steps became as short as times have digits."""
+    rest, params = jnp.zeros(2), lambda x: {"A": x[0] * force, "F": x[1] * force, "m": mass, "T": time}
+    motion = lambda x: jl.simulate(PAIR, rest, rest, TS / 5 * time, params(x)).q[-1, 0] / length
+    force, x = mass * length / time**2, jnp.array([3.0, 1.0])
+    by_differences = [(motion(x + dx) - motion(x - dx)) / 2e-5 for dx in 1e-5 * jnp.eye(2)]
+    np.testing.assert_allclose(jax.jacfwd(motion)(x), by_differences, rtol=1e-6)
+    np.testing.assert_allclose(jax.jacrev(motion)(x), by_differences, rtol=1e-6)

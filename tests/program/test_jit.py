@@ -1,5 +1,9 @@
 """Programs called from Python are compiled with the older CPU emitters: the same numbers, and a JAX without them works as well."""
 
+import os
+import subprocess
+import sys
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -89,3 +93,25 @@ def test_derivatives_from_python_have_the_options(derivative, monkeypatch):
     asked.clear()
     np.testing.assert_allclose(found, jax.jit(derivative(end))(c), rtol=1e-9)
     assert not asked
+
+
+WITHIN_JIT = """
+import sys
+import jax, jax.numpy as jnp, numpy as np
+jax.config.update("jax_enable_x64", True)
+import jaxlag as jl
+
+L = lambda q, qdot: 0.5 * qdot @ qdot + 0.3 * qdot[0] * qdot[1] - 0.5 * (q[0] - q[1]) ** 2
+blocks = jl.System(L, dissipation=lambda qdot, F: F * jnp.sum(jnp.abs(qdot)), force=lambda t, A: jnp.array([1.0, 0.0]) * A * jnp.sin(t))
+motion = lambda A: jl.simulate(blocks, np.zeros(2), np.zeros(2), np.linspace(0, 3, 11), {"A": A, "F": 1.0}).q[-1]
+print(*motion(3.0), *jax.jit(motion)(3.0))
+"""
+
+
+@pytest.mark.slow
+def test_within_the_users_own_jit_a_motion_ends():
+    """Two blocks that may stick, and a load of the time: with XLA's defaults, one kernel of the watch of a step ran without end."""
+    environment = {name: value for name, value in os.environ.items() if name != "XLA_FLAGS"}
+    said = subprocess.run([sys.executable, "-c", WITHIN_JIT], env=environment, capture_output=True, text=True, timeout=600, check=True)
+    alone, within = np.reshape([float(x) for x in said.stdout.split()], (2, 2))
+    np.testing.assert_allclose(within, alone, rtol=1e-9)
