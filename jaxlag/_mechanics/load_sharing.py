@@ -55,12 +55,14 @@ def may_share(flat: Flat, elements: FrictionElements) -> bool:
 
 def shared(mode: Flat, elements: FrictionElements, t, q, v, multipliers: Float[Array, " m"], bounds: Callable, stuck) -> Share:
     """The best share in a `mode`, with `bounds` of the multipliers, of the elements `stuck`, and how much of their bounds it leaves."""
-    pushes = jnp.zeros(mode.rows, bool)
+    pushes, holds = jnp.zeros(mode.rows, bool), jnp.ones(multipliers.size, bool)
     if mode.closed is not None:
-        pushes = pushes.at[mode.rows_of_bilateral + np.arange(mode.closed.size)].set(mode.closed)
+        contacts = mode.rows_of_bilateral + np.arange(mode.closed.size)
+        pushes, holds = pushes.at[contacts].set(mode.closed), holds.at[contacts].set(mode.closed)
     effect, mass = constraint_rows(mode, t, q, v)[1], jnp.diagonal(inertia(mode, t, q, v)[0].as_matrix())
     if mode.needs_multipliers:  # the friction of what slips included
         effect = effect + jax.jacfwd(lambda x: applied_force(mode, t, q, v, x))(multipliers).T
+    effect = jnp.where(holds[:, None], effect, 0)  # what is open has no force, whatever its friction would do
     effect = jax.lax.stop_gradient(effect / jnp.sqrt(jnp.where(mass > 0, mass, 1))[None, :])  # no unit of a coordinate is left
     return best_share(elements, effect, multipliers, bounds, jnp.concatenate([pushes, stuck]), LINEARISED if mode.needs_multipliers else 1)
 
@@ -83,7 +85,7 @@ def best_share(
         nothing = _Found(jnp.zeros_like(multipliers), none, none, jnp.full_like(none, -jnp.inf, shape=()))
         return jax.lax.while_loop(lambda carry: (carry[0] < most) & (carry[1].s < 0), better, (0, nothing))[1]
 
-    change, scale, weight, _ = undifferentiated(search)(effect, multipliers, there)
+    change, scale, weight, _ = undifferentiated(search, in_turn=True)(effect, multipliers, there)
     multipliers = multipliers + change
     alone = room(multipliers) - jnp.append(jnp.zeros(constraints, effect.dtype), elements.norms(multipliers[constraints:]))
     s = weight @ (alone / jnp.where(scale > 0, scale, 1))

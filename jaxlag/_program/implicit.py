@@ -5,6 +5,7 @@ from collections.abc import Callable
 from typing import Any
 
 import jax
+import jax.custom_batching
 import jax.numpy as jnp
 from jax.extend import core
 from jaxtyping import Array, Float
@@ -12,13 +13,21 @@ from jaxtyping import Array, Float
 from .walker import constants_as_inputs
 
 
-def undifferentiated(function: Callable) -> Callable:
-    """`function` of arrays, which is not differentiated, nor by what it closes over: its derivative is not even traced."""
+def undifferentiated(function: Callable, in_turn: bool = False) -> Callable:
+    """`function` of arrays, which is not differentiated, nor by what it closes over: its derivative is not even traced.
+
+    `in_turn`: a CPU computes the members of a batch one after the other. Functions of LAPACK share theirs among the threads that run them,
+    and where as many do that at once as there are threads, each waits for the others for ever (jaxlib 0.10).
+    """
 
     @functools.wraps(function)
     def call(*given):
-        converted, closed_over = jax.closure_convert(function, *given)
-        return converted(*jax.lax.stop_gradient((*given, *closed_over)))
+        if in_turn and jax.default_backend() == "cpu":
+            program, closed_over = open_function(function, *given)
+            program = jax.custom_batching.sequential_vmap(program)
+        else:
+            program, closed_over = jax.closure_convert(function, *given)
+        return program(*jax.lax.stop_gradient((*given, *closed_over)))
 
     return call
 

@@ -157,3 +157,14 @@ def test_a_ring_of_twelve_points_stops_with_all_of_them(speed):
     """After v²/2a, a = 12 · 0.1. What is left of the velocities when all stop was taken for belts that move apart: Painlevé's paradox."""
     motion = jl.simulate(ring, np.zeros(3), np.array(speed), [0.0, 5.0])
     np.testing.assert_allclose(motion.q[-1], np.array(speed) ** 2 / 2.4, rtol=1e-7, atol=1e-12)
+
+
+def test_grasps_of_a_batch_are_those_of_each():
+    """A thousand loads at a time: on a CPU one after the other, on threads that do not wait for each other."""
+    normal, tangential, _, mu = grasp(np.random.default_rng(3))
+    elements, k = FrictionElements(lambda t, q, v: v, {}, np.arange(len(mu)), {}), len(mu)
+    effect, there = jnp.concatenate([normal, tangential]), jnp.ones(2 * k, bool)
+    share = lambda given: best_share(elements, effect, given, lambda x: mu * x[:k], there, 4)
+    given = np.random.default_rng(4).normal(size=(1000, 2 * k))
+    for of_batch, of_each in zip(jax.jit(jax.vmap(share))(given), jax.lax.map(share, given), strict=True):
+        np.testing.assert_allclose(of_batch, of_each, rtol=1e-9, atol=1e-9)
