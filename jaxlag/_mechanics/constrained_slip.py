@@ -5,6 +5,7 @@ element along V alone, with P s = 0 and a force in V; across V the constraints h
 (1 − P)(s₀ − A G⁺b) is not zero, an element cannot rest: its slip is driven, as that of a crank whose angle is prescribed.
 """
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import jax
@@ -13,6 +14,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from .._model.flat import Flat
+from .._program.implicit import undifferentiated
 from .._program.scalarise import scalarised
 from .._program.sparse_jacobian import sparsity_pattern
 from .friction_elements import FrictionElements
@@ -30,12 +32,15 @@ class Left(NamedTuple):
     driven: Bool[Array, " e"]
 
 
-def on_constraints(flat: Flat, elements: FrictionElements, t, q, v) -> FrictionElements:
-    """The elements at this state, with what the constraints leave of their slip. Of many constraints that is not asked."""
+def on_constraints(flat: Flat, elements: FrictionElements, t, q, v, left: Callable | None = None) -> FrictionElements:
+    """The elements at this state, with what the constraints leave of their slip. Of many constraints that is not asked.
+
+    `left()` is what they leave, where there is a program of it already.
+    """
     if not 0 < flat.rows <= FEW or flat.massless or not _may_be_decided(flat, elements, t, q, v):
         return elements._replace(free=None, straight=np.array(False), driven=np.array(False))
-    left = scalarised(lambda t, q, v: _left(flat, elements, t, q, v))(t, q, v)
-    return elements._replace(**left._asdict())
+    found = left() if left else left_by_constraints(flat, elements, t, q, v)
+    return elements._replace(**found._asdict())
 
 
 def freely(elements: FrictionElements, rows: Float[Array, "r *k"]) -> Float[Array, "r *k"]:  # noqa: F821
@@ -68,6 +73,12 @@ def _may_be_decided(flat: Flat, elements: FrictionElements, t, q, v) -> bool:
         return True
     held = np.any(sparsity_pattern(lambda v: velocity_residual(flat, t, q, v), v), axis=0)
     return bool(np.any(np.all(held | ~sparsity_pattern(lambda v: elements.slip(t, q, v), v), axis=1)))
+
+
+def left_by_constraints(flat: Flat, elements: FrictionElements, t, q, v) -> Left:
+    """What few constraints leave of each slip: of a single row all or nothing, which does not change with the state."""
+    found = lambda t, q, v: _left(flat, elements, t, q, v)
+    return scalarised(found if np.any(elements.is_vector) else undifferentiated(found))(t, q, v)
 
 
 def _left(flat: Flat, elements: FrictionElements, t, q, v) -> Left:
@@ -107,7 +118,7 @@ def _orthonormal(G: Float[Array, "m n"], b: Float[Array, " m"]) -> tuple[Float[A
 
 def _beside(basis, b, A, s):
     """Rows A and their s without their parts along an orthonormal basis; twice, for the rounding (Golub & Van Loan, section 5.2.9)."""
-    for _ in range(2):
+    for _ in range(2 if len(basis) else 0):
         along = A @ basis.T
         A, s = A - along @ basis, s - along @ b
     return A, s

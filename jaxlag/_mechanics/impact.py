@@ -18,6 +18,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from .._model.flat import Flat, rows_by_name
+from .constrained_slip import on_constraints
 from .contact import Contacts, accelerated, contact_rows, gap_rates, in_contact, select_closed
 from .friction_elements import FrictionElements, with_all_masses
 from .friction_treatment import Regularised, StickSlip
@@ -88,7 +89,8 @@ def _phase(flat, elements, t, q, v, near, returned, given=None) -> Phase:
         contacts = Contacts.of(fast, zero, origin, origin, near)
         mode, contacts = select_mode(fast, of_impact, zero, origin, origin, still, everywhere, ~everywhere, contacts)
         sigma, held, consistent = mode.sigma, mode.held, mode.consistent
-        found = friction(contacts.applied_to(fast), of_impact, sigma, zero, origin, origin)
+        fast = contacts.applied_to(fast)
+        found = friction(fast, on_constraints(fast, of_impact, zero, origin, origin), sigma, zero, origin, origin)
         after, multipliers = found.qddot, found.multipliers
         lost = found.force @ (elements.slip(t, q, v) + elements.slip(t, q, after))
         rubbed = friction_by_term(of_impact, sigma, held, zero, origin, origin, found)

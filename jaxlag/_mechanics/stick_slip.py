@@ -86,13 +86,14 @@ MOST_OPERATIONS = 1200
 
 
 def friction(flat: Flat, elements: FrictionElements, sigma, t, q, v, feedback=None) -> Friction:
-    """Friction forces on the slip velocities; `margin` < 0 where a mode has ended: the slip has reversed, or the bound is exceeded."""
+    """Friction forces on the slip velocities, of elements on the constraints; `margin` < 0 where a mode has ended: the slip has reversed,
+    or the bound is exceeded.
+    """
     of_state = lambda sigma, t, q, v: _friction(flat, elements, sigma, t, q, v, feedback)
     return scalarised(of_state, limit=MOST_OPERATIONS, apart=True)(sigma, t, q, v)
 
 
 def _friction(flat, elements, sigma, t, q, v, feedback):
-    elements = on_constraints(flat, elements, t, q, v)
     stuck, of = sticking(elements, sigma), elements.element_of_row
     mode = in_mode(flat, elements, sigma)
     qddot, multipliers, _ = constrained_acceleration(mode, t, q, v, feedback)
@@ -246,7 +247,12 @@ def select_mode(
 
 def _in_modes(flat: Flat, elements: FrictionElements, t, q, v) -> Callable:
     """Friction at this state as a function of σ and of the contacts."""
-    return lambda sigma, contacts: friction(contacts.applied_to(flat), elements, sigma, t, q, v)
+
+    def friction_in(sigma, contacts):
+        chosen = contacts.applied_to(flat)
+        return friction(chosen, on_constraints(chosen, elements, t, q, v), sigma, t, q, v)
+
+    return friction_in
 
 
 def _greatest(x, among):

@@ -103,13 +103,13 @@ def _moved(equations: EquationsOfMotion, t, parts: Parts, args: Arguments, happe
     for i, (name, event) in enumerate(equations.system.events):
         if event.then is None:
             continue
-        now, _, _ = equations.mode(t, new, args)
+        now, _ = equations.contents(t, new, args)
         q, v, states = now.happened(name, t, new.q, new.v)
         z, u = (ravelled({name: states[name] for name in layout.shapes}, q.dtype) for layout in (equations.states, equations.sampled))
         changed = new._replace(q=q, v=v, z=z, u=u)
         new = jax.tree.map(lambda x, old, i=i: jnp.where(happens[i], x, old), changed, new)
     if equations.system.constraints:
-        there, _, _ = equations.mode(t, new, args)
+        there, _ = equations.contents(t, new, args)
         q = outside(there, t, new.q, new.v)
         nearest = nearest_state(there._replace(holonomic=there.bilateral), t, q, new.v)
         new = new._replace(q=nearest.q, v=nearest.v, closed=_still_closed(there, t, nearest.q, nearest.v, new.closed, args.scales))

@@ -31,8 +31,9 @@ def raise_failure(trajectory: Trajectory, start: tuple | None = None) -> None:
         "Allow more `max_steps`, inspect what was computed with `throw=False`, or use a solver for stiff systems, "
         f"`solver=diffrax.Kvaerno5()`.{_unread_friction(trajectory)}"
     )
+    last = np.ravel(jax.lax.stop_gradient(trajectory.ts))[-1]
     raise RuntimeError(
-        f"the motion must reach t = {np.ravel(trajectory.ts)[-1]:g}, but stopped at t = {np.min(trajectory.stats['reached']):g} "
+        f"the motion must reach t = {last:g}, but stopped at t = {np.min(trajectory.stats['reached']):g} "
         f"after {reached} of {samples} samples: {reason} {numerics if reason in map(reason_of, OF_THE_STEPS) else ''}".rstrip()
     )
 

@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, PyTree
 
 from .._mechanics.constrained_acceleration import constrained_acceleration
-from .._mechanics.constrained_slip import on_constraints
+from .._mechanics.constrained_slip import Left, left_by_constraints, on_constraints
 from .._mechanics.contact import free, in_contact
 from .._mechanics.friction_elements import FrictionElements, light_coordinates
 from .._mechanics.friction_treatment import Regularised, StickSlip
@@ -95,19 +95,25 @@ class EquationsOfMotion:
         """The states beside q, at the time t."""
         return StatesAt(self.states.unravelled(parts.z) | self.sampled.unravelled(parts.u), t, parts.q, parts.v)
 
-    def mode(self, t, parts: Parts, args: Arguments) -> tuple[Flat, Flat, FrictionElements | None]:
-        """The system, the system in its mode σ, and its elements of dry friction where there are any."""
-        flat, treatment = in_contact(self.flat_at(args.params, self.states_of(t, parts)), parts.closed > 0.5), self.formulation.friction
-        q, v, sigma = parts.q, parts.v, parts.sigma
+    def contents(self, t, parts: Parts, args: Arguments) -> tuple[Flat, FrictionElements | None]:
+        """The system with its closed contacts, and its elements of dry friction where there are any."""
+        flat = in_contact(self.flat_at(args.params, self.states_of(t, parts)), parts.closed > 0.5)
         if not self.rows:
-            return flat, treatment.smoothed(flat, t, q, v), None
-        elements = treatment.elements(flat, t, q, v)
+            return flat, None
+        elements = self.formulation.friction.elements(flat, t, parts.q, parts.v)
         assert elements is not None  # rows were counted from them
-        elements = on_constraints(flat, elements, t, q, v)
         if args.scales is not None and np.any(elements.is_vector):
-            slow = slip_of(elements, t, q, v, args.scales.slow)
+            slow = slip_of(elements, t, parts.q, parts.v, args.scales.slow)
             elements = elements._replace(near_rest=jax.lax.stop_gradient(jnp.where(elements.is_vector, slow, 0)))
-        return flat, in_mode(flat, elements, sigma), elements
+        return flat, elements
+
+    def mode(self, t, parts: Parts, args: Arguments) -> tuple[Flat, Flat, FrictionElements | None]:
+        """The system, the system in its mode σ, and its elements of dry friction on the constraints."""
+        flat, elements = self.contents(t, parts, args)
+        if elements is None:
+            return flat, self.formulation.friction.smoothed(flat, t, parts.q, parts.v), None
+        elements = on_constraints(flat, elements, t, parts.q, parts.v, lambda: _left_by_constraints(self, t, parts, args))
+        return flat, in_mode(flat, elements, parts.sigma), elements
 
     def decided(self, t, parts: Parts, args: Arguments) -> Parts:
         """With the velocities that follow from the rest: between the ends of steps, those of coordinates without inertia are not kept."""
@@ -250,6 +256,13 @@ def _rates(equations: EquationsOfMotion, t, y, args):
 def _accelerated(equations: EquationsOfMotion, t, parts: Parts, args, is_free) -> SaddlePoint:
     _, mode, _ = equations.mode(t, parts, args)
     return equations.acceleration(free(mode) if is_free else mode, t, parts.q, parts.v)
+
+
+@jitted
+def _left_by_constraints(equations: EquationsOfMotion, t, parts: Parts, args) -> Left:
+    flat, elements = equations.contents(t, parts, args)
+    assert elements is not None  # asked where there is friction
+    return left_by_constraints(flat, elements, t, parts.q, parts.v)
 
 
 @jitted

@@ -233,7 +233,7 @@ def _told_of_friction(equations: FirstOrderSystem, t, y, args: Arguments) -> Arg
     if not isinstance(equations, EquationsOfMotion) or not equations.elements or args.scales is None:
         return args
     args, parts = args._replace(scales=args.scales._replace(driven=None)), equations.parts(y)
-    flat, _, elements = equations.mode(t, parts, args)
+    flat, elements = equations.contents(t, parts, args)
     assert elements is not None and args.scales is not None
     slopes = jax.jacfwd(lambda v: elements.slip(t, parts.q, v))(parts.v)
     mass, of = jnp.diagonal(inertia(flat, t, parts.q, parts.v)[0].as_matrix()), elements.element_of_row

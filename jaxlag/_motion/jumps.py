@@ -22,7 +22,7 @@ def after_jump(equations: EquationsOfMotion, t, y0, y, before: Arguments, args: 
     has no part in it: where there is slip afterwards, it goes on; where there is none, it sticks or breaks away.
     """
     parts = equations.parts(y)
-    flat, _, elements = equations.mode(t, parts, args)
+    flat, elements = equations.contents(t, parts, args)
     if equations.works:
         there = equations.parts(y0)
         earlier = equations.flat(before.params, equations.states_of(t, there))

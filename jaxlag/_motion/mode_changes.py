@@ -99,7 +99,7 @@ def approach(equations: EquationsOfMotion, path: Callable, t0, t1, args: Argumen
     """
     t, parts = t0, equations.parts(path(t0))
     closed, sign = parts.closed > 0.5, parts.sign
-    flat, _, _ = equations.mode(t, parts, args)
+    flat, _ = equations.contents(t, parts, args)
     often = lambda start, end: end - start > (t1 - t0) / OFTEN
 
     def along(function):
@@ -149,7 +149,7 @@ def at_end(equations: EquationsOfMotion, t, y, args: Arguments, slopes: Float[Ar
     if not (equations.contacts or equations.events):
         return AtEnd(found, slopes, jnp.zeros_like(slopes))
     parts = equations.parts(y)
-    flat, _, _ = equations.mode(t, parts, args)
+    flat, _ = equations.contents(t, parts, args)
     first = [equations.elements, equations.elements + equations.contacts]
     (of_elements, of_contacts, _), (falls, rises, passes) = (jnp.split(x, first) for x in (found, slopes))
     is_closed = parts.closed > 0.5
@@ -281,7 +281,7 @@ def in_other_mode(elements: FrictionElements, parts: Parts, mode: Mode) -> Parts
 def started(equations: EquationsOfMotion, at: StatesAt, params) -> Start:
     """y at the start, in the mode that holds there: what touches and approaches has an impact."""
     parts, args, t = equations.at_start(at, params), Arguments(params), at.t
-    flat, _, elements = equations.mode(t, parts, args)
+    flat, elements = equations.contents(t, parts, args)
     yes = jnp.array(True)
     if equations.contacts:
         errors = tuple(roundings_beside(flat, t, parts.q, parts.v, x) for x in (parts.q, parts.v))

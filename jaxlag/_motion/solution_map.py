@@ -129,7 +129,8 @@ class SolutionMap:
         variations, times = self._variations(equations, inputs, directions, ts), ts - ts[0]
         y0, start = variations.initial(inputs)
         args, tolerances = self._arguments(equations, inputs, ts), inputs.tolerances
-        args = args._replace(scales=args.scales._replace(shares=tuple(_shares(inputs, of_order) for of_order in directions)))
+        shares = tuple(_shares(inputs, of_order, args.scales.duration) for of_order in directions)
+        args = args._replace(scales=args.scales._replace(shares=shares))
         if is_variational(equations, self.options, varying, inputs.params):
             args = args._replace(directions=variations.directions)
             ys, result, stats = in_one_loop(variations.equations, self.options, at.t, y0, times, args, tolerances)
@@ -217,9 +218,13 @@ def _at_random(inputs: Inputs) -> Inputs:
     return Inputs(None, q0, qdot0, params, jax.tree.map(lambda _: None, inputs.tolerances), states)
 
 
-def _shares(inputs: Inputs, directions: Inputs) -> Array:
-    """Of the motion, 1; of each direction, the share of itself by which a number that is not zero changes at most."""
+def _shares(inputs: Inputs, directions: Inputs, duration) -> Array:
+    """Of the motion, 1; of each direction, the share of itself by which a number that is not zero changes at most, a time that of the
+    duration.
+    """
     varying, _ = split_varying(inputs, directions)
+    if varying.t0 is not None:
+        varying = varying._replace(t0=duration * jnp.ones_like(varying.t0))
     pairs = zip(*map(jax.tree.leaves, (varying, directions)), strict=True)
     of_each = [jnp.where(x == 0, 0, jnp.abs(dx) / jnp.where(x == 0, 1, jnp.abs(x))) for x, dx in ((x[..., None], dx) for x, dx in pairs)]
     size = jax.tree.leaves(directions)[0].shape[-1]

@@ -110,12 +110,18 @@ class StepControl(dfx.AbstractStepSizeController):
         return jnp.where(self._is_motion(size), jnp.maximum(reach, driven.reshape(-1, *[1] * (size.ndim - 1))), reach)
 
     def _rounding(self, reach, args):
-        """What a variation that changes no entry of y beyond its rounding, though its number changes by its own size, may err by."""
-        shares = self._shares(args)
-        if not shares:
+        """What a variation that changes no entry of y beyond its rounding, though its number changes by its own size, may err by; and the
+        rounding of rounding, which is left of an entry that constraints hold.
+        """
+        if not self.variations:
             return 0.0
-        blur = jnp.finfo(reach.dtype).eps * functools.reduce(jnp.multiply.outer, shares, reach[(..., *[0] * self.variations)])
-        return jnp.where(~self._is_motion(reach) & (reach < MARGIN * blur), blur, 0)
+        eps, of_motion = jnp.finfo(reach.dtype).eps, reach[(..., *[0] * self.variations)]
+        own = of_motion.reshape(*of_motion.shape, *[1] * self.variations)
+        faint = (1e2 * eps) ** 2 * own * jnp.max(jnp.where(own > 0, reach / jnp.where(own > 0, own, 1), 0), axis=0, keepdims=True)
+        if shares := self._shares(args):
+            blur = eps * functools.reduce(jnp.multiply.outer, shares, of_motion)
+            faint = jnp.maximum(faint, jnp.where(reach < MARGIN * blur, blur, 0))
+        return jnp.where(self._is_motion(reach), 0, faint)
 
     def _held(self, like, args, h):
         """What the rounding of forces that dry friction holds moves in a step: where a motion rests, it is all that moves."""

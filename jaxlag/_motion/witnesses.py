@@ -31,7 +31,7 @@ def _roundings(parts: Parts, args: Arguments):
 
 def _value_and_scale(equations, t, parts, args):
     """Of each witness, its value, and what errors of q and q̇ amount to in it."""
-    flat, _, _ = equations.mode(t, parts, args)
+    flat, _ = equations.contents(t, parts, args)
     multipliers = _multipliers(equations, t, parts, args)(t, parts.q, parts.v)
     largest = jax.lax.stop_gradient(jnp.max(jnp.abs(multipliers), initial=0.0)) * jnp.ones_like(multipliers)
     of_loads, of_time = roundings(largest, largest), roundings(t[None], args.scales.duration)

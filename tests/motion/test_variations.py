@@ -86,6 +86,46 @@ def test_a_hanging_rod():
         np.testing.assert_allclose(derivative(x)(0.0), exact, rtol=1e-5)
 
 
+RODS = {
+    "plain": lambda q, l: q["r"] - l,
+    "squared": lambda q, l: q["r"] ** 2 - l**2,
+    "turning": lambda q, l: (q["r"] - l) * (2 + jnp.cos(q["phi"])),
+    "logarithm": lambda q, l: jnp.log(q["r"] / l),
+}
+
+
+@pytest.mark.parametrize("rod", RODS)
+def test_a_rod_in_polar_coordinates(rod):
+    """What it holds varies by rounding of rounding alone, which once ended the derivative, in any unit: from rest, through the bottom, by
+    the time. Numbers of the pendulum in φ.
+    """
+    weight = lambda q, m, g, l: m * g * l * jnp.cos(q["phi"])
+    held = jl.System(
+        lambda q, qdot, m, g: 0.5 * m * (qdot["r"] ** 2 + q["r"] ** 2 * qdot["phi"] ** 2) + weight(q, m, g, q["r"]),
+        holonomic={"rod": RODS[rod]},
+    )
+    plain = jl.System(lambda q, qdot, m, g, l: 0.5 * m * l**2 * qdot["phi"] ** 2 + weight(q, m, g, l))
+
+    @jax.jit
+    def of_held(x, unit):
+        params, ts = {"m": 1.0, "l": unit, "g": 9.81 * unit}, jnp.stack([0.0, x[2]])
+        motion = jl.simulate(held, {"r": unit, "phi": x[0]}, {"r": 0.0, "phi": x[1]}, ts, params)
+        return jnp.stack([motion.q["phi"][-1], motion.multipliers["rod"][-1] / unit]), motion.stats["num_steps"]
+
+    @jax.jit
+    def of_plain(x):
+        motion = jl.simulate(plain, {"phi": x[0]}, {"phi": x[1]}, jnp.stack([0.0, x[2]]), {"m": 1.0, "l": 1.0, "g": 9.81})
+        return motion.q["phi"][-1]
+
+    of_held, of_plain = jax.jacfwd(of_held, has_aux=True), jax.jacfwd(of_plain)
+    for start in ((0.0, 6.3), (0.5, 0.0), (0.0, 1e-9), (0.0, 0.0)):
+        x = jnp.array([*start, 0.5])
+        for unit in (1.0, 1e-6, 1e7):
+            slopes, steps = of_held(x, unit)
+            np.testing.assert_allclose(slopes[0], of_plain(x), rtol=1e-7, atol=1e-8)
+            assert np.all(np.isfinite(slopes[1])) and steps < 40
+
+
 def test_a_slider_that_an_amplitude_breaks_away():
     """Dry friction, then sliding: dq/dF of ½(t − t₀)² (t₀ = F) type motions, where the start is at rest."""
     system = jl.System(lambda q, qdot: 0.5 * qdot**2, dissipation=lambda qdot, F: F * jnp.abs(qdot), force=lambda t: t)
