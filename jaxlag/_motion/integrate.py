@@ -15,12 +15,13 @@ from jaxtyping import Array, Bool, PyTree
 from .._mechanics.consistent_state import Consistent, has_inertia, nearest_state
 from .._mechanics.contact import outside
 from .._mechanics.friction_treatment import Regularised, StickSlip
-from .._mechanics.lagrange import inertia
+from .._mechanics.lagrange import constraint_rows, inertia
 from .._mechanics.projection import Baumgarte, NoStabilisation, Projection
 from .._model.flat import Flat, StatesAt
 from .._model.numbers import count
 from .._model.signal import broken_signals, moves_smoothly
 from .._program.single_kernel import in_one_kernel
+from .._program.sparse_jacobian import MANY
 from .events import begun
 from .first_order import EquationsOfMotion, Formulation
 from .integrated import integrated
@@ -158,7 +159,7 @@ def by_diffrax(
 ) -> tuple[Array, RESULTS, dict]:
     """The same by diffrax's own loop, also of a batch."""
     control = StepControl.of(tolerances, (ts[0], ts[-1]), equations, _variations(equations))
-    args = _told_of_friction(equations, t0, y0, args)
+    args = told_of_loads(equations, t0, y0, args)
     alone = in_one_kernel if isinstance(adjoint, dfx.ForwardMode) else lambda function: function
     projected = alone(equations.projected) if equations.projection else None
     solution = dfx.diffeqsolve.__wrapped__(  # all is within a program already, and `equinox.filter_jit` would keep what it is given
@@ -215,7 +216,7 @@ def in_one_loop(
     meter, dense = Meter() if options.progress else dfx.NoProgressMeter(), not has_nodes(equations, args.params)
     back = in_one_kernel(equations.projected) if dense else equations.projected
     solver = _wrapped(options, equations, back if equations.projection else None, adjoint, (t0, y0, args))
-    args = _told_of_friction(equations, t0, y0[(..., *[0] * len(directions))], args)
+    args = told_of_loads(equations, t0, y0[(..., *[0] * len(directions))], args)
     numbers = y0, t0, args, ts, tolerances
     kind = {"variations": _variations(equations), "reverse": reverse, "dense": dense}
     ys, (result, stats) = integrated(equations, solver, options.max_steps, meter, *numbers, directions, **kind)
@@ -226,23 +227,30 @@ def in_one_loop(
     return ys, from_diffrax(result), stats
 
 
-def _told_of_friction(equations: FirstOrderSystem, t, y, args: Arguments) -> Arguments:
-    """With what dry friction at its bound would make of each velocity: where it holds another force, the rounding of both is a rate of
-    its own; where slip begins in a plane, it has no scale of its own yet, and its direction follows the load at a rate of 1/|v|.
+def told_of_loads(equations: FirstOrderSystem, t, y, args: Arguments) -> Arguments:
+    """With what constraints at the start, and dry friction at its bound, make of each velocity: where they hold another force, the rounding
+    of both is a rate of its own; where slip begins in a plane, it has no scale of its own yet, and its direction follows the load at a
+    rate of 1/|v|.
     """
-    if not isinstance(equations, EquationsOfMotion) or not equations.elements or args.scales is None:
+    holds = isinstance(equations, EquationsOfMotion) and (equations.elements or (equations.system.constraints and equations.size < MANY))
+    if not holds or args.scales is None:
         return args
     args, parts = args._replace(scales=args.scales._replace(driven=None)), equations.parts(y)
     flat, elements = equations.contents(t, parts, args)
-    assert elements is not None and args.scales is not None
-    slopes = jax.jacfwd(lambda v: elements.slip(t, parts.q, v))(parts.v)
-    mass, of = jnp.diagonal(inertia(flat, t, parts.q, parts.v)[0].as_matrix()), elements.element_of_row
-    bound = equations.friction(t, parts, args).bound[of]
-    pulls = jnp.abs(slopes * jnp.outer(bound, 1 / jnp.where(mass > 0, mass, jnp.inf)))
-    in_plane = elements.is_vector[of]
-    driven = 0.1 * args.scales.duration * jnp.sum(pulls[in_plane], axis=0) if np.any(in_plane) else None
-    scales = args.scales._replace(driven=driven, held=jnp.sum(pulls, axis=0))
-    return args._replace(scales=jax.lax.stop_gradient(scales))
+    mass = jnp.diagonal(inertia(flat, t, parts.q, parts.v)[0].as_matrix())
+    pull = lambda rows, loads: jnp.abs(rows) * jnp.outer(jnp.abs(loads), 1 / jnp.where(mass > 0, mass, jnp.inf))
+    scales, held = args.scales, jnp.zeros_like(parts.v)
+    if equations.system.constraints and equations.size < MANY:
+        loads = equations.accelerated(t, parts, args, False).multipliers[: flat.rows]
+        held = held + jnp.sum(pull(constraint_rows(flat, t, parts.q, parts.v)[1], loads), axis=0)
+    if elements is not None:
+        slopes = jax.jacfwd(lambda v: elements.slip(t, parts.q, v))(parts.v)
+        pulls = pull(slopes, equations.friction(t, parts, args).bound[elements.element_of_row])
+        in_plane = elements.is_vector[elements.element_of_row]
+        held = held + jnp.sum(pulls, axis=0)
+        if np.any(in_plane):
+            scales = scales._replace(driven=0.1 * scales.duration * jnp.sum(pulls[in_plane], axis=0))
+    return args._replace(scales=jax.lax.stop_gradient(scales._replace(held=held)))
 
 
 class Variations(NamedTuple):

@@ -12,15 +12,17 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, PyTree
 
+from .._mechanics.lagrange import inertia
 from .._model.flat import StatesAt
 from .._model.signal import SinceOrigin, is_signal, origin_of, with_second_derivatives
 from .._model.state_values import start_values
 from .._model.system import System
 from .._model.validation import check
+from .._program.sparse_jacobian import MANY
 from .event_record import records
 from .first_order import EquationsOfMotion
 from .guarantees import verified
-from .integrate import SolverOptions, Variations, in_one_loop, initialised, is_variational, states_at, with_status
+from .integrate import SolverOptions, Variations, in_one_loop, initialised, is_variational, states_at, told_of_loads, with_status
 from .moments import ContactState, EventState, FrictionState
 from .protocol import Arguments
 from .provenance import Provenance
@@ -130,9 +132,9 @@ class SolutionMap:
         y0, start = variations.initial(inputs)
         args, tolerances = self._arguments(equations, inputs, ts), inputs.tolerances
         shares = tuple(_shares(inputs, of_order, args.scales.duration) for of_order in directions)
-        args = args._replace(scales=args.scales._replace(shares=shares))
+        args = args._replace(scales=args.scales._replace(shares=shares, units=_units(equations, at, args)))
         if is_variational(equations, self.options, varying, inputs.params):
-            args = args._replace(directions=variations.directions)
+            args = told_of_loads(equations, at.t, y0[(..., *[0] * len(directions))], args)._replace(directions=variations.directions)
             ys, result, stats = in_one_loop(variations.equations, self.options, at.t, y0, times, args, tolerances)
             last_t, last_y = stats["last"]
             stats = stats | {"last": (last_t, last_y[(..., *[0] * len(directions))])}
@@ -216,6 +218,15 @@ def _at_random(inputs: Inputs) -> Inputs:
     parts = inputs.q0, inputs.qdot0, inputs.params, inputs.states
     q0, qdot0, params, states = (jax.tree.map(one, part, is_leaf=is_signal) for part in parts)
     return Inputs(None, q0, qdot0, params, jax.tree.map(lambda _: None, inputs.tolerances), states)
+
+
+def _units(equations: EquationsOfMotion, at: StatesAt, args: Arguments) -> Array | None:
+    """Of each coordinate, what weighs as much as one of any other: 1/√M at the start, 0 without inertia. Of many it is not asked."""
+    if at.q.size >= MANY:
+        return None
+    M = inertia(equations.flat_at(args.params, at), at.t, at.q, at.v)[0]
+    mass = jnp.diagonal(M.as_matrix())
+    return jax.lax.stop_gradient(jnp.where(mass > 0, jax.lax.rsqrt(jnp.where(mass > 0, mass, 1)), 0))
 
 
 def _shares(inputs: Inputs, directions: Inputs, duration) -> Array:

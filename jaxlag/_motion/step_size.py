@@ -116,22 +116,39 @@ class StepControl(dfx.AbstractStepSizeController):
         if not self.variations:
             return 0.0
         eps, of_motion = jnp.finfo(reach.dtype).eps, reach[(..., *[0] * self.variations)]
-        own = of_motion.reshape(*of_motion.shape, *[1] * self.variations)
-        faint = (1e2 * eps) ** 2 * own * jnp.max(jnp.where(own > 0, reach / jnp.where(own > 0, own, 1), 0), axis=0, keepdims=True)
+        own = self._among_others(of_motion, args)
+        faint = (1e2 * eps) ** 2 * own.reshape(*own.shape, *[1] * self.variations) * self._changes(reach, args)
         if shares := self._shares(args):
             blur = eps * functools.reduce(jnp.multiply.outer, shares, of_motion)
             faint = jnp.maximum(faint, jnp.where(reach < MARGIN * blur, blur, 0))
         return jnp.where(self._is_motion(reach), 0, faint)
 
-    def _held(self, like, args, h):
-        """What the rounding of forces that dry friction holds moves in a step: where a motion rests, it is all that moves."""
+    def _changes(self, reach, args):
+        """Of the motion 1; of each variation, the share by which it changes an entry of the motion at most."""
+        own = self._among_others(reach[(..., *[0] * self.variations)], args)
+        own = own.reshape(*own.shape, *[1] * self.variations)
+        most = jnp.max(_ratio_where(own > 0, reach, own), axis=0, keepdims=True)
+        return jnp.where(self._is_motion(most), 1, most)
+
+    def _among_others(self, reach, args):
+        """The scale of the motion, where a coordinate has none of its own that of the others, by their masses."""
+        units = None if getattr(args, "scales", None) is None else args.scales.units
+        if units is None:
+            return reach
+        n, units = self.coordinates, units.reshape(-1, *[1] * (reach.ndim - 1)).astype(reach.dtype)
+        of = lambda part: jnp.maximum(part, units * jnp.max(_ratio_where(units > 0, part, units), axis=0, keepdims=True))
+        return jnp.concatenate([of(reach[:n]), of(reach[n : 2 * n]), reach[2 * n :]])
+
+    def _held(self, reach, args, h):
+        """What the rounding of forces that constraints and friction hold moves in a step: where a motion rests, it is all that moves."""
         if getattr(args, "scales", None) is None or args.scales.held is None:
             return 0.0
-        moved = 10 * jnp.finfo(like.dtype).eps * args.scales.held * h
-        moved = jnp.concatenate([moved * h, moved, jnp.zeros(len(like) - 2 * len(moved))]).astype(like.dtype)
+        moved = 10 * jnp.finfo(reach.dtype).eps * args.scales.held * h
+        moved = jnp.concatenate([moved * h, moved, jnp.zeros(len(reach) - 2 * len(moved))]).astype(reach.dtype)
+        changes = self._changes(reach, args)
         if shares := self._shares(args):
-            return functools.reduce(jnp.multiply.outer, shares, moved)
-        return jnp.where(self._is_motion(like), moved.reshape(-1, *[1] * (like.ndim - 1)), 0)
+            changes = jnp.maximum(changes, functools.reduce(jnp.multiply.outer, shares)[None])
+        return moved.reshape(-1, *[1] * (reach.ndim - 1)) * changes
 
     def _shares(self, args):
         """Of the motion and each direction of its variations, the share by which it changes a number at most, where that is known."""
@@ -193,6 +210,10 @@ def _followed(noise, growth, error, h, allowed):
     noise = jnp.where(noise > 0, jnp.clip(now, noise / 100, 100 * noise), 0)
     matters = noise * h > allowed / MARGIN
     return jnp.where(matters, noise, 0), jnp.where(matters, growth, 0)
+
+
+def _ratio_where(there, above, below):
+    return jnp.where(there, above / jnp.where(there, below, 1), 0)
 
 
 def _ratio(error, allowed):
