@@ -82,6 +82,7 @@ def by_rows(asked: Request, D) -> tuple[Float[Array, "m m"], Bool[Array, ""]]:
     length = lambda x: of_rows(jnp.sqrt((rows != 0).astype(x.dtype) @ x**2))
     moved = rows.T @ (U @ (jnp.where(clear[:, None], step, 0) / jnp.where(clear, values, 1)[:, None]))
     bound = FARTHER * (length(asked.free) + length(moved)) if asked.reach is None else of_rows(asked.reach)[:, None]
+    bound = bound / jnp.max(jnp.abs(U), axis=0)[:, None]  # a direction of many rows goes as far as what all of them touch
     held = clear | (seen & jnp.all(jnp.abs(step) <= bound, axis=1))
     contradicts = jnp.abs(rest) > eps**FOLLOWS * (of_rows(jnp.abs(wanted)) + length(asked.free))
     satisfied = ~jnp.any(~held & ((values > eps**NOISE * values[0]) | jnp.any(contradicts, axis=1)))

@@ -85,7 +85,7 @@ def reaching(size: Array, coordinates: int, duration: Any) -> Array:
 
 def tolerances_of(rtol, atol, q: PyTree) -> tuple[Array | np.ndarray, Array | np.ndarray | None]:
     """The given tolerances, or the default for the precision; the absolute one of each coordinate and its velocity, where they differ."""
-    dtype = jnp.result_type(*jax.tree.leaves(q))
+    dtype = np.result_type(*(leaf.dtype for leaf in jax.tree.leaves(q)))
     single = dtype.itemsize < 8
     if single:
         _warn_of_single_precision()
