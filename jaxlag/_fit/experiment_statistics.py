@@ -10,8 +10,11 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import PyTree
 
+from .._mechanics.surfaces import surfaces
+from .._model.flat import StatesAt
 from .._model.paths import is_within
 from .._model.signal import is_signal
+from .._model.state_values import start_values
 from .experiment import Experiment, with_own
 from .identifiability import Determined
 from .minimum import Minimum
@@ -102,6 +105,18 @@ def _deviations(minimum, k, row, covariance):
     leaves, structure = jax.tree.flatten(values)
     parts = np.split(there, np.cumsum([leaf.size for leaf in leaves])[:-1])
     return jax.tree.unflatten(structure, [part.reshape(leaf.shape) for part, leaf in zip(parts, leaves, strict=True)])
+
+
+def deciding(minimum: Minimum) -> dict[str, str]:
+    """By leaf of params, the line of the user's code where it decides, with the position, what a function of the system is."""
+    found: dict[str, str] = {}
+    for e in minimum.recordings:
+        system, params = minimum.problem.model.system, with_own(minimum.problem.free.params, e.params)
+        q, v = (ravel_pytree(tree)[0] for tree in (e.q0, e.qdot0))
+        at = StatesAt(start_values(system, {}, e.ts[0], e.q0, e.qdot0, params), jnp.asarray(e.ts[0], q.dtype), q, v)
+        for surface in surfaces(system, e.q0, params, at):
+            found |= dict.fromkeys(surface.params, surface.line)
+    return found
 
 
 def ended_inputs(experiments: Sequence[Experiment], params: PyTree) -> dict[str, tuple[float, float]]:

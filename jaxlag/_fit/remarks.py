@@ -4,6 +4,7 @@ from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
 
+from .._model.paths import is_within
 from .channels import Channel
 from .identifiability import MANY, Undetermined
 from .parameter_stability import Halves
@@ -19,9 +20,9 @@ DRIFT = 1 / 6  # unless they are correlated over this part of the record;
 EXACT = 1 - 1e-8  # R² from which on residuals are those of the integration
 
 
-def on_undetermined(names: Sequence[str], found: Undetermined) -> list[str]:
-    """What the measurements do not determine."""
-    remarks = [f"{names[i]} has no influence on these measurements" for i in found.idle]
+def on_undetermined(names: Sequence[str], found: Undetermined, deciding: Mapping[str, str]) -> list[str]:
+    """What the measurements do not determine; `deciding`: what decides where a function jumps or bends, and in which line."""
+    remarks = [_on_idle(names[i], next((line for name, line in deciding.items() if is_within(names[i], name)), "")) for i in found.idle]
     remarks += [f"{names[i]} cannot be distinguished from the unknown starts" for i in found.with_start]
     joint = [names[i] for i in found.joint]
     if len(joint) > MANY:
@@ -34,6 +35,15 @@ def on_undetermined(names: Sequence[str], found: Undetermined) -> list[str]:
         )
         remarks.append(f"{_listed(joint)} are not determined individually: they can change together without visible effect ({changes})")
     return remarks
+
+
+def _on_idle(name, line):
+    if not line:
+        return f"{name} has no influence on these measurements"
+    return (
+        f"{name} decides where a function of the system jumps or bends ({line}), and its influence is not seen there: give the system an "
+        "event that is zero where it does"
+    )
 
 
 def _on_combinations(names, joint, found):

@@ -13,7 +13,7 @@ from .autocorrelation import independent_samples
 from .channel_sigma import predicted_exactly, too_short
 from .channels import channels_of
 from .experiment import Experiment
-from .experiment_statistics import ended_inputs, own_estimates, predictions_of, with_estimates
+from .experiment_statistics import deciding, ended_inputs, own_estimates, predictions_of, with_estimates
 from .identifiability import correlation_of
 from .levenberg_marquardt import CONVERGED, INTERRUPTED, REASONS, STEP_LIMIT, UNRELATED, Outcome
 from .linear_test import in_given_order
@@ -141,7 +141,7 @@ def _remarks(minimum, uncertainty, sigma, channels):
         remarks = [NO_ERRORS]
     else:
         found = undetermined_parameters(minimum, uncertainty)
-        remarks = [] if found is None else on_undetermined(free.entries, found)
+        remarks = [] if found is None else on_undetermined(free.entries, found, deciding(minimum) if found.idle else {})
         r = np.nan_to_num(np.asarray(minimum.found.residuals), posinf=0.0)  # of a motion that could not be computed
         at_bounds = list(on_bounds(free, minimum.theta, r @ np.asarray(minimum.found.jacobian)[:, :p]))
     times_noise = sigma if minimum.absolute else 1.0

@@ -110,6 +110,20 @@ def of_numbers(numbers, distances, defect, dtype):
         yield 'single precision: `jax.config.update("jax_enable_x64", True)` gives twice as many digits'
 
 
+def bending(surfaces, has_events):
+    """Functions that choose by the position, each line once."""
+    for line in dict.fromkeys(surface.line for surface in surfaces):
+        here = [surface for surface in surfaces if surface.line == line]
+        functions = " and ".join(dict.fromkeys(surface.function for surface in here))
+        chosen = ", ".join(dict.fromkeys(f"`{surface.what}`" for surface in here))
+        beside = ", unless one of `events` is zero there" if has_events else ""
+        yield (
+            f"{functions} chooses by the position ({chosen}, {line}): where the choice changes, a force jumps or bends, and the steps of "
+            "a motion do not end there, so that it errs by more than its tolerance, and derivatives by what decides are wrong where a "
+            f'force jumps{beside}: end them by `events={{"edge": jl.Event(lambda q: ...)}}`, a function that is zero there'
+        )
+
+
 def coupling_all(couplings, uses_all_numbers, n):
     """Terms that leave no zeros to a solve for many coordinates."""
     for (matrix, name), (entries, size, is_full) in couplings.items():

@@ -86,9 +86,7 @@ MOST_OPERATIONS = 1200
 
 
 def friction(flat: Flat, elements: FrictionElements, sigma, t, q, v, feedback=None) -> Friction:
-    """Friction forces on the slip velocities, of elements on the constraints; `margin` < 0 where a mode has ended: the slip has reversed,
-    or the bound is exceeded.
-    """
+    """Friction forces of elements on the constraints; `margin` < 0 where a mode has ended: the slip reverses, or a bound is exceeded."""
     of_state = lambda sigma, t, q, v: _friction(flat, elements, sigma, t, q, v, feedback)
     return scalarised(of_state, limit=MOST_OPERATIONS, apart=True)(sigma, t, q, v)
 
@@ -247,12 +245,8 @@ def select_mode(
 
 def _in_modes(flat: Flat, elements: FrictionElements, t, q, v) -> Callable:
     """Friction at this state as a function of σ and of the contacts."""
-
-    def friction_in(sigma, contacts):
-        chosen = contacts.applied_to(flat)
-        return friction(chosen, on_constraints(chosen, elements, t, q, v), sigma, t, q, v)
-
-    return friction_in
+    on = lambda chosen, sigma: friction(chosen, on_constraints(chosen, elements, t, q, v), sigma, t, q, v)
+    return lambda sigma, contacts: on(contacts.applied_to(flat), sigma)
 
 
 def _greatest(x, among):

@@ -71,9 +71,11 @@ class Event:
     The time is located to rounding, and differentiated exactly, as is what `then` returns, which is put on the constraints and outside of
     obstacles. A sample at the very time of an event shows the state before or behind it, as rounding has it. Where an impact, an input
     that jumps or another event takes w to the other side of zero, the event happens, too, but none twice at one time. Where several
-    happen at once, those stated first come first. To `equilibrium`, `linearise`, `examine` and `equations` a system is what it is without
-    events. Any consistent units. A system takes events by name: `System(..., events={"latch": Event(...)})`; a motion, too:
-    `simulate(..., events=...)`.
+    happen at once, those stated first come first. Where a force jumps or bends across w = 0, as by `jnp.where` or `jnp.maximum` of q, an
+    event makes steps end there, and derivatives right: up to there, forces are those of the side that the motion comes from.
+
+    To `equilibrium`, `linearise`, `examine` and `equations` a system is what it is without events. Any consistent units. A system takes
+    events by name: `System(..., events={"latch": Event(...)})`; a motion, too: `simulate(..., events=...)`.
 
     **Raises:** `TypeError` or `ValueError` where these are not such functions, times and numbers.
 

@@ -3,7 +3,7 @@
 import dataclasses
 import functools
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -15,13 +15,13 @@ from .._mechanics.constrained_acceleration import constrained_acceleration
 from .._mechanics.constrained_slip import Left, left_by_constraints, on_constraints
 from .._mechanics.contact import free, in_contact
 from .._mechanics.friction_elements import FrictionElements, light_coordinates
-from .._mechanics.friction_treatment import Regularised, StickSlip
 from .._mechanics.impact import check_impacts
 from .._mechanics.massless import completed, first_order
 from .._mechanics.power import energy_exchange, listed_powers
-from .._mechanics.projection import Baumgarte, NoStabilisation, Projection
+from .._mechanics.projection import Projection
 from .._mechanics.saddle_point import SaddlePoint
 from .._mechanics.stick_slip import Friction, friction, in_mode, redirected, slip_of, sticking
+from .._mechanics.surfaces import bends_by_position
 from .._model.flat import Flat, StatesAt, bind
 from .._model.signal import at_time, broken_signals
 from .._model.state_values import NOTHING, Layout, of_first_order, period, ravelled, sampled
@@ -29,19 +29,11 @@ from .._model.system import System
 from .._program.jit import jitted
 from .._program.scalarise import scalarised
 from .._program.walker import used_arguments
+from .formulation import PROJECTION, Formulation
+from .held_sides import on_held_sides
 from .interval_inputs import at_events, called_elsewhere, pieces_at, sees_time, values_of, warn_of_delays
 from .protocol import Arguments
 from .state_vector import Parts
-
-PROJECTION = "projection"  # name of the work that projection does
-
-
-class Formulation(NamedTuple):
-    """How the equations of motion are formulated: treatment of the constraints, treatment of dry friction, whether works are tracked."""
-
-    stabilisation: Projection | Baumgarte | NoStabilisation = Projection()
-    friction: StickSlip | Regularised = StickSlip()
-    works: bool = False
 
 
 @dataclasses.dataclass(frozen=True)
@@ -60,6 +52,7 @@ class EquationsOfMotion:
     contacts: int = 0
     events: int = 0
     light: tuple[int, ...] = ()  # coordinates without inertia, whose velocities follow from the rest
+    sided: bool = False  # whether functions choose by the position, perhaps across the surface of an event
     sees_time: bool = False  # whether functions ask for the time, beside signals at that time
 
     @classmethod
@@ -78,6 +71,8 @@ class EquationsOfMotion:
         light = light_coordinates(alone.flat_at(params, at), *at[1:])
         sees = sees_time(lambda params: values_of(alone.flat_at(params, at), *at[1:]), system, params)
         alone = dataclasses.replace(alone, light=tuple(map(int, light)), sees_time=sees)
+        if any(callable(event.when) for _, event in system.events):
+            alone = dataclasses.replace(alone, sided=bends_by_position(alone.flat_at(params, at), *at[1:]))
         elements = formulation.friction.elements(alone.flat_at(params, at), *at[1:])
         if system.unilateral:
             check_impacts(alone.flat_at(params, at), elements, formulation.friction)
@@ -238,7 +233,8 @@ class EquationsOfMotion:
 
 @jitted  # so that diffrax's many calls trace it once
 def _rates(equations: EquationsOfMotion, t, y, args):
-    parts = equations.decided(t, equations.parts(y), args)
+    moving = equations.decided(t, equations.parts(y), args)
+    parts = on_held_sides(equations.contents(t, moving, args)[0], t, moving, args) if equations.sided else moving
     q, v, works, sigma, held = parts.q, parts.v, parts.works, parts.sigma, parts.held
     flat, mode, elements = equations.mode(t, parts, args)
     of = lambda is_free: lambda: equations.accelerated(t, parts, args, is_free).x
@@ -249,7 +245,7 @@ def _rates(equations: EquationsOfMotion, t, y, args):
     powers = listed_powers(mode, t, q, v) if equations.works else works
     stuck = parts.time_stuck if elements is None else jnp.maximum(sticking(elements, sigma).astype(y.dtype), held)
     resting = Parts(*(jnp.zeros_like(part) for part in parts))
-    return resting._replace(q=v, v=qddot, z=rates, works=powers, time_stuck=stuck).y
+    return resting._replace(q=moving.v, v=qddot, z=rates, works=powers, time_stuck=stuck).y
 
 
 @jitted

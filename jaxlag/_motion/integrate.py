@@ -9,22 +9,21 @@ import diffrax as dfx
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Bool, PyTree
 
 from .._mechanics.consistent_state import Consistent, has_inertia, nearest_state
 from .._mechanics.contact import outside
 from .._mechanics.friction_treatment import Regularised, StickSlip
-from .._mechanics.lagrange import constraint_rows, inertia
 from .._mechanics.projection import Baumgarte, NoStabilisation, Projection
 from .._model.flat import Flat, StatesAt
 from .._model.numbers import count
 from .._model.signal import broken_signals, moves_smoothly
 from .._program.single_kernel import in_one_kernel
-from .._program.sparse_jacobian import MANY
 from .events import begun
-from .first_order import EquationsOfMotion, Formulation
+from .first_order import EquationsOfMotion
+from .formulation import Formulation
 from .integrated import integrated
+from .loads import told_of_loads
 from .mode_changes import started
 from .progress import Bar
 from .protocol import Arguments, FirstOrderSystem
@@ -225,32 +224,6 @@ def in_one_loop(
         projected = varied_along(lambda y, given: (equations.projected(given[1], y, args._replace(params=given[0])), None), along)
         ys = jax.vmap(lambda t, y: projected(y, (args.params, t))[0])(ts, ys)
     return ys, from_diffrax(result), stats
-
-
-def told_of_loads(equations: FirstOrderSystem, t, y, args: Arguments) -> Arguments:
-    """With what constraints at the start, and dry friction at its bound, make of each velocity: where they hold another force, the rounding
-    of both is a rate of its own; where slip begins in a plane, it has no scale of its own yet, and its direction follows the load at a
-    rate of 1/|v|.
-    """
-    holds = isinstance(equations, EquationsOfMotion) and (equations.elements or (equations.system.constraints and equations.size < MANY))
-    if not holds or args.scales is None:
-        return args
-    args, parts = args._replace(scales=args.scales._replace(driven=None)), equations.parts(y)
-    flat, elements = equations.contents(t, parts, args)
-    mass = jnp.diagonal(inertia(flat, t, parts.q, parts.v)[0].as_matrix())
-    pull = lambda rows, loads: jnp.abs(rows) * jnp.outer(jnp.abs(loads), 1 / jnp.where(mass > 0, mass, jnp.inf))
-    scales, held = args.scales, jnp.zeros_like(parts.v)
-    if equations.system.constraints and equations.size < MANY:
-        loads = equations.accelerated(t, parts, args, False).multipliers[: flat.rows]
-        held = held + jnp.sum(pull(constraint_rows(flat, t, parts.q, parts.v)[1], loads), axis=0)
-    if elements is not None:
-        slopes = jax.jacfwd(lambda v: elements.slip(t, parts.q, v))(parts.v)
-        pulls = pull(slopes, equations.friction(t, parts, args).bound[elements.element_of_row])
-        in_plane = elements.is_vector[elements.element_of_row]
-        held = held + jnp.sum(pulls, axis=0)
-        if np.any(in_plane):
-            scales = scales._replace(driven=0.1 * scales.duration * jnp.sum(pulls[in_plane], axis=0))
-    return args._replace(scales=jax.lax.stop_gradient(scales._replace(held=held)))
 
 
 class Variations(NamedTuple):

@@ -17,7 +17,7 @@ from .._model.validation import state_and_params
 from .._program.jit import compiled, is_concrete
 from .derivative_rule import differentiable
 from .failure import raise_failure
-from .first_order import Formulation
+from .formulation import Formulation
 from .integrate import SolverOptions
 from .padding import padded_signals, padded_times, without_padding
 from .progress import compiling

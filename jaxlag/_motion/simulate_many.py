@@ -26,7 +26,8 @@ from .._program.jit import jitted
 from .batch import BatchedEquations
 from .derivative_rule import differentiable_batch
 from .failure import raise_failure
-from .first_order import EquationsOfMotion, Formulation
+from .first_order import EquationsOfMotion
+from .formulation import Formulation
 from .integrate import SolverOptions, Variations, by_diffrax, initialised, is_variational, with_status
 from .members import all_devices, check_agreement, of_each, over_devices, padded
 from .protocol import Arguments

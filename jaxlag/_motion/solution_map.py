@@ -22,7 +22,8 @@ from .._program.sparse_jacobian import MANY
 from .event_record import records
 from .first_order import EquationsOfMotion
 from .guarantees import verified
-from .integrate import SolverOptions, Variations, in_one_loop, initialised, is_variational, states_at, told_of_loads, with_status
+from .integrate import SolverOptions, Variations, in_one_loop, initialised, is_variational, states_at, with_status
+from .loads import told_of_loads
 from .moments import ContactState, EventState, FrictionState
 from .protocol import Arguments
 from .provenance import Provenance

@@ -114,7 +114,7 @@ def test_other_combinations(change, said):
 
     places = [np.array([2.0, 3.0, 5.0]), np.array([2.2, 2.5, 5.5])]
     found = undetermined(places[0], [null(p) for p in places], places, [2] if said else [])
-    words = on_undetermined(("a", "b", "c"), found)
+    words = on_undetermined(("a", "b", "c"), found, {})
     if said:
         assert words == ["c has no influence on these measurements", f"{said}; a and b individually are not"]
     else:

@@ -9,7 +9,7 @@ import jaxlag as jl
 from jaxlag import dissipation
 from jaxlag._mechanics.friction_elements import find_elements
 from jaxlag._model.flat import bind
-from jaxlag._motion.first_order import Formulation
+from jaxlag._motion.formulation import Formulation
 from jaxlag._motion.integrate import SolverOptions
 
 T = lambda qdot: 0.5 * jnp.sum(qdot**2)

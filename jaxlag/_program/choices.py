@@ -1,0 +1,115 @@
+"""Where a program chooses by the value of an input, so that what it computes jumps or bends: where, max, |x|, floor, a table."""
+
+import pathlib
+from collections.abc import Callable, Iterable, Sequence
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax.extend import source_info_util
+
+from .walker import CALLS, CALLS_WITH_DERIVATIVE_RULE, called_program, walk
+
+OWN = str(pathlib.Path(__file__).parents[1])
+BY_VALUE = {
+    "max": "maximum", "min": "minimum", "abs": "abs", "sign": "sign", "clamp": "clip", "reduce_max": "max", "reduce_min": "min",
+    "floor": "floor", "ceil": "ceil", "round": "round", "rem": "remainder", "argmax": "argmax", "argmin": "argmin", "sort": "sort",
+}  # fmt: skip
+BY_PLACE = ("gather", "dynamic_slice")  # what stands behind the first operand are places
+GUARDS = ("eq", "ne")  # true at points alone: what is smooth is guarded by them
+SMOOTH = frozenset(["hypot", "logaddexp", "logaddexp2", "sinc", "softplus"])  # though they choose inside
+Marks = frozenset[str]
+
+
+class Choice(NamedTuple):
+    """What chooses, the line of the user's code, and the marks of the inputs that decide."""
+
+    what: str
+    line: str
+    by: Marks
+
+
+class Value(NamedTuple):
+    """The marks of the inputs that a value depends on, and the choices behind it."""
+
+    marks: Marks = frozenset()
+    choices: frozenset[Choice] = frozenset()
+
+    @classmethod
+    def of(cls, values: Iterable["Value"]) -> "Value":
+        """One that depends on all of these."""
+        values = list(values)
+        return cls(frozenset().union(*(value.marks for value in values)), frozenset().union(*(value.choices for value in values)))
+
+
+class _Call(NamedTuple):
+    """What the user calls, and in which line."""
+
+    what: str | None
+    line: str
+
+
+def choices(function: Callable, *marked: tuple[Any, str]) -> list[Choice]:
+    """The choices of `function(*arguments)`, each argument with its mark; those of jaxlag's own code are left out."""
+    program = jax.make_jaxpr(function)(*(argument for argument, _ in marked))
+    inputs = [Value(frozenset((mark,))) for argument, mark in marked for _ in jax.tree.leaves(argument)]
+    found: dict[tuple[str, str], Marks] = {}
+    for what, line, by in Value.of(_walked(program, inputs, None)).choices:
+        if OWN not in line:
+            found[what, line] = found.get((what, line), frozenset()) | by
+    return sorted(Choice(*of, by) for of, by in found.items())
+
+
+def _walked(program: Any, inputs: Iterable[Value], within: _Call | None) -> list[Value]:
+    """The outputs; what chooses within a program that is called is the call."""
+    evaluate = lambda equation, operands: _evaluated(equation, operands, within)
+    return walk(program, inputs, evaluate, constant=lambda _: Value(), literal=lambda _: Value())
+
+
+def _evaluated(equation: Any, operands: list[Value], within: _Call | None) -> Sequence[Value]:
+    name, params, found = equation.primitive.name, equation.params, Value.of(operands)
+    here = within or _Call(None, source_info_util.summarize(equation.source_info))
+
+    def chosen(what: str, by: Marks) -> Value:
+        return found._replace(choices=found.choices | {Choice(here.what or what, here.line, by)}) if by else found
+
+    if name in CALLS or name in CALLS_WITH_DERIVATIVE_RULE:
+        program = called_program(equation)
+        called = str(params.get("name") or program.jaxpr.debug_info.func_name).strip("_<>")
+        inner = _Call(here.what or (called if called != "lambda" else None), here.line)
+        given = operands[len(operands) - len(program.jaxpr.invars) :]
+        return [found] * len(equation.outvars) if called in SMOOTH else _walked(program, given, inner)
+    if name == "cond":
+        of_branches = zip(*(_walked(branch, operands[1:], here) for branch in params["branches"]), strict=True)
+        return [Value.of((chosen("cond", operands[0].marks), *of)) for of in of_branches]
+    if name == "scan":
+        return _scanned(params, operands, here)
+    if name in GUARDS:
+        found = Value()
+    elif name == "stop_gradient":
+        found = found._replace(choices=frozenset())
+    elif name == "select_n":
+        found = chosen("where", operands[0].marks)
+    elif name in BY_PLACE:
+        found = chosen("a table", Value.of(operands[1:]).marks)
+    elif name == "convert_element_type" and _counts(equation.outvars[0]) and not _counts(equation.invars[0]):
+        found = chosen("a conversion to integers", found.marks)
+    elif name in BY_VALUE:
+        found = chosen(BY_VALUE[name], found.marks)
+    return [found] * len(equation.outvars)
+
+
+def _scanned(params: dict, operands: list[Value], within: _Call) -> list[Value]:
+    """Turns until no carry depends on more."""
+    i, j = params["num_consts"], params["num_consts"] + params["num_carry"]
+    carry = list(operands[i:j])
+    while True:
+        outputs = _walked(params["jaxpr"], [*operands[:i], *carry, *operands[j:]], within)
+        more = [Value.of(pair) for pair in zip(carry, outputs, strict=False)]
+        if more == carry:
+            return [*carry, *outputs[j - i :]]
+        carry = more
+
+
+def _counts(atom: Any) -> bool:
+    return jnp.issubdtype(atom.aval.dtype, jnp.integer) or atom.aval.dtype == bool

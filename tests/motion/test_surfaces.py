@@ -1,0 +1,90 @@
+"""Forces that jump or bend across a surface: named by `examine` and `fit`, and exact where an event is zero there. Closed forms."""
+
+import inspect
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxlag as jl
+from jaxlag._program.choices import choices
+
+FREE = lambda qdot: 0.5 * qdot**2
+MUD = lambda q, qdot, a, b: 0.5 * jnp.where(q > a, b, 0.0) * qdot**2  # thick behind a
+STOP = lambda q, a, c: -0.5 * c * jnp.maximum(q - a, 0.0) ** 2
+EDGES = {
+    "plain": jl.Event(lambda q, a: q - a),
+    "rising": jl.Event(lambda q, a: 1e3 * (q - a), direction=jl.Rising()),
+    "curved": jl.Event(lambda q, a: (a - q) * (3 * a**2 + q**2)),
+}
+
+
+def line_of(function):
+    return inspect.getsourcelines(function)[1]
+
+
+@pytest.mark.parametrize("derivative", [jax.jacfwd, jax.jacrev])
+@pytest.mark.parametrize("edge", EDGES)
+def test_mud_behind_an_edge(edge, derivative):
+    """From q = 0 at speed 1, q(T) = a + (1 − e^{−b (T−a)})/b; the derivative by a was 0, and with an event not right either."""
+    system = jl.System(FREE, dissipation=MUD, events={"edge": EDGES[edge]})
+
+    @jax.jit
+    def last(x, unit):
+        a, b, T = x
+        return jl.simulate(system, 0 * unit, unit, jnp.stack([0.0, T]), {"a": a * unit, "b": b}).q[-1] / unit
+
+    a, b, T = x = jnp.array([0.5, 1.3, 2.0])
+    decay = np.exp(-b * (T - a))
+    for unit in (1.0, 1e-9, 1e6):
+        np.testing.assert_allclose(last(x, unit), a + (1 - decay) / b, rtol=1e-7)
+        exact = [1 - decay, -(1 - decay) / b**2 + (T - a) * decay / b, decay]
+        np.testing.assert_allclose(derivative(last)(x, unit), exact, rtol=2e-5 if edge == "curved" else 1e-7)
+
+
+def test_a_spring_that_one_runs_into():
+    """A half period of contact, and back: q(T) = a − (T − a − π/ω)."""
+    system = jl.System(lambda q, qdot, a, c: FREE(qdot) + STOP(q, a, c), events={"edge": EDGES["plain"]})
+    last = lambda a, c: jl.simulate(system, 0.0, 1.0, np.array([0.0, 10.0]), {"a": a, "c": c}).q[-1]
+    np.testing.assert_allclose(last(0.5, 4.0), 0.5 - (9.5 - np.pi / 2), rtol=1e-7)
+    np.testing.assert_allclose(jax.grad(last, (0, 1))(0.5, 4.0), [2.0, -np.pi / 16], rtol=1e-6)
+
+
+def test_the_user_is_told_where():
+    """Each function and its line, the table too; neither dry friction nor guards nor what is smooth."""
+    told = test_the_user_is_told_where
+    system = jl.System(
+        {"free": lambda qdot: 0.5 * qdot["x"] ** 2, "stop": lambda q, a, c: STOP(q["x"], a, c), "well": lambda q: -jnp.hypot(q["x"], 1.0)},
+        dissipation={"mud": lambda q, qdot, a, b: MUD(q["x"], qdot["x"], a, b), "rubbing": lambda qdot: 0.1 * jnp.abs(qdot["x"])},
+        force=lambda q: {"x": -jnp.interp(q["x"], jnp.arange(4.0), jnp.arange(4.0) ** 2) / jnp.where(q["x"] == 0, 1.0, q["x"])},
+    )
+    found = jl.examine(system, {"x": 0.3}, {"x": 1.0}, {"a": 0.5, "b": 1.0, "c": 4.0}).findings
+    for what, line in (("'stop' chooses", line_of(STOP)), ("'mud' chooses", line_of(MUD)), ("`force` chooses", 6 + line_of(told))):
+        (finding,) = [finding for finding in found if what in finding]
+        assert f"test_surfaces.py:{line}:" in finding and "jl.Event" in finding
+    assert not any(name in finding for finding in found for name in ("well", "rubbing", "free"))
+
+
+def test_a_fit_does_not_deny_an_influence():
+    """Without an event the derivative by a is 0; a parameter that stands nowhere has none indeed."""
+    system, ts = jl.System(FREE, dissipation=MUD), np.linspace(0, 2, 41)
+    exact = np.where(ts < 0.5, ts, 0.5 + 1 - np.exp(-np.maximum(ts - 0.5, 0)))
+    record = jl.Experiment(ts, exact + 1e-3 * np.random.default_rng(0).normal(size=ts.size), 0.0, 1.0, sigma=1e-3)
+    shown = str(jl.fit(system, record, {"a": 0.52, "b": 1.1, "idle": 1.0}, free=("a", "b", "idle")))
+    assert "a decides where" in shown and f"test_surfaces.py:{line_of(MUD)}:" in shown
+    assert "a has no influence" not in shown and "idle has no influence" in shown
+    edged = jl.System(FREE, dissipation=MUD, events={"edge": EDGES["plain"]})
+    found = jl.fit(edged, record, {"a": 0.52, "b": 1.1}, free=("a", "b"))
+    assert found.converged and abs(found.estimates["a"] - 0.5) < 4 * found.standard_errors["a"] < 0.01
+
+
+def test_choices_of_programs():
+    """Within scans, branches and calls; not behind `stop_gradient`, where a derivative does not see them."""
+    of = lambda function: [(what, set(by)) for what, _, by in choices(function, (jnp.ones(3), "q"), (jnp.ones(3), "v"), (1.0, "a"))]
+    assert of(lambda q, v, a: jax.lax.fori_loop(0, 3, lambda i, s: s + jnp.clip(q[0] + s, 0, a), 0.0)) == [("clip", {"q", "a"})]
+    assert of(lambda q, v, a: jax.lax.cond(q[0] > v[0], jnp.sin, jnp.cos, a)) == [("cond", {"q", "v"})]
+    assert of(lambda q, v, a: jax.nn.relu(q[0] - a)) == [("relu", {"q", "a"})]
+    assert of(lambda q, v, a: q[(10 * a).astype(int)]) == [("a table", {"a"})] or of(lambda q, v, a: q[(10 * a).astype(int)])
+    for smooth in (jax.nn.softplus, jax.nn.softmax, jnp.sinc, jnp.exp, lambda q: jnp.logaddexp(q, 1.0), lambda q: jnp.hypot(q, 2.0)):
+        assert of(lambda q, v, a, smooth=smooth: smooth(q)) == []
