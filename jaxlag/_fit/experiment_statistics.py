@@ -11,10 +11,8 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import PyTree
 
 from .._mechanics.surfaces import surfaces
-from .._model.flat import StatesAt
 from .._model.paths import is_within
 from .._model.signal import is_signal
-from .._model.state_values import start_values
 from .experiment import Experiment, with_own
 from .identifiability import Determined
 from .minimum import Minimum
@@ -112,9 +110,7 @@ def deciding(minimum: Minimum) -> dict[str, str]:
     found: dict[str, str] = {}
     for e in minimum.recordings:
         system, params = minimum.problem.model.system, with_own(minimum.problem.free.params, e.params)
-        q, v = (ravel_pytree(tree)[0] for tree in (e.q0, e.qdot0))
-        at = StatesAt(start_values(system, {}, e.ts[0], e.q0, e.qdot0, params), jnp.asarray(e.ts[0], q.dtype), q, v)
-        for surface in surfaces(system, e.q0, params, at):
+        for surface in surfaces(system, e.q0, e.qdot0, params, e.ts[0], {}):
             found |= dict.fromkeys(surface.params, surface.line)
     return found
 

@@ -8,9 +8,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import PyTree
 
-from .._model.flat import Flat, StatesAt, rows_by_name
+from .._model.flat import Flat, rows_by_name
 from .._model.paths import entry_names, leaf_names
-from .._model.state_values import given_states, start_values
+from .._model.state_values import given_states
 from .._model.system import System
 from .._model.validation import at_state, checked, coordinates, state
 from .._program.scalarise import scalarised
@@ -145,7 +145,7 @@ def examine(system: System, q: PyTree, qdot: PyTree, params: PyTree = None, *, t
         *findings.not_unique(found["multipliers"], found["other_multipliers"]),
         *findings.coupling_all(coupled, found["uses_all_numbers"], len(names)),
         *_unread_friction(system, q, qdot, params, t, states),
-        *findings.bending(_surfaces(system, q, qdot, params, t, states), bool(system.events)),
+        *findings.bending(surfaces(system, *state(q, qdot), params, t, given_states(system, states, q)), bool(system.events)),
     ]
     light = tuple(names[i] for i in np.flatnonzero(found["light"]))
     states = tuple(name for name, _ in system.states)
@@ -162,14 +162,6 @@ def _unread_friction(system, q, qdot, params, t, states):
     q, qdot = state(q, qdot)
     t = jnp.asarray(t, jax.tree.leaves(q)[0].dtype)
     return unread_friction(*checked(system, t, q, qdot, params, given_states(system, states, q)))
-
-
-def _surfaces(system, q, qdot, params, t, states):
-    """What chooses by the position."""
-    q, qdot = state(q, qdot)
-    values = start_values(system, given_states(system, states, q), t, q, qdot, params)
-    at, v = (jax.flatten_util.ravel_pytree(tree)[0] for tree in (q, qdot))
-    return surfaces(system, q, params, StatesAt(values, jnp.asarray(t, v.dtype), at, v))
 
 
 def _measure(flat: Flat, t, q, v):

@@ -5,10 +5,12 @@ from typing import Any, NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+from jax.flatten_util import ravel_pytree
 from jaxtyping import PyTree
 
 from .._model.flat import Flat, StatesAt, bind
 from .._model.paths import leaf_names
+from .._model.state_values import start_values
 from .._model.system import System, role
 from .._program.choices import choices
 
@@ -24,24 +26,37 @@ class Surface(NamedTuple):
     params: frozenset[str]
 
 
-def surfaces(system: System, like: PyTree, params: PyTree, at: StatesAt) -> list[Surface]:
-    """Those of all functions; what chooses by a velocity or a constraint force too is dry friction's."""
+def surfaces(system: System, q: PyTree, qdot: PyTree, params: PyTree, t: Any, states: Any) -> list[Surface]:
+    """Those of all functions, whose programs are read at this state; `states`: those that are given."""
+    values = start_values(system, states, t, q, qdot, params)
+    (at, v), t = (ravel_pytree(tree)[0] for tree in (q, qdot)), jnp.asarray(t, jax.tree.leaves(q)[0].dtype)
     numbers, rest = eqx.partition(params, eqx.is_inexact_array_like)
     names = leaf_names(numbers, "params")
-    numbers, structure = jax.tree.flatten(numbers)
-    multipliers = jnp.zeros(bind(system, like, params, at).rows, at.q.dtype)
+    leaves, structure = jax.tree.flatten(numbers)
+    multipliers = jnp.zeros(bind(system, q, params, StatesAt(values, t, at, v)).rows, at.dtype)
     found: dict[Surface, None] = {}
     for what, of in _functions(system):
 
-        def function(t, q, v, multipliers, *numbers, of=of):
-            flat = bind(system, like, eqx.combine(jax.tree.unflatten(structure, numbers), rest), at._replace(t=t, q=q, v=v))
-            return of(flat, t, q, v, multipliers)
+        def function(t, at, v, multipliers, *leaves, of=of):
+            flat = bind(system, q, eqx.combine(jax.tree.unflatten(structure, leaves), rest), StatesAt(values, t, at, v))
+            return of(flat, t, at, v, multipliers)
 
-        marked = (jnp.asarray(at.t, at.q.dtype), T), (at.q, Q), (at.v, V), (multipliers, LOAD), *zip(numbers, names, strict=True)
-        for chooses, line, by in choices(function, *marked):
-            if Q in by and not by & {V, LOAD}:
+        for chooses, line, by in choices(function, (t, T), (at, Q), (v, V), (multipliers, LOAD), *zip(leaves, names, strict=True)):
+            if _by_position(by):
                 found[Surface(what, chooses, line, by - {T, Q})] = None
     return list(found)
+
+
+def bends_by_position(system: System, flat: Flat, t, q, v) -> bool:
+    """Whether any function chooses by the position."""
+    given = (jnp.asarray(t, q.dtype), T), (q, Q), (v, V), (jnp.zeros(flat.rows, q.dtype), LOAD)
+    found = (choices(lambda *state, of=of: of(flat, *state), *given) for _, of in _functions(system))
+    return any(_by_position(choice.by) for of_one in found for choice in of_one)
+
+
+def _by_position(by: frozenset[str]) -> bool:
+    """What a velocity or a constraint force decides too is dry friction's."""
+    return Q in by and not by & {V, LOAD}
 
 
 def _functions(system: System) -> list[tuple[str, Any]]:
@@ -58,17 +73,3 @@ def _functions(system: System) -> list[tuple[str, Any]]:
         "states": lambda flat, t, q, v, _: flat.state_rates(t, q, v),
     }
     return of_terms + [(f"`{slot}`", of) for slot, of in of_all.items() if getattr(system, slot)]
-
-
-def bends_by_position(flat: Flat, t, q, v) -> bool:
-    """Whether any function chooses by q alone."""
-    multipliers = jnp.zeros(flat.rows, q.dtype)
-    everything = lambda t, q, v, multipliers: (
-        *(L(t, q, v) for L in flat.lagrangians.values()),
-        *(of(t, q, v, multipliers) for of in (*flat.dissipations.values(), *flat.forces.values())),
-        flat.holonomic(t, q),
-        flat.nonholonomic(t, q, v),
-        flat.state_rates(t, q, v),
-    )
-    by = [choice.by for choice in choices(everything, (jnp.asarray(t, q.dtype), T), (q, Q), (v, V), (multipliers, LOAD))]
-    return any(Q in marks and not marks & {V, LOAD} for marks in by)

@@ -72,7 +72,7 @@ class EquationsOfMotion:
         sees = sees_time(lambda params: values_of(alone.flat_at(params, at), *at[1:]), system, params)
         alone = dataclasses.replace(alone, light=tuple(map(int, light)), sees_time=sees)
         if any(callable(event.when) for _, event in system.events):
-            alone = dataclasses.replace(alone, sided=bends_by_position(alone.flat_at(params, at), *at[1:]))
+            alone = dataclasses.replace(alone, sided=bends_by_position(system, alone.flat_at(params, at), *at[1:]))
         elements = formulation.friction.elements(alone.flat_at(params, at), *at[1:])
         if system.unilateral:
             check_impacts(alone.flat_at(params, at), elements, formulation.friction)
