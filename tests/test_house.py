@@ -26,6 +26,7 @@ WINGS = {  # each imports only from those above it, and each file of a wing only
         "elimination",
         "interpreter",
         "scalarise",
+        "conditions",
         "single_kernel",
         "whole_kernel",
         "structured_jacobian",

@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from .pseudo_inverse import everywhere
+from .._program.conditions import everywhere
 
 
 def augmented(M, G):

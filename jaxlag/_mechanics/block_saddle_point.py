@@ -26,10 +26,10 @@ from .._program.block_tridiagonal import pairs_in_a_column
 from .._program.block_tridiagonal_lu import Factors as Blocks
 from .._program.block_tridiagonal_lu import factorised as by_blocks
 from .._program.block_tridiagonal_lu import order, positive_eigenvalues, solution
+from .._program.conditions import everywhere
 from .._program.shifted_factors import SHIFT, put_right, scales, shifted_where_singular, signs
 from .._program.sparse_jacobian import SPARSE
 from .._program.sparse_matrix import Places, SparseMatrix, picked, summed_by
-from .pseudo_inverse import everywhere
 
 EXACT = 2  # times that a solution is put right where rows are independent: once for GᵀG, once for rounding
 

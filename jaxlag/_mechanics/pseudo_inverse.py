@@ -10,19 +10,10 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from .._program.conditions import everywhere
+
 # Exponents of eps (1.3e-5, 1.6e-10, 1.8e-12 and 1.3e-6 in double precision) and a factor, with which ranks are judged
 CLEAR, SEEN, NOISE, FOLLOWS, FARTHER = 0.3125, 0.625, 0.75, 0.375, 2
-
-
-@jax.custom_batching.custom_vmap
-def everywhere(condition: Bool[Array, ""]) -> Bool[Array, ""]:
-    """A condition; in a batch, whether it holds for all members, so that a `cond` on it stays one and not the work of both branches."""
-    return condition
-
-
-@everywhere.def_vmap
-def _for_all_members(axis_size, in_batched, conditions):
-    return everywhere(jnp.all(conditions)), False
 
 
 class Request(NamedTuple):

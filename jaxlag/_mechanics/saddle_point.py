@@ -8,13 +8,14 @@ import jax.numpy as jnp
 import lineax as lx
 from jaxtyping import Array, Bool, Float
 
+from .._program.conditions import everywhere
 from .._program.recursive_elimination import Factors as Articulated
 from .._program.scalarise import scalarised
 from .._program.sparse_jacobian import MANY
 from .._program.sparse_matrix import SparseMatrix, dense
 from . import block_saddle_point, sparse_saddle_point
 from .augmented_inertia import augmented
-from .pseudo_inverse import Inverse, Request, applied, by_rows, everywhere, inverse_of
+from .pseudo_inverse import Inverse, Request, applied, by_rows, inverse_of
 from .structured_inertia import MOST_FULL, StructuredInertia, by_inertia, is_positive, root_of_inverse
 from .structured_inertia import factorised as structure_factorised
 

@@ -15,9 +15,10 @@ from jax import lax
 from jaxtyping import Array, Bool, Float
 
 from .._program.block_tridiagonal import by_factor, elimination, factor
+from .._program.conditions import everywhere
 from .._program.shifted_factors import SHIFT, put_right, shifted_where_singular, signs
 from .._program.sparse_matrix import SparseMatrix, picked, row_sums, summed_by
-from .pseudo_inverse import FOLLOWS, everywhere
+from .pseudo_inverse import FOLLOWS
 
 
 class Factors(NamedTuple):

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
 
-from .._mechanics.pseudo_inverse import everywhere
+from .._program.conditions import everywhere
 from .._program.jit import compiled, jitted
 from .unreached import rows_reached, with_unreached
 from .variational import derived, pushforward, split_varying

@@ -18,6 +18,7 @@ from .._model.signal import SinceOrigin, is_signal, origin_of, with_second_deriv
 from .._model.state_values import start_values
 from .._model.system import System
 from .._model.validation import check
+from .._program.conditions import computed_first
 from .._program.sparse_jacobian import MANY
 from .event_record import records
 from .first_order import EquationsOfMotion
@@ -255,7 +256,7 @@ def samples_at(equations: EquationsOfMotion, ts, ys, params, result, stats, tole
     last_t, last_y = stats["last"]
     times, states = jnp.concatenate([ts, last_t[None]]), jnp.concatenate([ys, last_y[None]])
     scales = scales_of(equations, tolerances, ts, params, states)
-    samples = jax.vmap(lambda t, y: sample_at(equations, t, y, params, scales))(times, states)
+    samples = computed_first(jax.vmap(lambda t, y: sample_at(equations, t, y, params, scales))(times, states), last_t)
     if equations.events:  # behind the end of a motion there is none
         states = jnp.where(states[:, -1:] > 0, jnp.nan, states)
     shown, result, reached = verified(equations, times, states, samples, result, tolerances[0])
