@@ -20,6 +20,7 @@ WINGS = {  # each imports only from those above it, and each file of a wing only
         "expressions",
         "scalar_graph",
         "walker",
+        "size_of_terms",
         "rules",
         "data_movement",
         "control_flow",

@@ -10,7 +10,7 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float, PyTree
 
-from .._mechanics.augmented_inertia import augmented
+from .._mechanics.augmented_inertia import augmented, by_weight, unit_lengths
 from .._mechanics.constraint_residuals import off_constraints
 from .._mechanics.contact import in_current_mode
 from .._mechanics.lagrange import applied_force, constraint_rows, inertia
@@ -20,10 +20,13 @@ from .._model.state_values import start_values
 from .._model.system import System
 from .._model.validation import checked
 from .._program.jit import compiled
+from .._program.size_of_terms import size_of_terms
 from .dynamics import Balance, Dynamics, Forces, Whole, dynamics_of
 from .inputs import Input
 from .newton import least_change
 from .tangent_space import Partition
+
+STEADY = 0.375  # exponent of eps (1.3e-6 in double precision): what may be left of terms that cancel in a steady state
 
 
 @dataclasses.dataclass(frozen=True)
@@ -66,13 +69,15 @@ class Matrices(NamedTuple):
 
 @compiled
 def constraint_slopes(system, t, q, qdot, params, states):
-    """G, how many of its rows hold positions (as an array of that length), and how far the state is off the constraints.
+    """G, of coordinates in units in which each has inertia of order one, how many of its rows hold positions (as an array of that length),
+    and how far the state is off the constraints.
 
     Below G, what says that velocities of coordinates without inertia depend on the others; rows that hold these hold them alone.
     """
     flat, t, q, v = checked(system, t, q, qdot, params, states)
     mode = in_current_mode(flat, t, q, v)
     _, G, _ = constraint_rows(mode, t, q, v)
+    G = G * unit_lengths(inertia(mode, t, q, v)[0].as_matrix(), G)[None]
     z, rows = first_order(mode, t, q, v)
     if z.size:
         alone = np.outer(rows, ~np.isin(np.arange(q.size), z))
@@ -101,12 +106,12 @@ def matrices(choice: Choice, system: System, t: Any, q: PyTree, qdot: PyTree, pa
     qddot, multipliers, z, outputs, updates = slopes
     parts = [jax.tree.map(lambda x: x[..., positions, :], velocity), jax.tree.map(lambda x: x[..., velocities, :], qddot), z]
     rates = jax.tree.map(lambda *rows: jnp.concatenate(rows, axis=-2), *parts)
-    near = jnp.finfo(y.q.dtype).eps ** 0.375
     by_state = jnp.abs(jnp.concatenate([of.by_state for of in (qddot, z, updates)]))
     by_held = jnp.abs(jnp.concatenate([of.by_inputs[0, :, len(choice.inputs) - choice.loops :] for of in (qddot, z, updates)]))
-    near_zero = jnp.abs(basis.T) @ (1 + jnp.abs(jnp.concatenate(y))), 1 + jnp.abs(dynamics.held[: choice.loops])
-    allowed = near * (by_state @ near_zero[0] + by_held @ near_zero[1])
-    allowed = allowed.at[:n].add(near**2 * _rounding(dynamics, y, forces.multipliers, M))
+    of_state, of_terms = _sizes(dynamics, y, forces.multipliers, M)
+    independent = np.array([*positions, *(n + velocities), *range(2 * n, len(of_state))], int)
+    size = by_state @ of_state[independent] + by_held @ jnp.abs(dynamics.held[: choice.loops]) + of_terms
+    allowed = jnp.finfo(y.q.dtype).eps ** STEADY * size
     left = jnp.concatenate([forces.qddot, found.z, found.updates - dynamics.held])
     steadiness = Steadiness(left, allowed, forces.sound.determined & forces.sound.satisfied)
     outputs, multipliers, updates = (_shifted(rates, of) for of in (outputs, multipliers, updates))
@@ -123,7 +128,10 @@ def _slopes(
     (n,), d, m, rows = y.q.shape, basis.shape[1], len(dynamics.inputs), forces.multipliers.size
     held = np.array(at.velocity_rows, int)
     redundant = len(held) < rows
-    inside = least_change(_rows(dynamics, y), forces.multipliers, 1.0) if redundant else jnp.zeros(n, y.q.dtype)
+    G = _rows(dynamics, y)
+    mode = in_current_mode(dynamics.at(y, dynamics.still()), dynamics.t, y.q, y.v)
+    units = unit_lengths(inertia(mode, dynamics.t, y.q, y.v)[0].as_matrix(), G)
+    inside = least_change(G, forces.multipliers, units) if redundant else jnp.zeros(n, y.q.dtype)
 
     def along(c):
         x, *u, qddot, multipliers = jnp.split(c, np.cumsum([d, m, m, m, n]))
@@ -223,13 +231,20 @@ def _shifted(rates: ByInputs, of: ByInputs) -> ByInputs:
     return ByInputs(C, jnp.stack([D + C @ (B1 + A @ B2), D1 + C @ B2, D2]))
 
 
-def _rounding(dynamics: Dynamics, y: Whole, multipliers: Array, mass: Array) -> Float[Array, " n"]:
-    """How far the forces that balance each other in q̈ would accelerate, each by itself."""
+def _sizes(dynamics: Dynamics, y: Whole, multipliers: Array, mass: Array) -> tuple[Float[Array, " y"], Float[Array, " r"]]:
+    """Of each number of the state its size, of what is zero by mass; and of q̈, ż and updates that of the terms that cancel in them."""
     mode, G = in_current_mode(dynamics.at(y, dynamics.still()), dynamics.t, y.q, y.v), _rows(dynamics, y)
-    of_lagrangian = jax.grad(mode.lagrangian, argnums=1)(dynamics.t, y.q, y.v)
-    applied = applied_force(mode, dynamics.t, y.q, y.v, multipliers)
-    forces = jnp.abs(of_lagrangian) + jnp.abs(applied) + jnp.abs(G.T) @ jnp.abs(multipliers)
     light = first_order(mode, dynamics.t, y.q, y.v).coordinates
     stand_in = with_masses(mode, light, dynamics.t, y.q, y.v) if light.size else None
     mass = mass if stand_in is None else inertia(stand_in, dynamics.t, y.q, y.v)[0].as_matrix()
-    return jnp.abs(jnp.linalg.inv(augmented(mass, G)[0])) @ forces
+    units = unit_lengths(mass, G)
+    of_lagrangian = lambda q: jax.grad(mode.lagrangian, argnums=1)(dynamics.t, q, y.v)
+    applied = applied_force(mode, dynamics.t, y.q, y.v, multipliers)
+    forces = jnp.abs(of_lagrangian(y.q)) + size_of_terms(of_lagrangian, y.q) + jnp.abs(applied) + jnp.abs(G.T) @ jnp.abs(multipliers)
+    mobility = jnp.abs(jnp.linalg.inv(augmented(mass, G)[0] * jnp.outer(units, units)))
+    terms = [units * (mobility @ (units * forces)), jnp.zeros(y.z.size + dynamics.held.size, y.q.dtype)]
+    if terms[1].size:
+        rates = lambda z: [dynamics.driven(y._replace(z=z), 0 * y.q, multipliers, dynamics.still())[i] for i in (0, 2)]
+        terms[1] = size_of_terms(lambda z: jnp.concatenate(rates(z)), y.z)
+    sizes = [by_weight(units, jnp.abs(x)) for x in (y.q, y.v)]
+    return jnp.concatenate([*sizes, jnp.abs(y.z)]), jnp.concatenate(terms)

@@ -10,6 +10,7 @@ import lineax as lx
 from jaxtyping import Array, Bool, Float
 
 from .._program.implicit import implicit_root
+from .._program.size_of_terms import size_of_terms
 from .._program.sparse_matrix import SparseMatrix
 
 ITERATIONS = 100
@@ -18,10 +19,11 @@ Residual = Callable[[Any, Float[Array, " u"]], Float[Array, " r"]]  # R(args, w)
 
 
 class Root(NamedTuple):
-    """w with R(w) = 0, and whether it is one."""
+    """w with R(w) = 0, whether it is one, and the size of what cancels in each equation."""
 
     w: Float[Array, " u"]
     found: Bool[Array, ""]
+    size: Float[Array, " r"]
 
 
 def root_near(
@@ -33,20 +35,19 @@ def root_near(
     fixed, guess = jax.lax.stop_gradient((args, guess))
     slope = lambda w: jax.jacfwd(residual, 1)(fixed, w)
     units = jax.lax.stop_gradient(units_beside(slope(guess), units))
+    of = jnp.where(units > 0, units, 1)
 
     def changes(w):
         J = slope(w)
-        return lambda w: -least_change(J, residual(fixed, w), ease * units)
+        return lambda w: -least_change(J, residual(fixed, w), ease * of)
 
     w, reach = newton(changes, guess, units)
-    in_units = lambda args, w: residual(args[0], w)
-    root = implicit_root(in_units, functools.partial(_change_in_units, residual), (args, units), w)
-    return Root(root, is_root(slope(w), residual(fixed, w), w, reach))
+    return root_of_size(lambda w: residual(fixed, w), slope(w), w, reach)._replace(w=differentiable_root(residual, args, w, of))
 
 
 def units_beside(J: Float[Array, "r u"], units: Float[Array, " u"]) -> Float[Array, " u"]:
     """Units of all unknowns where those of some are known and others are 0: such that in each equation that holds one whose unit is known
-    the other counts for no more than that. They follow all changes of units. Those that no equation ties to others have 1.
+    the other counts for no more than that. They follow all changes of units. Those that no equation ties to others keep 0.
     """
     size = jnp.abs(J)
 
@@ -56,29 +57,28 @@ def units_beside(J: Float[Array, "r u"], units: Float[Array, " u"]) -> Float[Arr
         found = jnp.min(jnp.where(ties, rows / jnp.where(ties, size, 1), jnp.inf), axis=0, initial=jnp.inf)
         return jnp.where((units > 0) | ~jnp.isfinite(found), units, found)
 
-    units = jax.lax.fori_loop(0, min(TIES, units.size), turn, units.astype(J.dtype))
-    return jnp.where(units > 0, units, 1)
+    return jax.lax.fori_loop(0, min(TIES, units.size), turn, units.astype(J.dtype))
 
 
 def newton(
-    changes: Callable[[Array], Callable[[Array], Array]], guess: Float[Array, " u"], units: Float[Array, " u"] | None = None
+    changes: Callable[[Array], Callable[[Array], Array]], guess: Float[Array, " u"], units: Float[Array, " u"]
 ) -> tuple[Float[Array, " u"], Float[Array, " u"]]:
-    """Where Newton's method comes to rest, and within which reach of each unknown what is beside it counts as rounding; `changes(w)` is
+    """Where Newton's method comes to rest, and the reach of each unknown, of which some eps are rounding; `changes(w)` is
     w' ↦ −J(w)⁻¹ R(w').
 
     A step is halved until the step that would follow it is shorter: a test that does not depend on the units of R or w. In these `units`
-    the reach is the largest unknown, at the start or now; where all are zero, rounding leaves something of forces that cancel.
+    the reach is the largest unknown, at the start or now; where a unit is 0, it is its own. What is nothing beside the start is zero.
 
     Source: Deuflhard, Newton Methods for Nonlinear Problems, section 3.3.2 (natural monotonicity test).
     """
-    eps = jnp.finfo(guess.dtype).eps
+    eps, known = jnp.finfo(guess.dtype).eps, units > 0
 
     def reach(w):
-        if units is None:
-            return 1 + jnp.abs(w)
-        return units * jnp.max(jnp.maximum(jnp.abs(w), jnp.abs(guess)) / units, initial=0.0) + eps**0.5
+        largest = jnp.maximum(jnp.abs(w), jnp.abs(guess))
+        return jnp.where(known, units * jnp.max(jnp.where(known, largest / jnp.where(known, units, 1), 0), initial=0.0), largest)
 
-    length = lambda step, w: jnp.max(jnp.abs(step) / reach(w), initial=0.0)
+    def length(step, w):
+        return jnp.max(jnp.where(step == 0, 0, jnp.abs(step) / reach(w)), initial=0.0)
 
     def turn(carry):
         w, _, i = carry
@@ -98,27 +98,30 @@ def newton(
         return (i < ITERATIONS) & ~done & jnp.all(jnp.isfinite(w))
 
     w, _, _ = jax.lax.while_loop(is_on_its_way, turn, (guess, jnp.array(False), jnp.array(0)))
+    w = jnp.where(jnp.all(jnp.abs(w) <= 8 * eps * reach(guess)), 0, w)
     return w, reach(w)
 
 
-def is_root(J: Array | SparseMatrix, R: Array, w: Array, reach: Array | None = None) -> Bool[Array, ""]:
-    """Whether a residual is zero: a change of w by rounding, within its reach, would bring as much about."""
-    allowed = jnp.finfo(w.dtype).eps ** 0.5 * (abs(J) @ (1 + jnp.abs(w) if reach is None else reach))
-    return jnp.all(jnp.isfinite(w)) & jnp.all(jnp.abs(R) <= allowed)
+def root_of_size(residual: Callable[[Array], Array], J: Array | SparseMatrix, w: Array, reach: Array) -> Root:
+    """Whether w is a root: what is left is rounding beside the terms that cancel, or what a change of w by rounding brings about."""
+    size = abs(J) @ reach + size_of_terms(residual, w)
+    return Root(w, jnp.all(jnp.isfinite(w)) & is_nothing(residual(w), size), size)
 
 
-def _change_in_units(residual, args, w, R):
-    args, units = args
+def is_nothing(R: Float[Array, " r"], size: Float[Array, " r"]) -> Bool[Array, ""]:
+    """Whether what is left of equations is rounding, beside the size of what cancels in them."""
+    return jnp.all(jnp.abs(R) <= jnp.finfo(R.dtype).eps ** 0.5 * size)
+
+
+def differentiable_root(residual: Residual, args: Any, w: Float[Array, " u"], units: Float[Array, " u"]) -> Float[Array, " u"]:
+    """w, which depends on args as R(args, w) = 0 says; of several ways to change with them, by the shortest in these units."""
+    in_units = lambda given, w: residual(given[0], w)
+    return implicit_root(in_units, functools.partial(_change, residual), (args, units), w)
+
+
+def _change(residual, given, w, R):
+    args, units = given
     return -least_change(jax.jacfwd(residual, 1)(args, w), R, units)
-
-
-def differentiable_root(residual: Residual, args: Any, w: Float[Array, " u"]) -> Float[Array, " u"]:
-    """w, which depends on args as R(args, w) = 0 says; of several ways to change with them, by the shortest."""
-    return implicit_root(residual, functools.partial(_change, residual), args, w)
-
-
-def _change(residual, args, w, R):
-    return -least_change(jax.jacfwd(residual, 1)(args, w), R, 1 + jnp.abs(jax.lax.stop_gradient(w)))
 
 
 def least_change(J: Float[Array, "r u"], R: Float[Array, " r"], scale: Any) -> Float[Array, " u"]:

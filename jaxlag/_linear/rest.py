@@ -5,13 +5,16 @@ from typing import Any, NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import lineax as lx
 import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
+from .._mechanics.augmented_inertia import unit_lengths
 from .._mechanics.friction_elements import FrictionElements, find_elements
 from .._mechanics.lagrange import applied_force, constraint_rows, inertia
 from .._mechanics.pseudo_inverse import FOLLOWS, SEEN
+from .._mechanics.saddle_point import saddle_point
 from .._mechanics.stick_slip import in_mode, slip_of, sticking
 from .._model.flat import Flat, StatesAt, bind
 from .._model.state_values import Layout, start_values
@@ -19,7 +22,7 @@ from .._model.system import System
 from .._model.validation import checked
 from .._program.jit import compiled
 from .descent import minimum_near
-from .newton import is_root, least_change, root_near
+from .newton import Root, is_nothing, least_change, root_near, units_beside
 
 
 class Search(NamedTuple):
@@ -158,12 +161,14 @@ def steady_state(search: Search, system: System, t: Any, q: PyTree, qdot: PyTree
     given = Given(eqx.filter(params, eqx.is_array), t, q0, v0, jnp.zeros(len(search.running), bool))
     equations = Equations(search, system, q, params, values, given, flat)
     start = jax.lax.stop_gradient(q0)
+    units = _units(inertia(flat, t, start, v0)[0].as_matrix())
     if search.stable:
-        start = minimum_near(lambda q: -flat.lagrangian(t, q, v0), lambda q: flat.holonomic(t, q), start, equations.moving)
+        V = lambda q: -flat.lagrangian(t, q, v0)
+        within = units_beside(jax.hessian(V)(start), units)
+        start = minimum_near(V, lambda q: flat.holonomic(t, q), start, equations.moving, jnp.where(within > 0, within, 1))
     nothing = jnp.zeros(flat.rows, q0.dtype), jnp.zeros(equations.friction_rows, q0.dtype)
     of = Unknowns(start[equations.moving], v0[equations.running], ravel_pytree(values)[0].astype(q0.dtype), *nothing)
     f, (_, G, _) = equations.force(flat, given, start, v0, of), constraint_rows(flat, t, start, v0)
-    units = _units(inertia(flat, t, start, v0)[0].as_matrix())
     sizes = jnp.max(jnp.abs(G) * units[None], axis=1, initial=0.0)
     of = of._replace(multipliers=least_change(G.T, -f, 1 / jnp.where(sizes > 0, sizes, 1)) if flat.rows else of.multipliers)
     ease = jnp.ones(sum(x.size for x in of), q0.dtype).at[equations.sizes[2] :].set(1e8 if search.held else 1.0)  # q stays if it can
@@ -172,8 +177,7 @@ def steady_state(search: Search, system: System, t: Any, q: PyTree, qdot: PyTree
         J = jax.jacfwd(equations, 1)(jax.lax.stop_gradient(given), guess)
         given = given._replace(open=left_open(J, equations.sizes[0] + np.arange(len(search.running))))
     known = jnp.zeros_like(ease).at[: equations.moving.size].set(units[equations.moving])
-    w, found = root_near(equations, given, guess, known, ease)
-    return _described(equations, given, w, found)
+    return _described(equations, given, root_near(equations, given, guess, known, ease))
 
 
 def _units(M: Float[Array, "n n"]) -> Float[Array, " n"]:
@@ -183,23 +187,22 @@ def _units(M: Float[Array, "n n"]) -> Float[Array, " n"]:
     return jnp.where(jnp.any(mass > 0), units, 1)
 
 
-def _described(equations: Equations, given: Given, w: Array, found: Array) -> Rest:
+def _described(equations: Equations, given: Given, root: Root) -> Rest:
     """A steady state with all that is said of it."""
-    flat, q, v, of = equations.taken_apart(given, w)
-    t, (known, at_rest) = given.t, jax.lax.stop_gradient((given, w))
-    J, R = jax.jacfwd(equations, 1)(known, at_rest), equations(known, at_rest)
-    allowed = jnp.abs(J) @ (1 + jnp.abs(at_rest)) + jnp.finfo(w.dtype).tiny
-    step = 0.1 * (1 + jnp.max(jnp.abs(q))) / jnp.maximum(jnp.max(jnp.abs(v)), jnp.finfo(w.dtype).tiny ** 0.5)
-    step = jnp.where(jnp.any(v != 0), step, 0)  # what drives a motion runs with it; at rest, t is the time at which forces are taken
+    flat, q, v, of = equations.taken_apart(given, root.w)
+    t, (known, at_rest) = given.t, jax.lax.stop_gradient((given, root.w))
+    R, M = equations(known, at_rest), inertia(flat, t, q, v)[0].as_matrix()
+    step = jax.lax.stop_gradient(_a_while(_units(M), jnp.maximum(jnp.abs(q), jnp.abs(given.q)), v))
     later = at_rest.at[: equations.moving.size].add(jax.lax.stop_gradient(step * v)[equations.moving])
-    uniform = is_root(J, equations(known._replace(t=known.t + step, q=known.q + step * known.v), later), at_rest)
+    uniform = is_nothing(equations(known._replace(t=known.t + step, q=known.q + step * known.v), later), root.size)
     in_terms_of_q = lambda q: equations(known._replace(q=q), at_rest.at[: equations.moving.size].set(q[equations.moving]))
     multipliers = of.multipliers
     if flat.rows:  # of dependent rows, those of least norm
         _, G, _ = constraint_rows(flat, t, q, v)
-        multipliers = least_change(G.T, G.T @ multipliers, 1.0)
+        metric = lx.DiagonalLinearOperator(jax.lax.stop_gradient(unit_lengths(M, G)) ** -2)
+        multipliers = saddle_point(metric, G, -(G.T @ multipliers), jnp.zeros_like(multipliers)).multipliers
     friction, holds, slips = _friction(equations, flat, given, q, v, of)
-    succeeded = found & holds
+    succeeded = root.found & holds
     shown = lambda x: jnp.where(succeeded, x, jnp.nan)
     states = jax.tree.map(shown, equations.unravel_states(of.states))
     return Rest(
@@ -212,10 +215,19 @@ def _described(equations: Equations, given: Given, w: Array, found: Array) -> Re
         t,
         succeeded,
         uniform,
-        R / allowed,
+        R / jnp.where(root.size > 0, root.size, 1),
         R[: q.size],
-        Slopes(inertia(flat, t, q, v)[0].as_matrix(), jax.jacfwd(in_terms_of_q)(jax.lax.stop_gradient(q))),
+        Slopes(M, jax.jacfwd(in_terms_of_q)(jax.lax.stop_gradient(q))),
     )
+
+
+def _a_while(units: Array, q: Array, v: Array) -> Array:
+    """A time in which a motion goes some part of its way, in units of mass; of one that starts at zero, a part of what these make one.
+
+    What drives a motion runs with it; at rest, t is the time at which forces are taken.
+    """
+    far, fast = (jnp.max(jnp.abs(x) / jnp.where(units > 0, units, jnp.inf)) for x in (q, v))
+    return jnp.where(fast > 0, 0.1 * jnp.where(far > 0, far, 1) / jnp.where(fast > 0, fast, 1), 0)
 
 
 def _friction(

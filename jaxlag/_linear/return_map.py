@@ -17,7 +17,7 @@ from .._motion.simulate import simulate
 from .._motion.step_size import SHARE
 from .._program.jit import compiled
 from .eigenvalues import eigen
-from .newton import differentiable_root, is_root, least_change
+from .newton import differentiable_root, is_nothing, least_change
 
 ITERATIONS = 30
 SECTION = "the section"  # among the events of the system
@@ -89,8 +89,9 @@ def orbit_near(system: System, setting: Setting, given: Given) -> Orbit:
     def residual(frame, w):
         return returned(frame, w, frame.given.t)[0][of] - w
 
-    near = _newton(lambda w: residual(jax.lax.stop_gradient(frame), w), frame.first[of], given.tolerances[0], _scales(frame)[of])
-    w = differentiable_root(residual, frame, near)
+    scales = jax.lax.stop_gradient(_scales(frame)[of])
+    near = _newton(lambda w: residual(jax.lax.stop_gradient(frame), w), frame.first[of], given.tolerances[0], scales)
+    w = differentiable_root(residual, frame, near, scales)
 
     def at(t):
         """The return from a start at another time, and its slope."""
@@ -105,7 +106,7 @@ def orbit_near(system: System, setting: Setting, given: Given) -> Orbit:
     later = given.t + (1 if is_forced else LATER) * frame.usual
     ends, times, slopes = jax.lax.map(at, jnp.stack([given.t, later]))
     left = ends[:, of] - w[None]
-    finds = lambda left: is_root(slopes[0] - jnp.eye(w.size), left, w)
+    finds = lambda left: is_nothing(left, jnp.abs(slopes[0] - jnp.eye(w.size)) @ jnp.maximum(jnp.abs(w), scales))
     values, here = eigen(slopes[0]).values[::-1], frame.first.at[of].set(w)
     checks = jnp.all(jnp.isfinite(frame.first)), finds(left[0]), finds(left[1])
     return Orbit(unravel(here), times[0], unravel(ends[0] - here), values, *jax.lax.stop_gradient((*checks, left[0])))

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
@@ -9,7 +10,7 @@ from jaxtyping import Array, Float, Int
 
 from .._program.block_tridiagonal_lu import Factors, factorised, positive_eigenvalues, solution
 from .._program.sparse_matrix import SparseMatrix, row_sums
-from .descent import STEPS
+from .descent import STEPS, far_down
 
 FIRST = 1e-6  # of the largest row of the curvature: the least that is added to it
 PROBES = 3  # vectors at random, on which factors are tried
@@ -17,8 +18,8 @@ SAFETY = 10  # times what factors are seen to be wrong by
 WEAKER = 16  # by which what is added shrinks from step to step, where it may
 
 
-def sparse_minimum_near(V: Callable, slope_and_curvature: Callable, q: Float[Array, " n"]) -> Float[Array, " n"]:
-    """A minimum of V, good to some digits; `slope_and_curvature(q)` is −∂V/∂q and −∂²V/∂q².
+def sparse_minimum_near(V: Callable, slope_and_curvature: Callable, q: Float[Array, " n"], units: Float[Array, " n"]) -> Float[Array, " n"]:
+    """A minimum of V, good to some digits; `slope_and_curvature(q)` is −∂V/∂q and −∂²V/∂q². All is measured in `units`.
 
     Newton's step with so much added to the curvature that it is positive; from a saddle or a maximum along what falls there. A step is
     halved until V is lower. A chain of 1000 springs of k = 1e5, started unstretched as an arc, takes 10 steps.
@@ -29,22 +30,28 @@ def sparse_minimum_near(V: Callable, slope_and_curvature: Callable, q: Float[Arr
     anywhere = jnp.asarray(np.random.default_rng(0).normal(size=q.size), q.dtype)
 
     def turn(carry):
-        q, added, _, i = carry
-        slope, K = slope_and_curvature(q)
-        largest, reach = jnp.max(row_sums(K)), 1 + jnp.max(jnp.abs(q))
+        x, added, _, i = carry
+        slope, K = slope_and_curvature(units * x)
+        slope, K = units * slope, SparseMatrix(K.values * units[K.places.rows] * units[K.places.columns], K.places)
+        largest = jnp.max(row_sums(K))
         added, factors = _made_definite(K, jnp.where(added > FIRST * largest, added / WEAKER, 0))
         step = -solution(K.places, factors, slope)
-        flat, falls = jnp.max(jnp.abs(step)) <= eps**0.5 * reach, added > 0
+        longest = jnp.max(jnp.abs(step))
+        reach = jnp.max(jnp.maximum(jnp.abs(x), jnp.abs(q / units)))
+        reach = jnp.where(reach > 0, reach, longest)
+        flat, falls = longest <= eps**0.5 * reach, added > 0
         downhill = solution(K.places, factors, anywhere)
-        step = jnp.where(flat & falls, 0.1 * reach * downhill / jnp.max(jnp.abs(downhill)), step)
-        step = step / jnp.maximum(1, jnp.max(jnp.abs(step)) / (0.5 * reach))
-        is_lower = lambda part: V(q + part * step) < V(q)
+        downhill = downhill / jnp.max(jnp.abs(downhill))
+        step = jnp.where(flat & falls, downhill * far_down(lambda h: V(units * (x + h * downhill)), 0.1 * reach), step)
+        longest = jnp.max(jnp.abs(step))
+        step = step * jnp.where((reach > 0) & (longest > 0.5 * reach), 0.5 * reach / jnp.where(longest > 0, longest, 1), 1)
+        is_lower = lambda part: V(units * (x + part * step)) < V(units * x)
         part = lax.while_loop(lambda part: (part > eps) & ~is_lower(part), lambda part: part / 2, jnp.ones((), q.dtype))
         lower = is_lower(part)
-        return jnp.where(lower, q + part * step, q), added, lower & ~(flat & ~falls), i + 1
+        return jnp.where(lower, x + part * step, x), added, lower & ~(flat & ~falls), i + 1
 
-    start = q, jnp.zeros((), q.dtype), jnp.array(True), jnp.array(0)
-    return lax.while_loop(lambda carry: carry[2] & (carry[3] < STEPS), turn, start)[0]
+    start = q / units, jnp.zeros((), q.dtype), jnp.array(True), jnp.array(0)
+    return units * lax.while_loop(lambda carry: carry[2] & (carry[3] < STEPS), turn, start)[0]
 
 
 def _made_definite(K: SparseMatrix, added: Array) -> tuple[Array, Factors]:
@@ -69,15 +76,17 @@ def eigenvalues_below(J: SparseMatrix, scale: Float[Array, " n"], bound: Array) 
     """
     n, places = scale.size, J.places
     of_q = np.arange(J.shape[0]) < n
-    largest = lambda which: jnp.max(jnp.abs(J.values) * which, initial=0.0)
-    G = largest(of_q[places.columns] & ~of_q[places.rows])
-    units = lax.rsqrt(scale), jnp.full(J.shape[0] - n, largest(of_q[places.columns] & of_q[places.rows]) / jnp.where(G > 0, G, 1))
-    unit = jnp.concatenate(units)  # those of multipliers such that pivots are alike
-    A = SparseMatrix(J.values * unit[places.rows] * unit[places.columns], places).plus_diagonal(jnp.where(of_q, bound, 0))
+    unit = jnp.append(lax.rsqrt(scale), jnp.ones(J.shape[0] - n, scale.dtype))
+    values, within = J.values * unit[places.rows] * unit[places.columns], of_q[places.columns] & of_q[places.rows]
+    stiffest = jnp.max(jnp.where(within, jnp.abs(values), 0), initial=0.0)
+    stiffest = jnp.where(stiffest > 0, stiffest, 1)  # in these units no number is far from one, as those are not that stand beside blocks
+    row = jax.ops.segment_max(jnp.abs(values), places.rows, J.shape[0], indices_are_sorted=True)
+    unit = jnp.where(of_q | (row <= 0), lax.rsqrt(stiffest), jnp.sqrt(stiffest) / jnp.where(row > 0, row, 1))
+    A = SparseMatrix(values * unit[places.rows] * unit[places.columns], places).plus_diagonal(jnp.where(of_q, bound / stiffest, 0))
     factors = factorised(A)
     count, sound = positive_eigenvalues(A, factors)
     error = jnp.zeros((), scale.dtype)
     for signs in np.random.default_rng(0).choice([-1.0, 1.0], (PROBES, J.shape[0])):
         x = jnp.asarray(signs, scale.dtype)
         error = jnp.maximum(error, jnp.max(jnp.abs(A @ (solution(places, factors, A @ x) - x))))
-    return count - (J.shape[0] - n), jnp.where(sound, SAFETY * error, jnp.inf)
+    return count - (J.shape[0] - n), jnp.where(sound, SAFETY * error * stiffest, jnp.inf)

@@ -12,6 +12,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float, PyTree
 
+from .._mechanics.augmented_inertia import units_alike
 from .._mechanics.friction_elements import find_elements
 from .._mechanics.lagrange import imbalance, inertia, position_rows
 from .._mechanics.saddle_point import saddle_point
@@ -26,7 +27,7 @@ from .._program.sparse_newton import newton_factors, refined
 from .newton import Root
 from .rest import Curvature, Equations, Given, Rest, Search
 from .sparse_descent import eigenvalues_below, sparse_minimum_near
-from .sparse_root import SparseEquations, sparse_root_near
+from .sparse_root import SparseEquations, sparse_root_near, sparse_units_beside
 
 MOST_DENSE = 400  # unknowns that are searched for with all zeros where the structure finds nothing: less than a minute
 
@@ -64,15 +65,18 @@ def _searched(equations: SparseEquations, given: Given, flat: Flat, start: Array
     """
     V = lambda q: -flat.lagrangian(given.t, q, given.v)
     of_V = lambda q: (equations.residual(given, q), equations.jacobian(given, q))
+    masses = units_alike(inertia(flat, given.t, given.q, given.v)[0], [])
+    units = jnp.zeros_like(start).at[: masses.size].set(masses)
     if not can_descend:
-        return sparse_root_near(equations, given, _with_multipliers(equations, given, start))
+        return sparse_root_near(equations, given, _with_multipliers(equations, given, start), units)
+    within = sparse_units_beside(equations.jacobian(given, start), units)
 
     def turn(carry):
         _, attempts = carry
-        guess = lax.cond(attempts == 0, lambda: start, lambda: sparse_minimum_near(V, of_V, start))
-        return sparse_root_near(equations, given, guess), attempts + 1
+        guess = lax.cond(attempts == 0, lambda: start, lambda: sparse_minimum_near(V, of_V, start, jnp.where(within > 0, within, 1)))
+        return sparse_root_near(equations, given, guess, units), attempts + 1
 
-    nothing = Root(start, jnp.array(False)), jnp.array(1 if stable else 0)
+    nothing = Root(start, jnp.array(False), jnp.zeros_like(start)), jnp.array(1 if stable else 0)
     return lax.while_loop(lambda carry: ~carry[0].found & (carry[1] < 2), turn, nothing)[0]
 
 
@@ -91,7 +95,6 @@ def _described(of_rest: EquationsOfRest, equations: SparseEquations, given: Give
     flat, q, v, of = of_rest.taken_apart(given, w)
     known, at_rest = lax.stop_gradient((given, w))
     J, R = equations.jacobian(known, at_rest), equations.residual(known, at_rest)
-    allowed = abs(J) @ (1 + jnp.abs(at_rest)) + jnp.finfo(w.dtype).tiny
     shown, multipliers = lambda x: jnp.where(root.found, x, jnp.nan), of.multipliers
     if flat.rows:  # of dependent rows, those of least norm
         _, G = position_rows(flat, given.t, q)
@@ -109,7 +112,7 @@ def _described(of_rest: EquationsOfRest, equations: SparseEquations, given: Give
         given.t,
         root.found,
         jnp.array(True),
-        R / allowed,
+        R / jnp.where(root.size > 0, root.size, 1),
         R[: q.size],
         _curvature(J, M, alone),
     )
@@ -117,15 +120,20 @@ def _described(of_rest: EquationsOfRest, equations: SparseEquations, given: Give
 
 def _curvature(J: SparseMatrix, M: lx.AbstractLinearOperator, alone: Array) -> Curvature:
     """By the inertia of J beside that of M: how many squares of natural frequencies are below zero, and how many within rounding."""
-    n, eps = alone.size, jnp.finfo(J.values.dtype).eps
-    mass = M.diagonal if isinstance(M, lx.DiagonalLinearOperator) else jnp.ones(n, J.values.dtype)
-    mass = jnp.where(jnp.min(mass) > 0, mass, 1)
-    difference = jnp.max(jnp.abs(J.T.values - J.values)) if J.T.places == J.places else jnp.inf
-    largest = jnp.max(row_sums(J)[:n] / mass)
+    n, eps, places = alone.size, jnp.finfo(J.values.dtype).eps, J.places
+    masses = jnp.append(units_alike(M, []), jnp.zeros(J.shape[0] - n, J.values.dtype))
+    units = sparse_units_beside(J, masses)[:n]
+    units = jnp.where(units > 0, units, 1)
+    mass = units**-2
+    within = (places.rows < n) & (places.columns < n)
+    unit = jnp.append(units, jnp.zeros(J.shape[0] - n, J.values.dtype))
+    K = SparseMatrix(jnp.where(within, J.values * unit[places.rows] * unit[places.columns], 0), places)
+    difference = jnp.max(jnp.abs(K.T.values - K.values)) if K.T.places == places else jnp.inf
+    largest = jnp.max(row_sums(K))
     J = J.plus_diagonal(jnp.concatenate([jnp.where(alone, -largest * mass, 0), jnp.zeros(J.shape[0] - n)]).astype(mass.dtype))
     dust = eps**0.625 * largest
     within = jnp.maximum(dust, jnp.nan_to_num(eigenvalues_below(J, mass, dust)[1], nan=jnp.inf))
     (falling, error), (not_rising, error_too) = (eigenvalues_below(J, mass, bound) for bound in (-within, within))
     seen = (within == dust) | (falling > 0) | (not_rising == 0)
-    symmetric = difference <= eps**0.5 * jnp.max(jnp.abs(J.values))
+    symmetric = difference <= eps**0.5 * largest
     return Curvature(falling, not_rising + jnp.sum(alone), seen & (jnp.maximum(error, error_too) <= within), symmetric, alone)

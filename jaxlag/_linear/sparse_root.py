@@ -16,7 +16,7 @@ from .._program.shifted_factors import GROWTH
 from .._program.sparse_jacobian import entries
 from .._program.sparse_matrix import Places, SparseMatrix, colors
 from .._program.sparse_newton import linear_solution, newton_factors, refined, sparse_places
-from .newton import Residual, Root, is_root, newton
+from .newton import Residual, Root, newton, root_of_size
 
 BY_VALUES = 2  # as sparse as is of use: the dense search finds singular values of all by all, at twenty times the cost of factors
 
@@ -67,9 +67,9 @@ class SparseEquations:
         return implicit_root(self.residual, self.change, args, w)
 
 
-def sparse_root_near(equations: SparseEquations, args: Any, guess: Float[Array, " u"]) -> Root:
+def sparse_root_near(equations: SparseEquations, args: Any, guess: Float[Array, " u"], units: Float[Array, " u"]) -> Root:
     """The root that Newton's method finds from a guess; found only where it is the only one near, but for multipliers of rows that depend
-    on each other.
+    on each other. `units` as of `root_near`.
     """
     fixed = jax.lax.stop_gradient(args)
 
@@ -78,9 +78,20 @@ def sparse_root_near(equations: SparseEquations, args: Any, guess: Float[Array, 
         factors = newton_factors(A)
         return lambda w: refined(A.__matmul__, A.places, factors, -equations.oriented(equations.residual(fixed, w)))
 
-    w, _ = newton(changes, jax.lax.stop_gradient(guess))
-    J, R = equations.jacobian(fixed, w), equations.residual(fixed, w)
-    return Root(w, is_root(J, R, w) & is_regular(equations.matrix(J)))
+    w, reach = newton(changes, jax.lax.stop_gradient(guess), sparse_units_beside(equations.jacobian(fixed, guess), units))
+    J = equations.jacobian(fixed, w)
+    root = root_of_size(lambda w: equations.residual(fixed, w), J, w, reach)
+    return root._replace(found=root.found & is_regular(equations.matrix(J)))
+
+
+def sparse_units_beside(J: SparseMatrix, units: Float[Array, " u"]) -> Float[Array, " u"]:
+    """`units_beside` of a sparse matrix: multipliers have theirs from what they hold."""
+    (m, n), rows, columns = J.shape, J.places.rows, J.places.columns
+    size = jnp.abs(J.values)
+    known = jnp.maximum(jax.ops.segment_max(size * units[columns], rows, m, indices_are_sorted=True), 0)[rows]
+    ties = (size > 0) & (known > 0)
+    found = jax.ops.segment_min(jnp.where(ties, known / jnp.where(ties, size, 1), jnp.inf), columns, n)
+    return jnp.where((units > 0) | ~jnp.isfinite(found), units, found)
 
 
 def is_regular(A: SparseMatrix) -> Bool[Array, ""]:

@@ -1,10 +1,16 @@
 """M + GᵀWG, which says the same as M on the null space of G and is positive there and beside; and units that make all inertias alike."""
 
+from collections.abc import Sequence
+from typing import Any
+
 import jax
 import jax.numpy as jnp
+import lineax as lx
 from jaxtyping import Array, Float
 
 from .._program.conditions import everywhere
+from .._program.sparse_matrix import SparseMatrix
+from .structured_inertia import StructuredInertia
 
 
 def augmented(M, G):
@@ -17,6 +23,29 @@ def unit_lengths(M: Float[Array, "n n"], G: Float[Array, "m n"]) -> Float[Array,
     """Units of the coordinates in which each has inertia of order one, whatever units they are given in; of what has no mass, by rows."""
     size = jnp.diagonal(augmented(M, G)[0])
     return jnp.where(size > 0, jax.lax.rsqrt(jnp.where(size > 0, size, 1)), 1)
+
+
+def units_alike(M: lx.AbstractLinearOperator, rows: Sequence[Any]) -> Float[Array, " n"]:
+    """`unit_lengths` of an M and rows of any kind; of many coordinates those of their masses, and 0 where these are not seen."""
+    if isinstance(M, StructuredInertia) and M.sums:
+        return jnp.zeros(M.size, M.slopes.values.dtype)
+    if not isinstance(M, StructuredInertia) and not any(isinstance(G, SparseMatrix) for G in rows):
+        M = M.as_matrix()
+        return unit_lengths(M, jnp.concatenate([jnp.zeros((0, len(M)), M.dtype), *rows]))
+    mass = M.slopes.diagonal if isinstance(M, StructuredInertia) else jnp.diagonal(M.as_matrix())
+    return jnp.where(mass > 0, jax.lax.rsqrt(jnp.where(mass > 0, mass, 1)), 0)
+
+
+def alike(M: lx.AbstractLinearOperator, rows: Sequence[Any], size: Float[Array, " n"]) -> Float[Array, " n"]:
+    """`by_weight` in the units of M and rows."""
+    return by_weight(jax.lax.stop_gradient(units_alike(M, rows)), size)
+
+
+def by_weight(units: Float[Array, " n"], size: Float[Array, " n"]) -> Float[Array, " n"]:
+    """Sizes of the numbers of a state, each at least what weighs as much as the largest of the others: mass tells what is small of a number
+    that is zero.
+    """
+    return jnp.maximum(size, units * jnp.max(jnp.where(units > 0, size / jnp.where(units > 0, units, 1), 0), initial=0.0))
 
 
 def _weights(masses: Float[Array, " n"], squares: Float[Array, "m n"]) -> Float[Array, " m"]:

@@ -19,6 +19,7 @@ from .._program.jit import is_concrete
 from .._program.scalarise import scalarised
 from .._program.sparse_jacobian import MANY
 from .._program.sparse_matrix import SparseMatrix, dense
+from .augmented_inertia import alike
 from .constrained_root import Linear, is_without_curvature, root_of
 from .constraint_residuals import off, off_constraints, terms
 from .contact import in_contact
@@ -133,8 +134,9 @@ def _nearest_position(flat: Flat, moving, t, q0, M, found: bool) -> Float[Array,
     def linear(args, w):
         (t, q0, M), (q, multipliers) = args, unpacked(args[1], w)
         g, G = position_rows(flat, t, q)
-        reach = reach_of(q[moving], off(g, terms(G, q)) > _small(q))
-        metric, G = M, _columns(G, moving)
+        metric, G, sizes = M, _columns(G, moving), abs(G) @ jnp.abs(q) + terms(flat, t, q)
+        is_off = off(g, sizes + abs(G) @ alike(M, [G], jnp.abs(q[moving]))) > _small(q)
+        reach = reach_of(q[moving], is_off)
         if not is_without_curvature(M, G):
             G, straight = dense(G), M.as_matrix()
             curved = straight - jax.hessian(lambda q: multipliers @ flat.holonomic(t, q))(q)[np.ix_(moving, moving)]
@@ -180,8 +182,9 @@ def _nearest_velocity(flat: Flat, moving, t, q, v0, found: bool) -> tuple[Float[
     def linear(args, w):
         t, q, v0 = args
         psi, G, _ = velocity_rows(flat, t, q, v0)
-        reach = reach_of(v0[moving], off(psi, terms(G, v0)) > _small(q))
-        return Linear(_part(inertia(flat, t, q, v0)[0], moving), _columns(G, moving), jnp.zeros_like(v0[moving]), -psi, reach)
+        M, G, sizes = _part(inertia(flat, t, q, v0)[0], moving), _columns(G, moving), abs(G) @ jnp.abs(v0) + jnp.abs(psi - G @ v0)
+        is_off = off(psi, sizes + abs(G) @ alike(M, [G], jnp.abs(v0[moving]))) > _small(q)
+        return Linear(M, G, jnp.zeros_like(v0[moving]), -psi, reach_of(v0[moving], is_off))
 
     def by_one_step(linear, args):
         found = linear(args, like).solution()

@@ -8,8 +8,10 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from .._model.flat import Flat
+from .._program.size_of_terms import size_of_terms
 from .._program.sparse_jacobian import MANY, jacobian
-from .lagrange import rows_of, velocity_residual
+from .augmented_inertia import alike
+from .lagrange import inertia, rows_of, velocity_residual
 from .saddle_point import Rows
 from .singular_directions import not_affine_in
 
@@ -37,15 +39,26 @@ class Residuals(NamedTuple):
         psi = jnp.concatenate([of_g(jnp.ones_like(t), v), a])
         return cls(g, psi, jax.vmap(lambda dq: of_g(still, dq), out_axes=1)(directions), jax.vmap(of_a, out_axes=1)(directions))
 
-    def of_psi(self, size: Callable) -> Float[Array, " m"]:
-        """A size of each row of ψ."""
-        return jnp.concatenate([size(self.of_positions), size(self.of_velocities)])
+    def of_psi(self, x: Callable) -> Float[Array, " m"]:
+        """Something of the rows of ψ."""
+        return jnp.concatenate([x(self.of_positions), x(self.of_velocities)])
 
 
-def off_constraints(flat: Flat, t, q, v) -> Float[Array, ""]:
-    """Largest residual of g and ψ, in the units of its row."""
-    found = Residuals.of(flat, t, q, v)
-    return jnp.maximum(off(found.g, terms(found.of_positions, q)), off(found.psi, found.of_psi(lambda rows: terms(rows, v))))
+def off_constraints(flat: Flat, t, q, v, reach: tuple[Array, Array] | None = None) -> Float[Array, ""]:
+    """Largest residual of g and ψ beside the terms of its row, of coordinates and velocities as large as they are, or in a motion as they
+    `reach`.
+    """
+    found, M = Residuals.of(flat, t, q, v), inertia(flat, t, q, v)[0]
+    G = [rows for rows in (found.of_positions, found.of_velocities) if rows.shape[0]]
+    of_q, of_v = (alike(M, G, size) for size in ((jnp.abs(q), jnp.abs(v)) if reach is None else reach))
+    of_g = abs(found.of_positions) @ of_q + terms(flat, t, q)
+    of_psi = found.of_psi(lambda rows: abs(rows) @ of_v) + jnp.abs(found.psi - found.of_psi(lambda rows: rows @ v))
+    return jnp.maximum(off(found.g, of_g), off(found.psi, of_psi))
+
+
+def terms(flat: Flat, t, q) -> Float[Array, " h"]:
+    """The size of the terms that cancel in g, where q itself may be zero: of y − l (1 − cos φ) some l."""
+    return size_of_terms(lambda q: flat.holonomic(t, q), q)
 
 
 def is_on_constraints(flat: Flat, t, q, v) -> Bool[Array, ""]:
@@ -62,12 +75,7 @@ def is_on_constraints(flat: Flat, t, q, v) -> Bool[Array, ""]:
     return jnp.all(on_positions) & jnp.all(on_velocities) & jnp.all(is_affine) & is_defined
 
 
-def terms(rows: Rows, x: Float[Array, " n"]) -> Float[Array, " m"]:
-    """The size of the terms of each row, of coordinates of at least one: those that it does not touch have no part in it."""
-    return abs(rows) @ (1 + jnp.abs(x))
-
-
 def off(residual: Float[Array, " m"], size: Float[Array, " m"]) -> Float[Array, ""]:
     """Largest residual, beside the size of the terms of its row: rounding makes some eps of it."""
-    each = jnp.abs(residual) / jnp.where(size > 0, size, 1)
+    each = jnp.where(residual == 0, 0, jnp.abs(residual) / size)
     return jnp.where(jnp.any(jnp.isnan(each)), jnp.nan, jnp.max(each, initial=0.0))  # a maximum of thousands leaves NaN out on a CPU

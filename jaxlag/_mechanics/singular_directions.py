@@ -13,13 +13,14 @@ from .._model.system import System
 from .._model.validation import at_state, coordinates
 from .._program.jit import is_concrete
 from .._program.walker import used_arguments
-from .augmented_inertia import unit_lengths
+from .augmented_inertia import unit_lengths, units_alike
 from .lagrange import constraint_rows, inertia
 from .massless import first_order, with_masses
 from .pseudo_inverse import CLEAR
 from .saddle_point import NO_INERTIA
 from .self_consistent import NOT_CONSISTENT
 
+LOOKS, BESIDE, FROM_REST = 7, 3, 12  # at a constraint, in so many decades beside the velocities that there are, or that have inertia 1
 UNDEFINED = (
     "the functions of the system must return finite numbers, but one returns a NaN or an infinity there. Look for what is undefined, such "
     "as the root of a negative number or 0/0, for missing values, and for a motion that grows without bounds."
@@ -106,14 +107,21 @@ def _matrices(flat: Flat, t, q, v):
 
 
 def not_affine_in(flat: Flat, t, q, v) -> Bool[Array, " n"]:
-    """In which velocities a nonholonomic constraint is not affine: ∂a/∂q̇ must be the same at two of them.
+    """In which velocities a nonholonomic constraint is not affine: ∂a/∂q̇ must be the same at all of them.
 
-    Costs nothing where the program of ∂a/∂q̇ does not use q̇, as where a is written in sums and products.
+    It is looked at where velocities are of the size that they have, smaller and larger; of what rests, in many decades. Costs nothing
+    where the program of ∂a/∂q̇ does not use q̇, as where a is written in sums and products.
     """
     slope = jax.jacfwd(flat.nonholonomic, argnums=2)
     t, q, v = jax.lax.stop_gradient((t, q, v))
     if flat.nonholonomic(t, q, v).size == 0 or not used_arguments(slope, t, q, v)[2]:
         return jnp.zeros(v.size, bool)
-    here, there = slope(t, q, v), slope(t, q, v + (1 + jnp.abs(v)) * (1 + np.arange(v.size, dtype=v.dtype) / v.size))
-    uneven = jnp.abs(here - there) > jnp.finfo(v.dtype).eps ** 0.5 * jnp.max(jnp.abs(here) + jnp.abs(there))
-    return jnp.any(uneven, axis=0)
+    units = units_alike(inertia(flat, t, q, v)[0], [slope(t, q, v)])
+    fastest = jnp.max(jnp.abs(v) / jnp.where(units > 0, units, jnp.inf))
+    sizes = jnp.where(fastest > 0, fastest, 1) * 10.0 ** (jnp.where(fastest > 0, BESIDE, FROM_REST) * np.linspace(-1, 1, LOOKS))
+    units = jnp.where(units > 0, units, 1)
+    aside = units * (1 + np.arange(v.size, dtype=v.dtype) / v.size)
+    in_units = lambda v: units[None] * slope(t, q, v)
+    here, there = in_units(v)[None], jax.vmap(lambda size: in_units(v + size * aside))(sizes.astype(v.dtype))
+    largest = jnp.max(jnp.abs(here) + jnp.abs(there), axis=2, keepdims=True)
+    return jnp.any(jnp.abs(here - there) > jnp.finfo(v.dtype).eps ** 0.5 * largest, axis=(0, 1))

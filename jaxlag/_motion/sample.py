@@ -72,8 +72,8 @@ def sample_at(equations: EquationsOfMotion, t, y, params, scales: Scales) -> tup
         excess = jnp.where((held > 0) | idle(flat, elements, sigma, found.bound), 0, -found.margin)
         violation = Violation(jnp.concatenate([excess, -found.bound]), jnp.concatenate([scale, jnp.abs(found.bound)]))
         counts = {"transitions": parts.transitions[0], "time_stuck": parts.time_stuck}
-    of_mode = undifferentiated(scalarised(lambda t, q, v: off_constraints(mode, t, q, v)))
-    off = of_mode(t, q, v) if equations.projection else jnp.zeros_like(t)
+    of_mode = undifferentiated(scalarised(lambda t, q, v, *reach: off_constraints(mode, t, q, v, reach)))
+    off = of_mode(t, q, v, scales.of_q, scales.of_v) if equations.projection else jnp.zeros_like(t)
     named = dict(zip(equations.works, works, strict=True)) if equations.works else None
     if equations.contacts:
         violation = violation.beside(*_contact_violation(flat, t, parts, multipliers, scales))

@@ -93,6 +93,11 @@ class SparseMatrix(eqx.Module):
     def __abs__(self) -> "SparseMatrix":
         return SparseMatrix(jnp.abs(self.values), self.places)
 
+    @property
+    def diagonal(self) -> Float[Array, " m"]:
+        """The numbers on the diagonal."""
+        return summed_by(self.places, jnp.where(self.places.rows == self.places.columns, self.values, 0))
+
     def plus_diagonal(self, x: Float[Array, " n"]) -> "SparseMatrix":
         """With x added on the diagonal, all of which must be among the places."""
         return SparseMatrix(self.values.at[np.flatnonzero(self.places.rows == self.places.columns)].add(x), self.places)

@@ -1,0 +1,97 @@
+"""What is said of rest does not change with units: what falls, what accelerates, what does not stay as it is, which kind it is."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxlag as jl
+
+GRAVITY = 9.81
+UNITS = [([1.0, 1.0], 1.0, 1.0), ([1e9, 1e-9], 1e-9, 1e6), ([1e-9, 1e9], 1e9, 1e-6), ([1e-9, 1e-9], 1.0, 1.0)]
+in_units = pytest.mark.parametrize("length, energy, time", UNITS)
+
+
+def stated(L, g=None):
+    """A system whose coordinates, energy and time have units of their own."""
+    holonomic = None if g is None else lambda q, s: g(q / s)
+    return jl.System(lambda q, qdot, s, E, tau: E * L(q / s, qdot * tau / s), holonomic=holonomic)
+
+
+def params_of(length, energy, time):
+    return {"s": jnp.asarray(length), "E": energy, "tau": time}
+
+
+ROD = stated(lambda q, v: 0.5 * v @ v - GRAVITY * q[1], lambda q: q @ q - 1.0)
+WELLS = stated(lambda q, v: 0.5 * v @ v - 0.25 * q[0] ** 4 + 0.5 * q[0] ** 2 - 1.5 * (q[0] - q[1]) ** 2)
+HOOP = stated(lambda q, v: 0.5 * (v[0] ** 2 + (jnp.sin(q[0]) * v[1]) ** 2) + GRAVITY * jnp.cos(q[0]))
+
+
+@in_units
+@pytest.mark.parametrize("start", [(0.6, 0.8), (0.0, 1.0)])
+def test_a_pendulum_falls(start, length, energy, time):
+    """Also from its upper position of rest: hanging, with ω² = g/l."""
+    s = np.array(length)
+    found = jl.equilibrium(ROD, s * np.array(start), params_of(length, energy, time), stable=True)
+    np.testing.assert_allclose(found.q / s, [0, -1], atol=1e-12)
+    assert found.stability == "stable"
+    np.testing.assert_allclose(np.asarray(found.stiffness) * time**2, [GRAVITY], rtol=1e-9)
+
+
+@in_units
+def test_a_fall_from_the_origin(length, energy, time):
+    """From the saddle at zero, where no coordinate tells its unit, to x = ±1 with ω² of [[5, −3], [−3, 3]]."""
+    s = np.array(length)
+    found = jl.equilibrium(WELLS, np.zeros(2), params_of(length, energy, time), stable=True)
+    np.testing.assert_allclose(np.abs(found.q / s), [1, 1], rtol=1e-9)
+    np.testing.assert_allclose(np.asarray(found.stiffness) * time**2, [4 - np.sqrt(10), 4 + np.sqrt(10)], rtol=1e-8)
+
+
+@in_units
+def test_what_accelerates_is_not_steady(length, energy, time):
+    s, params = np.array(length), params_of(length, energy, time)
+    beside = np.array([1e-3, -np.sqrt(1 - 1e-6)])
+    with pytest.raises(ValueError, match=r"'q\[0\]' accelerates"):
+        jl.linearise(ROD, s * beside, params=params)
+    with pytest.raises(ValueError, match="must satisfy the constraints"):
+        jl.linearise(ROD, s * np.array([0, -1 - 1e-6]), params=params)
+    hanging = jl.linearise(ROD, s * np.array([0, -1.0]), params=params)
+    np.testing.assert_allclose(np.asarray(hanging.modes().angular_frequency) * time, [np.sqrt(GRAVITY)], rtol=1e-9)
+
+
+@pytest.mark.parametrize("length", [1.0, 1e-9, 1e9])
+def test_constants_are_terms(length):
+    """Coordinates that are zero at rest: a bob hangs 0.1 + 0.2 below, which is 0.3 but for rounding."""
+    rod = jl.System(lambda q, qdot, s: 0.5 * qdot @ qdot / s**2 - GRAVITY * q[1] / s, holonomic=_rod_from_rest)
+    found = jl.linearise(rod, np.zeros(2), params={"s": length})
+    np.testing.assert_allclose(found.modes().angular_frequency, [np.sqrt(GRAVITY / 0.3)], rtol=1e-9)
+
+
+def _rod_from_rest(q, s):
+    x, y = q / s
+    return x**2 + (y - 0.1 - 0.2) ** 2 - 0.3**2
+
+
+@in_units
+def test_what_does_not_stay_as_it_is(length, energy, time):
+    """A bead that runs along its hoop meets gravity; one that runs round with it is steady at cos θ = g/ω²."""
+    s, params = np.array(length), params_of(length, energy, time)
+    with pytest.raises(ValueError, match="does not stay as it is"):
+        jl.steady(HOOP, s * np.array([1.0, 0.0]), s / time * np.array([0.2, 0.0]), params)
+    found = jl.steady(HOOP, s * np.array([1.0, 0.0]), s / time * np.array([0.0, 5.0]), params, fixed_rates=["q[1]"])
+    np.testing.assert_allclose(found.q[0] / s[0], np.arccos(GRAVITY / 25), rtol=1e-9)
+
+
+N = 70
+CHAIN = stated(lambda q, v: 0.5 * v @ v - 2 * jnp.sum(jnp.diff(q, prepend=0.0, append=0.0) ** 2) + 0.1 * jnp.sum(q))
+SAG = 0.0125 * np.arange(1, N + 1) * np.arange(N, 0, -1)  # of −4 (q_{i−1} − 2 q_i + q_{i+1}) = 0.1
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("length", [1.0, 1e-9, 10.0 ** (9 * (-1.0) ** np.arange(N))])
+@pytest.mark.parametrize("energy, time", [(1.0, 1.0), (1e-9, 1e6), (1e9, 1e-6)])
+def test_many_at_rest(length, energy, time):
+    s = np.broadcast_to(length, (N,))
+    params = params_of(s, energy, time)
+    found = jl.equilibrium(CHAIN, np.zeros(N), params)
+    np.testing.assert_allclose(found.q / s, SAG, rtol=1e-9)
+    assert found.stability == "stable"
