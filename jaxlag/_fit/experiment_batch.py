@@ -12,8 +12,10 @@ from jax.flatten_util import ravel_pytree
 from jax.sharding import Mesh, NamedSharding
 from jaxtyping import Array, Float, PyTree
 
+from .._mechanics.augmented_inertia import unit_lengths
 from .._mechanics.consistent_state import consistent_state
-from .._mechanics.lagrange import constraint_rows, position_residual
+from .._mechanics.lagrange import constraint_rows, inertia, position_residual
+from .._mechanics.singular_directions import tangent_basis
 from .._model.paths import is_within
 from .._model.system import System
 from .._model.validation import at_state
@@ -134,17 +136,18 @@ def _tangent_basis(system, params, e):
     if system.constraints and any(free):
         params = with_own(params, e.params)
         q, qdot = consistent_state(system, e.q0, e.qdot0, params, t=e.ts[0])
-        for k, jacobian in enumerate(at_state(_constraint_jacobians, system, q, qdot, params, e.ts[0])):
+        *jacobians, units = map(np.asarray, at_state(_constraint_jacobians, system, q, qdot, params, e.ts[0]))
+        for k, jacobian in enumerate(jacobians):
             columns = np.array(free[k], int) - k * n
-            _, s, Vt = np.linalg.svd(np.asarray(jacobian)[:, columns])
-            rank = int(np.sum(s > 1e-9 * s[:1]))
-            blocks[k] = blocks[k] @ Vt[rank:].T
+            allowed = units[columns, None] * tangent_basis(jacobian[:, columns] * units[columns], float(np.finfo(units.dtype).eps))
+            blocks[k] = blocks[k] @ (allowed / np.linalg.norm(allowed, axis=0))
     return np.hstack(blocks).astype(jax.tree.leaves(e.q0)[0].dtype)
 
 
 def _constraint_jacobians(flat, t, q, v):
-    """Of the constraints on positions, and of all constraints on velocities."""
-    return position_residual(flat, t, q)[1], constraint_rows(flat, t, q, v)[1]
+    """Of the constraints on positions, and of all constraints on velocities; and units of coordinates in which they weigh alike."""
+    G = constraint_rows(flat, t, q, v)[1]
+    return position_residual(flat, t, q)[1], G, unit_lengths(inertia(flat, t, q, v)[0].as_matrix(), G)
 
 
 def map_batch(of_one: Callable[..., Any], batch: ExperimentBatch, z: Any, *common: Any) -> Any:

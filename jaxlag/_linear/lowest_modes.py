@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Complex, PyTree
 
+from .._mechanics.augmented_inertia import by_weight
 from .._model.flat import bind
 from .._model.numbers import count as whole
 from .._model.numbers import number
@@ -93,8 +94,9 @@ def _at_rest(system: System, known: tuple, names: tuple[str, ...]) -> tuple[np.n
     f = -np.asarray(loose.pencil.left, float)[:, None]
     multipliers = loose.shared(loose.nearest(f[:n], 0 * f[n:])[n:, 0]).astype(dtype)
     matrices = of(multipliers) if len(multipliers) else loose
-    left, flat = np.asarray(matrices.pencil.left), np.concatenate([*(np.ravel(x) for x in jax.tree.leaves(known[1])), multipliers])
-    allowed = np.finfo(dtype).eps ** STILL * (abs(matrices.K) @ (1 + np.abs(flat)))
+    left, flat = np.asarray(matrices.pencil.left), np.concatenate([np.ravel(x) for x in jax.tree.leaves(known[1])])
+    size = np.concatenate([np.asarray(by_weight(jnp.asarray(matrices.units), jnp.abs(flat))), np.abs(multipliers)])
+    allowed = np.finfo(dtype).eps ** STILL * (abs(matrices.K) @ size + np.asarray(matrices.pencil.terms))
     if np.any(np.abs(left) > allowed):
         i = int(np.argmax(np.abs(left) / np.where(allowed > 0, allowed, np.finfo(dtype).tiny)))
         what = f"{names[i]!r} is pushed by {-left[i]:.4g}" if i < n else "is off its constraints"

@@ -20,6 +20,7 @@ from .._model.validation import checked
 from .._program.array_dependence import dependence
 from .._program.expressions import TooLong
 from .._program.jit import compiled
+from .._program.size_of_terms import size_of_terms
 from .._program.sparse_jacobian import entries
 from .._program.sparse_matrix import Places, SparseMatrix, colors
 
@@ -27,12 +28,13 @@ CURE = "Take `linearise(…).modes()`."
 
 
 class Pencil(NamedTuple):
-    """Of (x, μ): [K −Gᵀ; −G 0], C and M, the places of which are the same; and −f − Gᵀλ and −g."""
+    """Of (x, μ): [K −Gᵀ; −G 0], C and M, the places of which are the same; −f − Gᵀλ and −g, and the size of the terms that cancel there."""
 
     stiffness: SparseMatrix
     damping: SparseMatrix
     mass: SparseMatrix
     left: Float[Array, " w"]
+    terms: Float[Array, " w"]
 
 
 def _deviation(flat: Flat, t: Any, q: Array, multipliers: Array, along: Array, rate: Array, second_rate: Array) -> Float[Array, " w"]:
@@ -62,7 +64,8 @@ def pencil(system: System, t: Any, q: PyTree, params: PyTree, multipliers: Array
         at = lambda w: of(*(w if i == j else nothing for j in range(3)))
         return SparseMatrix(entries(jax.linearize(at, nothing)[1], color, pattern, nothing).values, places)
 
-    return Pencil(slope(0), slope(1), slope(2), of(nothing, nothing, nothing))
+    terms = size_of_terms(lambda w: of(w, nothing, nothing), nothing)
+    return Pencil(slope(0), slope(1), slope(2), of(nothing, nothing, nothing), terms)
 
 
 def _pattern(function: Callable, w: Array) -> scipy.sparse.csr_matrix:

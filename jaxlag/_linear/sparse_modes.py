@@ -58,9 +58,14 @@ class Matrices(NamedTuple):
     @property
     def rounding(self) -> float:
         """That of squares of natural frequencies, by the largest of them."""
+        units = scipy.sparse.diags(self.units)
+        return 10 * float(np.finfo(self.pencil.left.dtype).eps) * float(abs(units @ self.K[: self.n, : self.n] @ units).sum(axis=1).max())
+
+    @property
+    def units(self) -> np.ndarray:
+        """Of the coordinates, such that the mass of each is 1; 0 of those that have none."""
         masses = self.M.diagonal()[: self.n]
-        largest = np.max(np.asarray(abs(self.K[: self.n, : self.n]).sum(axis=1)).ravel()[masses > 0] / masses[masses > 0], initial=0.0)
-        return 10 * float(np.finfo(self.pencil.left.dtype).eps) * float(largest)
+        return np.where(masses > 0, 1 / np.sqrt(np.where(masses > 0, masses, 1)), 0)
 
     def at(self, value: complex) -> scipy.sparse.csc_matrix:
         """[P(λ) −Gᵀ; −G 0]."""

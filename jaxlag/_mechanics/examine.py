@@ -15,7 +15,7 @@ from .._model.system import System
 from .._model.validation import at_state, checked, coordinates, state
 from .._program.scalarise import scalarised
 from . import findings
-from .augmented_inertia import augmented, unit_lengths
+from .augmented_inertia import augmented, by_weight, unit_lengths
 from .constrained_acceleration import constrained_acceleration, other_multipliers
 from .contact import in_contact, in_current_mode
 from .couplings import MATRICES, NOT_READ, couplings, uses_all_numbers
@@ -175,7 +175,8 @@ def _measure(flat: Flat, t, q, v):
     units = unit_lengths(M, G)
     beside = jnp.linspace(-0.1, 0.1, q.size, dtype=q.dtype)
     around = jnp.stack([jnp.zeros_like(beside), beside, -beside[::-1]])
-    aside = lambda x, near: x + near * jnp.where(x == 0, 1, jnp.abs(x))
+    unless_zero = lambda x, other: jnp.where(x == 0, other, x)
+    aside = lambda x, near: x + near * unless_zero(jnp.abs(x), unless_zero(by_weight(units, jnp.abs(x)), units))
     multipliers, defects = jax.vmap(lambda near: _defects(mode, t, aside(q, near), aside(v, near)))(around)
     multipliers = multipliers[0]
 

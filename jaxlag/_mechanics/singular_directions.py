@@ -53,7 +53,7 @@ def tangent_basis(G: np.ndarray, eps: float, least: float | None = None) -> np.n
     if not G.shape[0]:
         return np.eye(G.shape[1])
     _, s, Vt = np.linalg.svd(G / np.where(size > 0, size, 1))
-    return Vt[int(np.sum(s > (eps**CLEAR if least is None else least) * max(s[0], eps))) :].T
+    return Vt[int(np.sum(s > (eps**CLEAR if least is None else least) * np.max(s, initial=eps))) :].T
 
 
 def massless_coordinates(M: np.ndarray, G: np.ndarray, units: np.ndarray) -> list[int]:

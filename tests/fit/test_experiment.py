@@ -10,6 +10,7 @@ import oscillator as osc
 import pytest
 
 import jaxlag as jl
+from jaxlag._fit.experiment_batch import _tangent_basis
 
 T = np.linspace(0.0, 1.0, 5)
 X = np.cos(T)
@@ -214,3 +215,16 @@ def test_params_that_are_no_mapping_are_named_by_their_fields(kind):
 def test_masked_samples_are_missing():
     masked = np.ma.masked_array(X, [0, 0, 1, 0, 0])
     np.testing.assert_array_equal(experiment(values=masked).values, np.where(np.arange(5) == 2, np.nan, X))
+
+
+def test_directions_of_an_unknown_start_in_any_units():
+    """On a sphere and in a plane, rows and coordinates of which are in units 18 decades apart: one position and one velocity move."""
+    s = np.array([1e9, 1e-9, 1.0])
+    rows = {"sphere": lambda q, s: 1e9 * ((q / s) @ (q / s) - 1), "plane": lambda q, s: 1e-9 * (q / s)[2]}
+    system = jl.System(lambda q, qdot, s: 0.5 * (qdot / s) @ (qdot / s), holonomic=rows)
+    start = dict(q0=s * np.array([0.6, 0.8, 0.0]), qdot0=s * np.array([-0.8, 0.6, 0.0]), unknown=("q0", "qdot0"))
+    e = jl.Experiment(np.linspace(0, 1, 5), {"x": np.zeros(5)}, observe=lambda q: {"x": q[0]}, **start)
+    basis = _tangent_basis(system, {"s": s}, e) / np.tile(s, 2)[:, None]
+    position, velocity = (basis / np.linalg.norm(basis, axis=0)).T
+    np.testing.assert_allclose(np.abs(position), [0.8, 0.6, 0, 0, 0, 0], atol=1e-9)
+    np.testing.assert_allclose(np.abs(velocity), [0, 0, 0, 0.8, 0.6, 0], atol=1e-9)

@@ -95,3 +95,16 @@ def test_many_at_rest(length, energy, time):
     found = jl.equilibrium(CHAIN, np.zeros(N), params)
     np.testing.assert_allclose(found.q / s, SAG, rtol=1e-9)
     assert found.stability == "stable"
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("length", [1.0, 1e-9, 10.0 ** (9 * (-1.0) ** np.arange(N))])
+@pytest.mark.parametrize("energy, time", [(1.0, 1.0), (1e-9, 1e6), (1e9, 1e-6)])
+def test_the_lowest_of_many_modes(length, energy, time):
+    """4 sin(k π/142), where the chain is at rest; refused where it is a tenth part off."""
+    s = np.broadcast_to(length, (N,))
+    params = params_of(s, energy, time)
+    modes = jl.lowest_modes(CHAIN, s * SAG, params, count=3)
+    np.testing.assert_allclose(np.asarray(modes.angular_frequency) * time, 4 * np.sin(np.arange(1, 4) * np.pi / (2 * N + 2)), rtol=1e-6)
+    with pytest.raises(ValueError, match="must be at rest"):
+        jl.lowest_modes(CHAIN, 1.1 * s * SAG, params, count=3)
