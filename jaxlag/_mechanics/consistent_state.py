@@ -21,7 +21,7 @@ from .._program.sparse_jacobian import MANY
 from .._program.sparse_matrix import SparseMatrix, dense
 from .augmented_inertia import alike
 from .constrained_root import Linear, is_without_curvature, root_of
-from .constraint_residuals import off, off_constraints, terms
+from .constraint_residuals import is_reached, off, terms
 from .contact import in_contact
 from .friction_elements import find_elements, with_all_masses
 from .lagrange import inertia, position_rows, velocity_residual, velocity_rows
@@ -32,7 +32,8 @@ from .singular_directions import NOT_AFFINE, UNDEFINED, explained, not_affine_in
 from .stick_slip import first_mode, in_mode
 from .structured_inertia import StructuredInertia
 
-FEW, ITERATIONS = 4, 16  # near the constraints four suffice
+FEW, ITERATIONS = 4, 32  # near the constraints four suffice
+LAST = 3  # changes with which one is compared
 WITHOUT_CURVATURE = 200  # of a step that leaves it out: each takes away a part, the more the nearer the start is
 
 
@@ -79,7 +80,7 @@ def nearest_state(flat: Flat, t, q0, v0, free: Sequence[int] | None = None, *, f
 
     @undifferentiated
     def judged(t, q0, v0, q, v, M, given):
-        reached = (off_constraints(flat, t, q, v) < _small(q)) & jnp.all(jnp.isfinite(q))
+        reached = is_reached(flat, t, (q0, v0), q, v) & jnp.all(jnp.isfinite(q))
         return reached, ~jnp.any(not_affine_in(flat, t, q0, v0)), jnp.all(jnp.isfinite(given)) & _is_finite(M)
 
     reached, affine, defined = judged(t, q0, v0, q, v, M, given)
@@ -150,15 +151,19 @@ def _nearest_position(flat: Flat, moving, t, q0, M, found: bool) -> Float[Array,
 
         def newton(carry):
             w, before, _, i = carry
-            found = linear(args, w).solution()
+            step = linear(args, w)
+            found = step.solution()
             change = jnp.abs(found.x)  # of each coordinate in its own unit, until rounding makes it
-            moves = jnp.any((change > 4 * eps * jnp.abs(w[:free])) & ((change < before) | (i < FEW)))
-            return jnp.concatenate([w[:free] + found.x, found.multipliers]), change, moves, i + 1
+            # Rows that depend on each other on the constraints alone hold more directions off them: one or two ever smaller steps
+            # onto the constraints are followed by a larger one along them, which leads off them again.
+            is_off = jnp.any(jnp.isinf(step.reach))
+            moves = jnp.any((change > 4 * eps * jnp.abs(w[:free])) & ((change < jnp.max(before, axis=0)) | (i < FEW) | is_off))
+            return jnp.concatenate([w[:free] + found.x, found.multipliers]), jnp.stack([*before[1:], change]), moves, i + 1
 
-        step = jax.eval_shape(linear, args, start)
-        most = WITHOUT_CURVATURE if is_without_curvature(step.M, step.G) else ITERATIONS
+        shape = jax.eval_shape(linear, args, start)
+        most = WITHOUT_CURVATURE if is_without_curvature(shape.M, shape.G) else ITERATIONS
         going_on = lambda carry: carry[2] & (carry[3] < most)
-        return jax.lax.while_loop(going_on, newton, (start, start[:free], jnp.array(True), jnp.array(0)))[0], None
+        return jax.lax.while_loop(going_on, newton, (start, jnp.stack([start[:free]] * LAST), jnp.array(True), jnp.array(0)))[0], None
 
     find = (lambda _, args: (there(args), None)) if found else by_newton
     w, _ = root_of(residual, linear, find, (t, q0, M), like)

@@ -130,9 +130,7 @@ def examine(system: System, q: PyTree, qdot: PyTree, params: PyTree = None, *, t
         "dissipated": {name: float(np.min(value)) for name, value in found["dissipated"].items()},
         "time_constants": constants,
     }
-    off, size, rows_off, rows_size = found["defects"].max(axis=0)
-    share = lambda off, size: off / size if size > 0 else off
-    defect = max(share(off, size), share(rows_off, rows_size) if rank == G.shape[0] else 0)  # rows may contradict each other
+    defect = _largest_defect(found["defects"], rank == G.shape[0], eps)
     names = entry_names(q, "q")
     coupled = dict(sorted(found["couplings"].items(), key=lambda of: MATRICES.index(of[0][0])))
     found_out = [
@@ -151,6 +149,15 @@ def examine(system: System, q: PyTree, qdot: PyTree, params: PyTree = None, *, t
     states = tuple(name for name, _ in system.states)
     counts = {of: (None if c.entries == NOT_READ else int(c.entries), int(c.size)) for of, c in coupled.items()}
     return Examination(**numbers, findings=tuple(found_out), states=states, contacts=contacts, without_inertia=light, couplings=counts)
+
+
+def _largest_defect(defects, is_regular, eps):
+    """Of the equations and of the rows, as `_defects` has them at each state; where rows contradict each other, of neither."""
+    share = lambda off, size: off / np.where(size > 0, size, 1)
+    in_equations, in_rows = share(defects[:, 0], defects[:, 1]), share(defects[:, 2], defects[:, 3])
+    if is_regular:
+        return max(np.max(in_equations), np.max(in_rows))
+    return np.max(in_equations[in_rows <= eps**0.5], initial=0.0)
 
 
 def _counted(entries):

@@ -52,7 +52,8 @@ def consistent_state(case: Case, u: Units) -> dict[str, Seen]:
 def motion(case: Case, u: Units, **settings) -> dict[str, Seen]:
     i = inputs_of(case, u)
     found = jl.simulate(in_units(case), i.q, i.qdot, i.ts, i.params, works=True, **settings)
-    works = {f"W {name}": Seen(x, u.energy) for name, x in found.work().items() if name not in ("time", "projection")}
+    shared = _rows(case) if case.kind == "redundant" else []  # as λ is
+    works = {f"W {name}": Seen(x, u.energy) for name, x in found.work().items() if name not in ("time", "projection", *shared)}
     stuck = {f"sticking {name}": Seen(x.sticking) for name, x in found.friction.items()}
     forces = {f"friction {name}": Seen(x.force, u.energy / u.time) for name, x in found.friction.items()}
     counts = {"transitions": Seen(found.stats["transitions"])} if "transitions" in found.stats else {}

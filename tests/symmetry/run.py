@@ -11,6 +11,7 @@ import time
 import warnings
 
 import jax
+import numpy as np
 
 jax.config.update("jax_enable_x64", True)
 
@@ -70,6 +71,7 @@ def main():
     parser.add_argument("--sizes", nargs="+", type=int, default=[2, 3, 5, 8])
     parser.add_argument("--systems", type=int, default=3, help="how many of a kind are stated otherwise")
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--minutes", type=float, default=np.inf, help="after which no other kind is begun")
     parser.add_argument("--verbose", action="store_true")
     args = parser.parse_args()
     warnings.filterwarnings("ignore", message=".*must be made once")  # each kind of system is made anew for each statement
@@ -77,6 +79,9 @@ def main():
     count = -(-args.count // len(pairs))
     total, failed, shown, begin = collections.Counter(), collections.Counter(), set(), time.perf_counter()
     for question, kind, n in pairs:
+        if time.perf_counter() - begin > 60 * args.minutes:
+            print(f"not asked: {question} {kind} n = {n}")
+            continue
         try:
             for name, which, found in itertools.chain(numbers(question, kind, n, count, args), programs(question, kind, n, args)):
                 total[question, name] += 1

@@ -85,7 +85,7 @@ def test_accelerations_of_all_kinds_stated_otherwise(kind, name):
     assert_follows_otherwise("acceleration", name, kind, 3, seeds=range(3))
 
 
-@pytest.mark.parametrize("kind", [pytest.param("redundant", marks=UNSOLVED)])
+@pytest.mark.parametrize("kind", ["redundant"])
 def test_states_on_the_constraints(kind):
     assert_follows("consistent_state", kind, each=3)
 
@@ -97,7 +97,7 @@ def test_states_on_the_constraints_of_all_kinds(kind):
 
 
 @pytest.mark.parametrize(
-    "kind", ["smooth", pytest.param("redundant", marks=[pytest.mark.slow, UNSOLVED]), pytest.param("massless", marks=pytest.mark.slow)]
+    "kind", ["smooth", pytest.param("redundant", marks=pytest.mark.slow), pytest.param("massless", marks=pytest.mark.slow)]
 )
 def test_examinations(kind):
     assert_follows("examine", kind, each=2)
