@@ -195,8 +195,8 @@ ONCE_A_PERIOD = jl.Every(_period)
 # Identification
 
 
-def _record(case: Case, u: Units):
-    """The motion in the units of the case, computed tightly, with noise; the same numbers in all units."""
+def _record(case: Case, u: Units, sigma: float | None = None):
+    """The motion in the units of the case, computed tightly, with noise, of which `sigma` may be given; the same numbers in all units."""
     from transform import plain
 
     key = id(case)
@@ -208,11 +208,12 @@ def _record(case: Case, u: Units):
         RECORDS[key] = own, exact + 1e-3 * np.random.default_rng(0).normal(size=exact.shape)
     own, q = RECORDS[key]
     i = inputs_of(own, u)
-    return i, jl.Experiment(i.ts, {"q": u.length * q + u.shift + u.drift * i.ts[:, None]}, i.q, i.qdot, observe=_seen_position)
+    seen = {"q": u.channels * (u.length * q + u.shift + u.drift * i.ts[:, None])}
+    return i, jl.Experiment(i.ts, seen, i.q, i.qdot, observe=_seen_position, sigma=sigma and {"q": sigma * u.channels * np.abs(u.length)})
 
 
-def _seen_position(q):
-    return {"q": q}
+def _seen_position(q, units):
+    return {"q": units.channels * q}
 
 
 RECORDS: dict = {}
@@ -230,7 +231,7 @@ def _values(u: Units, found) -> dict[str, Seen]:
 
 
 def fit(case: Case, u: Units) -> dict[str, Seen]:
-    i, record = _record(case, u)
+    i, record = _record(case, u, sigma=1e-3)
     guess = i.params | {name: 1.1 * i.params[name] for name in IDENTIFIED}
     found = jl.fit(in_units(case), record, guess, free=IDENTIFIED)
     return _values(u, found) | {"converged": Seen(found.converged), "remarks": Seen(len(found.remarks))}

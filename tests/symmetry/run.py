@@ -15,7 +15,8 @@ import numpy as np
 
 jax.config.update("jax_enable_x64", True)
 
-from generate import AT_REST, KINDS, drawn  # noqa: E402
+from generate import AT_REST, KINDS, Case, drawn  # noqa: E402
+from machines import MACHINES  # noqa: E402
 from net import misses, variant_misses  # noqa: E402
 from questions import QUESTIONS  # noqa: E402
 from transform import NUMBERS, drawn_units  # noqa: E402
@@ -24,8 +25,18 @@ from variants import VARIANTS, applies, variant  # noqa: E402
 SEEDS = 8  # of systems; units have seeds without end
 
 
+def case_of(kind: str, n: int, seed: int) -> Case:
+    """A random system with n coordinates, or a machine, of which there is one."""
+    return MADE.setdefault(kind, MACHINES[kind]()) if kind in MACHINES else drawn(kind, n, seed)
+
+
+MADE: dict[str, Case] = {}
+
+
 def asked(question: str, kind: str) -> bool:
     """Whether a question makes sense of a kind."""
+    if kind in MACHINES:
+        return question in ("acceleration", "motion", "gradient_forward", "gradient_reverse", "examine")
     if question in ("equilibrium", "linear", "locus"):
         return kind in AT_REST
     if question in ("fit", "regress", "compare"):
@@ -38,14 +49,17 @@ def asked(question: str, kind: str) -> bool:
 
 
 def moves_with(question: str, which: str) -> bool:
-    """Whether a question can be asked in a frame that moves: what rests in one does not in the other."""
+    """Whether a question can be asked in a frame that moves: what rests in one does not in the other; and whether it has channels."""
+    if which == "channels":
+        return question in ("fit", "regress", "compare")
     return which != "frame" or question in ("acceleration", "consistent_state", "motion", "gradient_forward", "gradient_reverse", "fit")
 
 
 def numbers(question, kind, n, count, args):
     """Each system in other units, as (transformation, which system, which units, what does not follow)."""
     which = [name for name in args.which if name in NUMBERS and moves_with(question, name)]
-    cases = [drawn(kind, n, seed) for seed in range(min(SEEDS, -(-count // max(1, len(which)))))]
+    seeds = 1 if kind in MACHINES else min(SEEDS, -(-count // max(1, len(which))))
+    cases = [case_of(kind, n, seed) for seed in range(seeds)]
     for i in range(count if which else 0):
         name, system = which[i % len(which)], i // len(which) % len(cases)
         units = args.seed * 100_000 + i
@@ -57,8 +71,8 @@ def programs(question, kind, n, args):
     if question not in ("acceleration", "motion"):
         return
     for name in (name for name in args.which if name in VARIANTS and applies(name, kind)):
-        for system in range(args.systems):
-            case = drawn(kind, n, system)
+        for system in range(1 if kind in MACHINES else args.systems):
+            case = case_of(kind, n, system)
             yield name, f"system {system}", variant_misses(case, variant(name, case), question)
 
 
@@ -66,7 +80,7 @@ def main():
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("count", type=int)
     parser.add_argument("--questions", nargs="+", default=list(QUESTIONS))
-    parser.add_argument("--kinds", nargs="+", default=list(KINDS))
+    parser.add_argument("--kinds", nargs="+", default=[*KINDS, *MACHINES])
     parser.add_argument("--which", nargs="+", default=[*NUMBERS, *VARIANTS])
     parser.add_argument("--sizes", nargs="+", type=int, default=[2, 3, 5, 8])
     parser.add_argument("--systems", type=int, default=3, help="how many of a kind are stated otherwise")
@@ -75,7 +89,8 @@ def main():
     parser.add_argument("--verbose", action="store_true")
     args = parser.parse_args()
     warnings.filterwarnings("ignore", message=".*must be made once")  # each kind of system is made anew for each statement
-    pairs = [(q, k, n) for q, k, n in itertools.product(args.questions, args.kinds, args.sizes) if asked(q, k)]
+    sizes = lambda kind: [len(case_of(kind, 0, 0).q0)] if kind in MACHINES else args.sizes
+    pairs = [(q, k, n) for q in args.questions for k in args.kinds for n in sizes(k) if asked(q, k)]
     count = -(-args.count // len(pairs))
     total, failed, shown, begin = collections.Counter(), collections.Counter(), set(), time.perf_counter()
     for question, kind, n in pairs:

@@ -5,10 +5,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from generate import drawn
+from machines import gyroscope, gyroscope_in_quaternions
 from net import reference
 from transform import in_units, inputs_of, plain
 
 import jaxlag as jl
+from jaxlag import rigid
 
 CUT = 8
 
@@ -99,6 +101,19 @@ def test_a_rod_in_its_angle_and_in_x_and_y():
     by_rod = lambda l: jl.simulate(rod, on_circle(1.0, l), jnp.zeros(2), ts, params | {"l": l}).q
     np.testing.assert_allclose(by_rod(1.5), by_angle(1.5), rtol=0, atol=1e-6)
     np.testing.assert_allclose(jax.jacfwd(by_rod)(1.5), jax.jacfwd(by_angle)(1.5), rtol=0, atol=1e-5)
+
+
+@pytest.mark.slow
+def test_a_gyroscope_in_angles_and_in_a_quaternion():
+    """The axis of a top that spins fast, through its nods."""
+    by_angles, by_numbers = (moved(make()) for make in (gyroscope, gyroscope_in_quaternions))
+    expected = jax.vmap(lambda q: rigid.euler("zxz")(list(q)))(by_angles)[:, :, 2]
+    np.testing.assert_allclose(jax.vmap(rigid.quaternion)(by_numbers)[:, :, 2], expected, rtol=0, atol=1e-8)
+
+
+def moved(case):
+    i = inputs_of(case, plain(case))
+    return jl.simulate(in_units(case), i.q, i.qdot, i.ts, i.params, rtol=1e-10).q
 
 
 def test_new_coordinates_by_substitution():

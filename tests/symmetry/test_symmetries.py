@@ -6,8 +6,9 @@ A few hundred of them here; `python tests/symmetry/run.py 10000` asks all questi
 import numpy as np
 import pytest
 from generate import KINDS, drawn
+from machines import MACHINES
 from net import misses, variant_misses
-from run import asked, moves_with
+from run import asked, case_of, moves_with
 from transform import NUMBERS, drawn_units
 from variants import VARIANTS, applies, variant
 
@@ -21,7 +22,7 @@ def assert_follows(question, kind, n=2, each=1, seeds=(0,), which=NUMBERS):
     found = []
     for name in (name for name in which if moves_with(question, name)):
         for seed in seeds:
-            case = drawn(kind, n, seed)
+            case = case_of(kind, n, seed)
             for units in range(each):
                 found += [
                     f"{name}, system {seed}, units {units}: {miss}" for miss in misses(case, drawn_units(case, units, name), question)[:1]
@@ -33,7 +34,7 @@ def assert_follows_otherwise(question, name, kind, n=2, seeds=(0,)):
     """Stated by another program."""
     found = []
     for seed in seeds:
-        case = drawn(kind, n, seed)
+        case = case_of(kind, n, seed)
         found += [f"system {seed}: {miss}" for miss in variant_misses(case, variant(name, case), question)[:1]]
     assert not found, "\n".join(found)
 
@@ -101,6 +102,20 @@ def test_states_on_the_constraints_of_all_kinds(kind):
 )
 def test_examinations(kind):
     assert_follows("examine", kind, each=2)
+
+
+QUICK = ("Cartesian pendulum", "belt")
+
+
+@pytest.mark.parametrize("kind", [kind if kind in QUICK else pytest.param(kind, marks=pytest.mark.slow) for kind in MACHINES])
+def test_accelerations_of_machines(kind):
+    assert_follows("acceleration", kind, each=3)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", [kind for kind in MACHINES if applies("components", kind)])
+def test_accelerations_of_machines_by_components(kind):
+    assert_follows_otherwise("acceleration", "components", kind)
 
 
 # In time

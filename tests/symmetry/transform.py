@@ -18,7 +18,7 @@ import jaxlag as jl
 
 
 class Units(NamedTuple):
-    """Numbers by which what is stated is multiplied: t' = τ t + T, q' = s q + a + u t', L' = E L, g' = r g, z' = σ z, p' = k p."""
+    """Numbers that multiply what is stated: t' = τ t + T, q' = s q + a + u t', L' = E L, g' = r g, z' = σ z, p' = k p, y' = c y."""
 
     start: Any
     time: Any
@@ -29,6 +29,7 @@ class Units(NamedTuple):
     rows: dict[str, Any]
     states: dict[str, Any]
     params: dict[str, Any]
+    channels: Any = 1.0
 
 
 ROWS = ("holonomic", "nonholonomic", "unilateral")
@@ -64,6 +65,8 @@ def drawn_units(case: Case, seed: int, which: str) -> Units:
             return units._replace(rows=named(units.rows, 9), states=named(units.states, 9))
         case "params":
             return units._replace(params=named(units.params, 9))
+        case "channels":
+            return units._replace(channels=float(decades(9)))
         case "mirror":
             return units._replace(length=np.where(draw.random(case.n) < 0.5, -1.0, 1.0))
         case "shift":
@@ -76,7 +79,7 @@ def drawn_units(case: Case, seed: int, which: str) -> Units:
     raise ValueError(which)
 
 
-NUMBERS = ("clock", "time", "energy", "length", "each length", "rows", "params", "mirror", "shift", "frame", "all")
+NUMBERS = ("clock", "time", "energy", "length", "each length", "rows", "params", "channels", "mirror", "shift", "frame", "all")
 
 
 def _translated(params, t_given):

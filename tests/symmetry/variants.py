@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from generate import Case, Term
+from machines import MACHINES
 
 import jaxlag as jl
 
@@ -170,6 +171,28 @@ def twice(case: Case) -> Variant:
     return Variant(_with_loop(case, {"loop": g, "again": again}), back)
 
 
+def components(case: Case) -> Variant:
+    """Each component of a vector of constraints as a constraint with a name."""
+    terms, names = dict(case.terms), {}
+    for slot in (slot for slot in ("holonomic", "nonholonomic") if slot in case.terms):
+        terms[slot] = {}
+        for name, term in case.terms[slot].items():
+            size = np.size(term.f(0.0, jnp.asarray(case.q0), jnp.asarray(case.qdot0), case.params))
+            names[name] = [f"{name} {i}" for i in range(size)]
+            terms[slot] |= {row: Term(_component(term.f, i), term.names) for i, row in enumerate(names[name])}
+
+    def back(seen):
+        others = {name: x for name, x in seen.items() if not name.startswith(("λ", "W"))}
+        held = {name: rows for name, rows in names.items() if f"λ {rows[0]}" in seen}
+        return others | {f"λ {name}": np.stack([seen[f"λ {row}"] for row in rows], -1) for name, rows in held.items()}
+
+    return Variant(case._replace(terms=terms), back)
+
+
+def _component(f: Callable, i: int) -> Callable:
+    return lambda *args, **z: f(*args, **z)[i]
+
+
 def _with_loop(case: Case, rows: dict[str, Term]) -> Case:
     return case._replace(terms=case.terms | {"holonomic": rows})
 
@@ -195,6 +218,7 @@ VARIANTS = {
     "cubed": cubed,
     "twice": twice,
     "as vector": as_vector,
+    "components": components,
 }
 
 
@@ -209,7 +233,9 @@ def variant(name: str, case: Case) -> Variant:
 
 
 def applies(name: str, kind: str) -> bool:
-    """Whether a kind can be stated so."""
+    """Whether a kind can be stated so; of machines, those of which a constraint is a vector, by its components alone."""
+    if name == "components" or kind in MACHINES:
+        return name == "components" and kind in ("vehicle in parts", "bicycle", "coin", "four-bar linkage")
     if name in ("cubed", "twice"):
         return kind in ("holonomic", "dry loop", "held and rolling")
     if name == "as vector":
