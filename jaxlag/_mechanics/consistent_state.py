@@ -21,7 +21,7 @@ from .._program.sparse_jacobian import MANY
 from .._program.sparse_matrix import SparseMatrix, dense
 from .augmented_inertia import alike
 from .constrained_root import Linear, is_without_curvature, root_of
-from .constraint_residuals import is_reached, off, terms
+from .constraint_residuals import off, off_constraints, terms
 from .contact import in_contact
 from .friction_elements import find_elements, with_all_masses
 from .lagrange import inertia, position_rows, velocity_residual, velocity_rows
@@ -80,7 +80,7 @@ def nearest_state(flat: Flat, t, q0, v0, free: Sequence[int] | None = None, *, f
 
     @undifferentiated
     def judged(t, q0, v0, q, v, M, given):
-        reached = is_reached(flat, t, (q0, v0), q, v) & jnp.all(jnp.isfinite(q))
+        reached = (off_constraints(flat, t, q, v) < _small(q)) & jnp.all(jnp.isfinite(q))
         return reached, ~jnp.any(not_affine_in(flat, t, q0, v0)), jnp.all(jnp.isfinite(given)) & _is_finite(M)
 
     reached, affine, defined = judged(t, q0, v0, q, v, M, given)

@@ -15,7 +15,6 @@ from .lagrange import inertia, rows_of, velocity_residual
 from .saddle_point import Rows
 from .singular_directions import not_affine_in
 
-FAINT = 100  # eps of coordinates of one: no search has to say more of what is zero
 ROUNDING = 4  # eps, by which a residual may differ from zero beside the terms of its change
 
 
@@ -60,20 +59,6 @@ def off_constraints(flat: Flat, t, q, v, reach: tuple[Array, Array] | None = Non
 def terms(flat: Flat, t, q) -> Float[Array, " h"]:
     """The size of the terms that cancel in g, where q itself may be zero: of y − l (1 − cos φ) some l."""
     return size_of_terms(lambda q: flat.holonomic(t, q), q)
-
-
-def is_reached(flat: Flat, t, start: tuple, q, v) -> Bool[Array, ""]:
-    """Whether a search from the state `start` has ended on the constraints: what is left is small beside coordinates of at least one, and,
-    unless rounding makes it of these, beside where the search has been, in whatever unit.
-    """
-    found, eps = Residuals.of(flat, t, q, v), jnp.finfo(q.dtype).eps
-    been = lambda x, start: jnp.abs(x) + jnp.abs(x - start)
-    beside = lambda rows, x, start: abs(rows) @ been(x, start)
-    in_units = off_constraints(flat, t, q, v)
-    of_way = jnp.maximum(
-        off(found.g, beside(found.of_positions, q, start[0])), off(found.psi, found.of_psi(lambda rows: beside(rows, v, start[1])))
-    )
-    return (in_units < eps**0.5) & ((of_way < eps**0.5) | (in_units < FAINT * eps))
 
 
 def is_on_constraints(flat: Flat, t, q, v) -> Bool[Array, ""]:

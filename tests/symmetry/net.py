@@ -13,6 +13,7 @@ INTEGRATED = {"motion", "gradient_forward", "gradient_reverse"}
 FLOOR = {"motion": 1e-7, "gradient_forward": 1e-6, "gradient_reverse": 1e-6, "periodic": 1e-6, "linear": 1e-7, "locus": 1e-7}
 ROUNDING = 1e-9  # of what is computed without integration: some 1e6 eps, for matrices of condition 1e3 in their own units
 OTHER_STEPS = 3  # times more is allowed where other coordinates make other steps of the same tolerance
+OF_RATES = {"q̇": 3.0, "q̈": 10.0}  # ω and ω² of the stiffest: by them an error of q comes back in its rates
 SMALL = 1e-2  # what is smaller is compared with this: numbers are of order one in the units of a case
 
 
@@ -94,7 +95,8 @@ def _compared(known: Reference, seen: dict[str, np.ndarray], more: float, slack:
             continue
         got = seen[name]
         off = np.max(np.abs(got - right), initial=0.0) if got.shape == right.shape else np.inf
-        allowed = slack * known.allowed[name] + (more * max(1.0, np.max(np.abs(right), initial=0.0)) if known.allowed[name] else 0.0)
+        beside = OF_RATES.get(name, 1.0) * more * max(1.0, np.max(np.abs(right), initial=0.0))
+        allowed = slack * known.allowed[name] + (beside if known.allowed[name] else 0.0)
         if not off <= allowed:
             found.append(Miss(name, float(off), float(allowed)))
     return sorted(found, key=lambda miss: -miss.off / max(miss.allowed, 1e-300))

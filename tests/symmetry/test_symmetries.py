@@ -12,10 +12,6 @@ from run import asked, case_of, moves_with
 from transform import NUMBERS, drawn_units
 from variants import VARIANTS, applies, variant
 
-# Rows g and (2 + cos q₀) g depend on each other where g = 0 alone: beside it their difference asks for what neither does.
-UNSOLVED = pytest.mark.xfail(reason="constraints that depend on each other only where they hold", strict=True)
-MANY = 9  # of a transformation whose numbers have to be found first
-
 
 def assert_follows(question, kind, n=2, each=1, seeds=(0,), which=NUMBERS):
     """Of each transformation by numbers `each`, for the systems of `seeds`."""
@@ -127,11 +123,17 @@ def test_motions(kind):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "kind", [pytest.param(kind, marks=UNSOLVED if kind == "redundant" else ()) for kind in KINDS if kind not in ("smooth", "dry")]
-)
+@pytest.mark.parametrize("kind", [kind for kind in KINDS if kind not in ("smooth", "dry")])
 def test_motions_of_all_kinds(kind):
-    assert_follows("motion", kind, each=3, seeds=range(2))
+    which = [name for name in NUMBERS if (kind, name) != ("redundant", "frame")]
+    assert_follows("motion", kind, each=3, seeds=range(2), which=which)
+
+
+@pytest.mark.slow
+@pytest.mark.xfail(reason="within a step, rows that depend on each other on the constraints alone are taken for independent", strict=True)
+def test_motions_of_rows_that_depend_on_each_other_in_a_moving_frame():
+    """Rows g and (2 + cos q₀) g: beside g = 0, where the stages of a step are, their difference asks for what neither does."""
+    assert_follows("motion", "redundant", each=3, which=["frame"])
 
 
 @pytest.mark.slow
