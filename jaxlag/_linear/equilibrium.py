@@ -10,7 +10,7 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, PyTree
 
-from .._model.numbers import number
+from .._model.numbers import number, refuse_nan
 from .._model.paths import entry_names, is_within, listed
 from .._model.state_values import given_states
 from .._model.system import System
@@ -186,6 +186,7 @@ def _found(system: System, q: PyTree, qdot: PyTree, params: PyTree, t: Any, stat
         raise ValueError(f"`stable` must be False where forces are not from L, but there are {terms}. Write their potential into L.")
     t = number(t, "`t`", jax.tree.leaves(q)[0].dtype, cure="Pass one time, and use `jax.vmap` for several.")
     given = system, t, q, qdot, parameters(params, q), given_states(system, states, q)
+    refuse_nan(given[4])
     found, names = _near(search, *given), entry_names(q, "q")
     is_known = is_concrete(jax.lax.stop_gradient(found))
     values = seen(found)

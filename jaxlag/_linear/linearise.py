@@ -12,7 +12,7 @@ from jaxtyping import PyTree
 from .._mechanics.consistent_state import consistent_state
 from .._model.flat import Flat, StatesAt, bind
 from .._model.injection import check_function
-from .._model.numbers import number
+from .._model.numbers import number, refuse_nan
 from .._model.paths import entry_names, is_within, listed
 from .._model.state_values import Layout, given_states, of_first_order, sampled, start_values
 from .._model.system import System
@@ -96,6 +96,7 @@ def linearise(
     dtype = jax.tree.leaves(q)[0].dtype
     t = jnp.asarray(t, dtype) if along else number(t, "`t`", dtype, cure="Pass one time, or a `Trajectory`.")
     params, states = parameters(params, q), given_states(system, states, q)
+    refuse_nan(params)
     if system.constraints and not found_before and not is_concrete((t, q, qdot, params, states)):
         q, qdot = _with_constraints(system, t, q, qdot, params, states)
     first = jax.tree.map(lambda x: x[0], (t, q, qdot, states)) if along else (t, q, qdot, states)

@@ -10,7 +10,7 @@ from jaxtyping import Array, Complex, PyTree
 from .._mechanics.augmented_inertia import by_weight
 from .._model.flat import bind
 from .._model.numbers import count as whole
-from .._model.numbers import number
+from .._model.numbers import number, refuse_nan
 from .._model.paths import entry_names
 from .._model.system import System
 from .._model.validation import coordinates, parameters, without_contacts
@@ -61,6 +61,7 @@ def lowest_modes(system: System, q: Any, params: PyTree = None, *, count: int = 
     q = coordinates(q, "q")
     dtype = jax.tree.leaves(q)[0].dtype
     t, params = number(t, "`t`", dtype, cure="Pass one time."), parameters(params, q)
+    refuse_nan(params)
     count = whole(count, "`count`", cure="Ask for one mode or more.")
     shift = float(number(shift, "`shift`", dtype, cure="Pass a real number, in 1/time."))
     _refuse(system)

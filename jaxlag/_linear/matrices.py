@@ -16,6 +16,7 @@ from .._mechanics.contact import in_current_mode
 from .._mechanics.lagrange import applied_force, constraint_rows, inertia
 from .._mechanics.massless import first_order, with_masses
 from .._model.flat import StatesAt
+from .._model.numbers import none_is_nan, where_known
 from .._model.state_values import start_values
 from .._model.system import System
 from .._model.validation import checked
@@ -87,7 +88,7 @@ def constraint_slopes(system, t, q, qdot, params, states):
 
 @compiled
 def matrices(choice: Choice, system: System, t: Any, q: PyTree, qdot: PyTree, params: PyTree, states: PyTree) -> Matrices:
-    """The matrices near a state."""
+    """The matrices near a state; NaN where an entry of params is."""
     checked(system, t, q, qdot, params, states)
     values = start_values(system, states, t, q, qdot, params)
     at = StatesAt(values, t, ravel_pytree(q)[0], ravel_pytree(qdot)[0])
@@ -115,7 +116,8 @@ def matrices(choice: Choice, system: System, t: Any, q: PyTree, qdot: PyTree, pa
     left = jnp.concatenate([forces.qddot, found.z, found.updates - dynamics.held])
     steadiness = Steadiness(left, allowed, forces.sound.determined & forces.sound.satisfied)
     outputs, multipliers, updates = (_shifted(rates, of) for of in (outputs, multipliers, updates))
-    return Matrices(_proper(rates), outputs, multipliers, updates, basis, M, steadiness, jnp.any(rates.by_inputs[1:] != 0))
+    near = Matrices(_proper(rates), outputs, multipliers, updates, basis, M, steadiness, jnp.any(rates.by_inputs[1:] != 0))
+    return where_known(none_is_nan(params), near)
 
 
 def _slopes(

@@ -11,7 +11,7 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float, PyTree
 
 from .._model.injection import call
-from .._model.numbers import number, numbers
+from .._model.numbers import number, numbers, refuse_nan
 from .._model.paths import entry_names, leaf_names
 from .._model.state_values import given_states, start_values
 from .._model.system import System
@@ -49,6 +49,7 @@ class ParameterPlane:
                 "Call `stability_map` from Python, and differentiate `linearise` or a crossing of `root_locus`."
             )
         self.names, self.values, self.indices = _two(over, self.params)
+        refuse_nan(self.at(*(x[0] for x in self.values)))
 
     @property
     def shape(self) -> tuple[int, int]:

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Array, Complex, Float, PyTree
 
 from .._model.injection import call
-from .._model.numbers import number, numbers
+from .._model.numbers import number, numbers, refuse_nan
 from .._model.paths import leaf_names
 from .._model.state_values import given_states, sampled
 from .._model.system import System
@@ -125,6 +125,7 @@ class _Family:
         if over not in names or np.shape(jax.tree.leaves(self.params)[names.index(over)]):
             raise ValueError(f"`over` must name one number of `params`, but is {over!r}. The entries are {', '.join(names)}.")
         self.index = names.index(over)
+        refuse_nan(self.at(first, self.params))
         self.steady: dict[float, Any] = {}  # states that were found, from which others start
         self.choice = Choice((), None, self._linearised(first, seen(self.params)).coordinates.partition, 0)
 

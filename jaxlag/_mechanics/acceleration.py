@@ -44,8 +44,9 @@ def acceleration(system: System, q: PyTree, qdot: PyTree, params: PyTree = None,
 
     **Returns:** `Acceleration(qddot, multipliers)`: q̈ structured like q; λ by the constraint's name, structured like what g or a returns.
 
-    **Raises:** `ValueError` where a direction has no inertia and no constraint holds it, where constraints contradict each other, or where
-    forces depend on λ such that none agrees with them, or more than one. Under `jit` the result is NaN there.
+    **Raises:** `ValueError` where an entry of `params` is NaN, where a direction has no inertia and no constraint holds it, where
+    constraints contradict each other, or where forces depend on λ such that none agrees with them, or more than one. Under `jit` the
+    result is NaN there.
 
     **Source:** Hairer & Wanner, Solving Ordinary Differential Equations II, eqs. VII.1.46.
 

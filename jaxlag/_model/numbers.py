@@ -13,9 +13,9 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float, PyTree
 
-from .._program.jit import is_concrete
+from .._program.jit import compiled, is_concrete, values
 
 TIMES = (datetime.date, datetime.timedelta)  # in arrays of objects
 DATES = "Count the time from a start, e.g. `(times - times[0]) / np.timedelta64(1, 's')`."
@@ -72,6 +72,28 @@ def number(
             wanted = "finite" if not math.isfinite(value) else "positive" if positive else f"at least {least:g}"
             raise ValueError(f"{label} must be {wanted}, but is {value:g}. {cure}")
     return x
+
+
+@compiled
+def none_is_nan(params: PyTree) -> Bool[Array | np.ndarray, ""]:
+    """Whether no entry of params is NaN. What a program makes of one may hide it: 0·x is 0, whatever x."""
+    leaves = [leaf for leaf in jax.tree.leaves(params) if jnp.issubdtype(getattr(leaf, "dtype", int), jnp.inexact)]
+    return ~jnp.any(jnp.stack([jnp.any(jnp.isnan(leaf)) for leaf in leaves])) if leaves else np.array(True)
+
+
+def where_known(sound: Bool[Array | np.ndarray, ""], tree: PyTree) -> PyTree:
+    """The numbers of a tree, where they are sound."""
+    return jax.tree.map(lambda x: jnp.where(sound, x, jnp.nan) if jnp.issubdtype(x.dtype, jnp.inexact) else x, tree)
+
+
+def refuse_nan(params: PyTree, sound: Bool[Array | np.ndarray, ""] | None = None) -> None:
+    """Raises where an entry of params is NaN, unless `jit` or `vmap` hides it; `sound`: `none_is_nan` of params, where it is known."""
+    sound = values(none_is_nan(params) if sound is None else sound)
+    if sound is None or sound:
+        return
+    paths, _ = jax.tree_util.tree_flatten_with_path(params)
+    names = [jax.tree_util.keystr(path) for path, leaf in paths if not values(none_is_nan(leaf))]
+    raise ValueError(f"`params{names[0]}` must be known, but is NaN. Give it a value.")
 
 
 def count(given: Any, label: str, *, least: int = 1, cure: str) -> int:

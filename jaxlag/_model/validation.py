@@ -16,7 +16,7 @@ from .event import merged
 from .flat import Flat, StatesAt, bind, flat_like
 from .given import Given, known, remember
 from .injection import asks_for, call, check_entries, described, missing
-from .numbers import Label, in_dtype, number, numbers
+from .numbers import Label, in_dtype, none_is_nan, number, numbers, refuse_nan, where_known
 from .state_values import given_states, of_first_order, sampled, shaped_like, start_values
 from .system import CONSTRAINT_SLOTS, SLOTS, System, role
 from .user_errors import warn_of_recreated_functions
@@ -245,15 +245,22 @@ def without_events(system: System, label: str) -> None:
 
 
 def at_state(core: Callable[..., Any], system: System, q: Any, qdot: Any, params: Any, t: Any, states: Any = None) -> Any:
-    """`core(flat, t, q, v)` of the checked system at a state given by the user; compiled once for each `core` and `system`."""
+    """`core(flat, t, q, v)` of the checked system at a state given by the user; compiled once for each `core` and `system`.
+
+    **Raises:** `ValueError` where an entry of params is NaN; under `jit` the result is NaN there.
+    """
     given = state_and_params(q, qdot, params)
     t = number(t, "`t`", given.dtype, cure="Pass one time, and use `jax.vmap` for several.")
-    return _at_state(core, system, t, given, {} if states is None else given_states(system, states, given.trees[0]))
+    found, sound = _at_state(core, system, t, given, {} if states is None else given_states(system, states, given.trees[0]))
+    refuse_nan(given.trees[2], sound)
+    return found
 
 
 @compiled
 def _at_state(core, system, t, given, states):
-    return core(*checked(system, t, *given.trees, states))
+    q, qdot, params = given.trees
+    sound = none_is_nan(params)
+    return where_known(sound, core(*checked(system, t, q, qdot, params, states))), sound
 
 
 def checked(system: System, t: Array, q: PyTree, qdot: PyTree, params: PyTree, states: Any) -> tuple[Flat, Array, Array, Array]:

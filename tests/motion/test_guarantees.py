@@ -202,6 +202,34 @@ def test_no_function_makes_numbers_of_nan(function, place):
     assert (place, function) in independent or any(np.any(np.isnan(leaf)) for leaf in jax.tree.leaves(out))
 
 
+UNUSED = jl.System(lambda q, qdot, m, k: 0.5 * m * qdot**2 - 0.0 * k * q)  # for numbers; in IEEE arithmetic 0·NaN is NaN
+
+
+@pytest.mark.parametrize("function", [*AT_STATE, jl.linearise, jl.equilibrium])
+def test_a_parameter_that_is_nan_is_refused_where_its_factor_is_zero(function):
+    with pytest.raises(ValueError, match=r"`params\['k'\]` must be known, but is NaN. Give it a value."):
+        function(UNUSED, 1.0, *(() if function is jl.equilibrium else (0.0,)), {"m": 1.0, "k": np.nan})
+
+
+def test_a_parameter_that_is_nan_gives_nan_within_a_program():
+    qddot = lambda k: jl.acceleration(UNUSED, 1.0, 0.0, {"m": 1.0, "k": k}).qddot
+    A = lambda k: jl.linearise(UNUSED, 1.0, 0.0, {"m": 1.0, "k": k}).A
+    np.testing.assert_array_equal(jax.vmap(qddot)(np.array([1.0, np.nan])), [0.0, np.nan])
+    assert np.isnan(jax.jit(qddot)(np.nan)) and np.all(np.isnan(jax.jit(A)(np.nan)))
+    with pytest.raises(ValueError, match="must be known, but is NaN"):
+        jax.grad(qddot)(np.nan)
+
+
+def test_maps_over_a_parameter_that_is_not_known_yet():
+    """A root locus and a map give it its values; what they do not give must be known."""
+    oscillator = jl.System(lambda q, qdot, m, c: 0.5 * m * qdot**2 - 0.5 * c * q**2, dissipation=lambda qdot, b: 0.5 * b * qdot**2)
+    given = {"m": 1.0, "c": 4.0, "b": np.nan}
+    assert jl.root_locus(oscillator, 0.0, params=given, over="b", values=[0.1, 0.2]).crossings == ()
+    for call in (jl.root_locus, lambda *args, over, values, **more: jl.stability_map(*args, over={"c": values, "m": values}, **more)):
+        with pytest.raises(ValueError, match=r"`params\['b'\]` must be known"):
+            call(oscillator, 0.0, params=given, over="c", values=[1.0, 2.0])
+
+
 def test_a_sample_that_is_no_number_is_no_success():
     """The steps pass by a moment at which the rod has no length; a sample does not."""
     length = lambda t: 1.0 + jnp.where(jnp.abs(t - 0.5) < 1e-9, jnp.nan, 0.0)
