@@ -162,7 +162,7 @@ def unread_friction(flat: Flat, t, q, v, read: Container[str] | None = None) -> 
                     f"{role(slot, name)} is dry friction for these parameters only, as |v|**p is for p = 1, which is not recognised: "
                     "write F * jnp.abs(v)"
                 )
-            elif term.moduli.unresolved:
+            elif term.moduli.is_unread():
                 findings.append(
                     f"{role(slot, name)} depends on the sign or the root of a velocity in a way that is not recognised as dry friction: "
                     "if it is, write F * jnp.abs(v), or F * jnp.linalg.norm(v) of a vector"

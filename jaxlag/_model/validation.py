@@ -90,7 +90,7 @@ def _parameter(leaf, dtype, label):
     if type(leaf) is np.ndarray and leaf.dtype == dtype:  # the common one
         return np.array(leaf)
     if isinstance(leaf, jax.Array):  # a weakly typed one, such as `jnp.asarray(1.0)`, counts as a number: nothing is compiled anew for it
-        return leaf.astype(dtype) if leaf.dtype.kind == "f" and jax.typeof(leaf).weak_type else leaf
+        return leaf.astype(dtype) if jax.typeof(leaf).weak_type and leaf.dtype.kind == "f" else leaf
     if isinstance(leaf, Mapping):  # one that JAX takes for a leaf
         return _parameters(dict(leaf), dtype, str(label).strip("`"))
     if isinstance(leaf, np.ma.MaskedArray) or (isinstance(leaf, (np.ndarray, np.generic)) and leaf.dtype.kind not in "biucfV"):

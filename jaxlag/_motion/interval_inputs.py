@@ -240,4 +240,4 @@ def _from_floats(found: Array, like: Any) -> Array:
 
 
 def _is_packable(x: Any) -> Bool[Array, ""] | bool:
-    return eqx.is_array(x) and x.dtype != jax.dtypes.float0 and x.dtype.kind in "fbiu" and not jnp.issubdtype(x.dtype, jax.dtypes.extended)
+    return eqx.is_array(x) and not jnp.issubdtype(x.dtype, jax.dtypes.extended) and x.dtype != jax.dtypes.float0 and x.dtype.kind in "fbiu"

@@ -46,6 +46,11 @@ class Moduli:
         forms = [self.forms[x] or {} for x in (*self.results, *lost) if x in self.forms]
         return {factor.of for form in forms for monomial in form for factor, _ in monomial if isinstance(factor, Sign)}
 
+    def is_unread(self) -> bool:
+        """Whether the results may be nonsmooth in a velocity in another way, also within what is not taken apart."""
+        hidden = [self.structure.primitives[x] for x in self.nodes if x in self.structure.primitives and self._depends(x)]
+        return bool(self.unresolved) or not NONSMOOTH.isdisjoint(set().union(*hidden))
+
     def jumps(self) -> bool:
         """Whether a result jumps where a velocity changes its sign, or changes almost as steeply."""
         jumps = any(self._jumps(x) for x in self.results if x in self.forms)

@@ -17,7 +17,9 @@ def is_foldable(atom: Any) -> bool:
 
 
 def is_numeric(x: Any) -> bool:
-    """Whether its numbers are at hand: not traced, and not another object."""
+    """Whether its numbers are at hand: not traced, no key of random numbers, and not another object."""
+    if isinstance(x, jax.Array) and jax.dtypes.issubdtype(x.dtype, jax.dtypes.extended):
+        return False
     return isinstance(x, (np.ndarray, np.generic, jax.Array, int, float)) and not isinstance(x, jax.core.Tracer)
 
 

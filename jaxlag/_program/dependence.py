@@ -11,10 +11,9 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from .constants import has_extended_dtype
 from .expressions import Algebra, Arrays, Node, filled, is_number, objects
 from .interpreter import Interpreter
-from .walker import CALLS, CALLS_WITH_DERIVATIVE_RULE, branch_index
+from .walker import CALLS, CALLS_WITH_DERIVATIVE_RULE, branch_index, primitive_names
 
 Path = tuple[int, ...]  # to an equation: its number in the program, that of the call within it, that of the equation in there, ...
 Place = tuple[Path, int, int, float]  # the equation, its output, the element of it, and the number to multiply it by
@@ -46,6 +45,7 @@ class Structure(Interpreter):
         self.degrees: dict[Node, int] = {}
         self.given: dict[int, tuple[Any, np.ndarray]] = {}
         self.blocks: dict[tuple, Arrays] = {}
+        self.primitives: dict[Node, frozenset[str]] = {}  # of a result of a block, those within it
         self.reset()
 
     def reset(self) -> None:
@@ -132,8 +132,11 @@ class Structure(Interpreter):
                         self.places.setdefault(node, (path, i, k, 1 / float(number)))
 
     def whole(self, equation: Any, operands: Arrays) -> Arrays:
-        if all(x.dtype != object for x in operands) and not any(map(has_extended_dtype, [*equation.invars, *equation.outvars])):
+        if all(x.dtype != object for x in operands):
             return super().whole(equation, operands)
+        return self._block(equation, operands)
+
+    def foreign(self, equation: Any, operands: Arrays) -> Arrays:
         return self._block(equation, operands)
 
     def _block(self, equation, operands, degree=None) -> Arrays:
@@ -142,6 +145,8 @@ class Structure(Interpreter):
         key = (equation.primitive.name, str(equation.params), *(x if isinstance(x, Node) else (x.dtype, str(x)) for x in flat))
         if key not in self.blocks:
             self.blocks[key] = self.block(lambda *_: [], operands, equation.outvars)
+            names = frozenset(primitive_names([equation]))
+            self.primitives |= {x: names for array in self.blocks[key] for x in array.flat}
             if degree is not None:
                 self.degrees |= {x: degree for array in self.blocks[key] for x in array.flat}
         return self.blocks[key]

@@ -96,8 +96,8 @@ class Interpreter(ScalarGraph):
         atoms = [*equation.invars, *equation.outvars]
         self.count_work(10 + (0 if numbers else sum(atom.aval.size for atom in atoms)))
         if any(map(has_extended_dtype, atoms)) or not (numbers or all(map(is_foldable, atoms))):
-            raise UnknownPrimitive(primitive, self.source)
-        if numbers and (not all(map(is_foldable, atoms)) or _operations(equation) > MAX_FOLDED_OPERATIONS):
+            results = self.foreign(equation, operands)
+        elif numbers and (not all(map(is_foldable, atoms)) or _operations(equation) > MAX_FOLDED_OPERATIONS):
             results = self.whole(equation, operands)
         elif primitive.name in RULES:
             results = RULES[primitive.name](self, equation, *operands)
@@ -107,6 +107,10 @@ class Interpreter(ScalarGraph):
             results = self.whole(equation, operands)
         self.source.pop()
         return results if isinstance(results, list) else [results]
+
+    def foreign(self, equation: Any, operands: Arrays) -> Arrays:
+        """The outputs of an equation with variables whose arithmetic is left to JAX: complex, of half precision, keys of random numbers."""
+        raise UnknownPrimitive(equation.primitive, self.source)
 
     def elementwise(self, primitive: core.Primitive, params: dict, dtype: Any, *arrays: np.ndarray) -> np.ndarray:
         """An element-wise operation, in one call of NumPy where all elements are numbers."""

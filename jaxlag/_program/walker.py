@@ -66,8 +66,8 @@ def unrolled_scan(
 
 
 def primitive_names(program: Any) -> Iterator[str]:
-    """The names of all primitives in a program, those of the programs it calls included."""
-    for equation in getattr(program, "jaxpr", program).eqns:
+    """The names of all primitives in a program or a list of equations, those of the programs they call included."""
+    for equation in program if isinstance(program, list) else getattr(program, "jaxpr", program).eqns:
         yield equation.primitive.name
         for value in equation.params.values():
             for part in value if isinstance(value, (tuple, list)) else [value]:

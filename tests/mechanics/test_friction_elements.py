@@ -278,3 +278,33 @@ def test_a_switch_among_the_parameters(off, end):
     system = jl.System(spring, dissipation=lambda qdot, off: jnp.where(off, 0.3, 0.0) * jnp.abs(qdot))
     motion = jl.simulate(system, 1.0, 0.0, [0.0, 5.0, 20.0], {"off": off}, rtol=1e-10, atol=1e-12)
     np.testing.assert_allclose(motion.q[1 if not off else 2], end, atol=1e-7)
+
+
+OTHER_NUMBERS = {  # factors of one
+    "complex": lambda q: jnp.real((1 + 0j * jnp.sum(q)) ** 2),
+    "half precision": lambda q: (1 + 0 * jnp.sum(q).astype(jnp.float16)).astype(q.dtype),
+    "a key of random numbers": lambda q: 1 + 0 * jax.random.normal(jax.random.key(1)),
+}
+
+
+@pytest.mark.parametrize("name", OTHER_NUMBERS)
+def test_other_numbers_beside_dry_friction_are_left_to_jax(name):
+    force, bounds, slip = read(lambda q, qdot, F: OTHER_NUMBERS[name](q) * F * jnp.sum(jnp.abs(qdot)), np.array([2.0, -1.0]), {"F": 0.3})
+    np.testing.assert_allclose(force, [-0.3, 0.3])
+    np.testing.assert_allclose(bounds, [0.3, 0.3])
+
+
+@pytest.mark.slow
+def test_a_motion_with_friction_beside_other_numbers():
+    """An oscillator of stiffness 4 is released at 1: each half-swing loses 2F/c, and after the seventh it rests at 14 F/c − 1."""
+    factor = lambda q, key: OTHER_NUMBERS["complex"](q) * OTHER_NUMBERS["half precision"](q) * (1 + 0 * jax.random.normal(key))
+    system = jl.System(lambda q, qdot: 0.5 * qdot**2 - 2 * q**2, dissipation=lambda q, qdot, F, key: factor(q, key) * F * jnp.abs(qdot))
+    rest = lambda F: jl.simulate(system, 1.0, 0.0, [0.0, 20.0], {"F": F, "key": jax.random.key(1)}).q[-1]
+    np.testing.assert_allclose(jax.value_and_grad(rest)(0.3), [0.05, 3.5], rtol=1e-6)
+
+
+@pytest.mark.slow
+def test_dry_friction_in_complex_numbers_is_named():
+    system = jl.System(lambda q, qdot: 0.5 * qdot**2 - 2 * q**2, dissipation=lambda qdot: 0.3 * jnp.abs(qdot + 0j))
+    with pytest.raises(RuntimeError, match="is not recognised as dry friction: if it is, write"):
+        jl.simulate(system, 1.0, 0.0, [0.0, 20.0], max_steps=3000)
