@@ -21,6 +21,7 @@ WINGS = {  # each imports only from those above it, and each file of a wing only
         "scalar_graph",
         "walker",
         "size_of_terms",
+        "signed_zeros",
         "rules",
         "data_movement",
         "control_flow",

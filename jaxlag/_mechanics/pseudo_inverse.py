@@ -129,7 +129,7 @@ def applied(S: Float[Array, "m m"], inverse: Inverse, R: Float[Array, "m k"]) ->
     regular, D, factor, root = inverse
     if len(D) < 2:
         size = jnp.diagonal(S)[:, None]
-        return jnp.where(D[:, None] > 0, R / jnp.where(D[:, None] > 0, size, 1), 0)
+        return jnp.where(size > 0, R / jnp.where(size > 0, size, 1), 0)
     solve = lambda _, R: D[:, None] * jax.scipy.linalg.cho_solve((factor, True), D[:, None] * R)
     # A forward pass over a reverse one differentiates this body, not its rule: S⁺ is a solve with S that moves, or, where S is singular,
     # has terms that change nothing but the derivative by S.

@@ -22,9 +22,9 @@ from .constants import ELEMENTWISE, fold_by_jax, folded, has_extended_dtype, is_
 from .expressions import Algebra, Arrays, Node, TooLong, UnknownPrimitive, filled, is_number, objects
 from .rules import RULES, map_elements
 from .scalar_graph import ScalarGraph
-from .walker import CALLS, CALLS_WITH_DERIVATIVE_RULE, called_program, constants_as_inputs, primitive_names, walk
+from .signed_zeros import equations_with_signed_zeros
+from .walker import CALLS, CALLS_WITH_DERIVATIVE_RULE, called_program, constants_as_inputs, walk
 
-SENSITIVE_TO_SIGNED_ZEROS = {"atan2", "bitcast_convert_type"}  # an angle is π or −π
 MAX_FOLDED_OPERATIONS = 1000  # on numbers: some 20 ms in Python, less than a program takes to compile
 
 
@@ -36,7 +36,7 @@ def evaluate(closed: Any, algebra: Algebra, *arguments: Any, limit: int | float 
     **Raises:** `UnknownPrimitive`, which names the primitive and its line; `TooLong` where there are more than `limit` nodes.
     """
     interpreter = Interpreter(algebra, limit)
-    interpreter.keeps_signed_zeros = not SENSITIVE_TO_SIGNED_ZEROS.isdisjoint(primitive_names(closed))
+    interpreter.with_signed_zeros = equations_with_signed_zeros(closed)
     inputs: Arrays = []
     values: dict[Node, Any] = {}
     for argument, variable in zip(arguments, closed.jaxpr.invars, strict=True):
@@ -58,7 +58,7 @@ def traced(closed: Any, interpreter: "Interpreter") -> tuple[Arrays, Arrays]:
     jaxpr = constants_as_inputs(closed)
     if closed.effects or any(map(has_extended_dtype, jaxpr.invars)):
         raise TooLong
-    interpreter.keeps_signed_zeros = not SENSITIVE_TO_SIGNED_ZEROS.isdisjoint(primitive_names(closed))
+    interpreter.with_signed_zeros = equations_with_signed_zeros(closed)
     given = [*closed.consts, *([None] * len(closed.jaxpr.invars))]
     inputs = [
         np.asarray(x)
@@ -71,6 +71,8 @@ def traced(closed: Any, interpreter: "Interpreter") -> tuple[Arrays, Arrays]:
 
 class Interpreter(ScalarGraph):
     """Evaluates jaxprs over arrays of numbers and expression nodes."""
+
+    with_signed_zeros: frozenset[int] = frozenset()  # equations, by their `id`
 
     @np.errstate(all="ignore")  # 1/0 among numbers is JAX's inf, without a warning
     def run(self, program: Any, inputs: Any) -> Arrays:
@@ -92,6 +94,7 @@ class Interpreter(ScalarGraph):
         primitive = equation.primitive
         results: Any = NotImplemented
         self.source.append(equation.source_info)
+        outside, self.keeps_signed_zeros = self.keeps_signed_zeros, id(equation) in self.with_signed_zeros
         numbers = all(x.dtype != object for x in operands)
         atoms = [*equation.invars, *equation.outvars]
         self.count_work(10 + (0 if numbers else sum(atom.aval.size for atom in atoms)))
@@ -106,6 +109,7 @@ class Interpreter(ScalarGraph):
         if results is NotImplemented:
             results = self.whole(equation, operands)
         self.source.pop()
+        self.keeps_signed_zeros = outside
         return results if isinstance(results, list) else [results]
 
     def foreign(self, equation: Any, operands: Arrays) -> Arrays:

@@ -26,7 +26,7 @@ class ScalarGraph:
         self.algebra, self.limit, self.work = algebra, limit, 0
         self.nodes: list[Node] = []
         self.node_of_key: dict[tuple, Node] = {}
-        self.keeps_signed_zeros = False  # x − y and −(y − x) differ by it where x = y, and so does the angle that atan2 gives
+        self.keeps_signed_zeros = False  # x − y and −(y − x) differ by it where x = y, and so does what is divided by them
         self.source: list = []  # the lines of the user's code, for messages
 
     def new(self, *what: Any) -> Node:

@@ -40,8 +40,9 @@ def scalarised(function: Callable, *, limit: int = 800, apart: bool = False) -> 
 
     What has no scalar form (a decomposition, a loop of unknown length) still works on arrays. A function of more than `limit` scalar
     operations is left as it is, and so is one whose variables are complex or of half precision. The results that an infinity or a NaN
-    gives in 0·x, x − x or (1/√x)² are not kept, nor is the sign of a zero, except where an angle depends on it. Results `apart` are put
-    together entry by entry: where they are parts of one array, XLA computes what long chains of operations share anew for each part.
+    gives in 0·x, x − x or (1/√x)² are not kept, nor is the sign of a zero, except that of x − y where an angle or a quotient depends on
+    it. Results `apart` are put together entry by entry: where they are parts of one array, XLA computes what long chains of operations
+    share anew for each part.
     """
     # 700: a chain of 5 links has 633, and takes half the time of arrays; one of 6 links has 838, and its first derivative would take
     # four times as long to compile, a higher one twice as long (tests/benchmarks/bench_entries.py --limit 100000).

@@ -69,10 +69,14 @@ def primitive_names(program: Any) -> Iterator[str]:
     """The names of all primitives in a program or a list of equations, those of the programs they call included."""
     for equation in program if isinstance(program, list) else getattr(program, "jaxpr", program).eqns:
         yield equation.primitive.name
-        for value in equation.params.values():
-            for part in value if isinstance(value, (tuple, list)) else [value]:
-                if hasattr(part, "eqns") or hasattr(part, "jaxpr"):
-                    yield from primitive_names(part)
+        for part in programs_within(equation):
+            yield from primitive_names(part)
+
+
+def programs_within(equation: Any) -> list[Any]:
+    """The programs that an equation calls."""
+    parts = [part for value in equation.params.values() for part in (value if isinstance(value, (tuple, list)) else [value])]
+    return [part for part in parts if hasattr(part, "eqns") or hasattr(part, "jaxpr")]
 
 
 def count_equations(program: Any) -> int:

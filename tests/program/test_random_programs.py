@@ -17,6 +17,7 @@ import jaxlag as jl
 from jaxlag._program.interpreter import Interpreter, evaluate
 from jaxlag._program.scalar_graph import SIMPLIFICATIONS, ScalarGraph
 from jaxlag._program.scalarise import JAX_ALGEBRA, scalarised
+from jaxlag._program.signed_zeros import equations_with_signed_zeros
 from jaxlag._program.sparse_jacobian import sparsity_pattern
 from jaxlag._program.structured_jacobian import structured_jacobian
 
@@ -109,11 +110,21 @@ def test_programs_with_other_numbers_are_left_to_jax(name):
     assert columns is None or np.allclose(columns, jax.jacfwd(gradient)(Q), rtol=1e-12)
 
 
+EQUAL = np.array([1.0, -1.0, 1.0])
 EXACT = {  # at each of the arguments, and equation by equation: XLA merges factors as well
     "a function of an element in place": (lambda x: x.at[np.array([0, 2])].apply(jnp.negative), [Q]),
     "an angle to the left": (lambda x: jnp.arctan2(x[2] - x[0], x[1]), [np.array([1.0, -1.0, 1.0]), np.array([0.0, -2.0, 0.0])]),
     "an angle of a negated difference": (lambda x: jnp.arctan2(-(x[2] - x[0]), x[1]), [np.array([1.0, -1.0, 1.0])]),
     "an angle from nothing": (lambda x: jnp.arctan2(0 - x[2], x[1]), [np.array([1.0, -1.0, 0.0])]),
+    "a slope": (lambda x: jnp.arctan(x[1] / (x[2] - x[0])), [EQUAL]),
+    "a slope the other way": (lambda x: jnp.arctan(x[1] / (x[0] - x[2])) + jnp.arctan(x[1] / (x[2] - x[0])), [EQUAL, Q]),
+    "a slope downwards": (lambda x: jnp.arctan(-x[1] / -(2 * (x[2] - x[0]))), [EQUAL]),
+    "a slope of a sum": (lambda x: jnp.arctan(x[1] / -(x[1] + x[2] - x[0] - x[1])), [EQUAL]),
+    "inverse powers": (lambda x: (x[2] - x[0]) ** -3 + lax.rsqrt(x[2] - x[0]) + (x[2] - x[0]) ** -1.0, [EQUAL]),
+    "within a choice": (lambda x: lax.cond(x[1] < 0, lambda d: x[1] / d, lambda d: d, x[2] - x[0]), [EQUAL]),
+    "within a loop": (lambda x: lax.fori_loop(0, 2, lambda i, c: (x[2] - x[0], 1 / c[0]), (x[1], x[1]))[1], [EQUAL]),
+    "within a function with a rule": (lambda x: jax.nn.relu(1 / (x[2] - x[0])) - jax.nn.relu(-1 / (x[2] - x[0])), [EQUAL]),
+    "a sign as bits": (lambda x: jnp.copysign(x[1], x[2] - x[0]), [EQUAL]),
     "factors far from 1": (lambda x: (1e200 * x) * (1e200 * x) * 1e-100, [np.full(3, 1e-180)]),
     "a factor that vanishes": (lambda x: (x * 1e-200) * 1e-200 * 1e300, [np.full(3, 1e120)]),
     "whole numbers that wrap around": (lambda x: x * x * x - 7 * x, [np.array([2**30, -(2**31), 5], np.int32)]),
@@ -132,6 +143,19 @@ def test_it_is_exact_where_jax_is(name):
         (expected,), (found,) = run_plain(closed, x), run_rewritten(closed, x)[0]
         np.testing.assert_array_equal(found, expected)
         np.testing.assert_array_equal(evaluate(closed, JAX_ALGEBRA, x)[0], expected)  # of numbers
+
+
+def test_differences_share_a_node_where_no_sign_of_a_zero_matters():
+    """Divisors that are not zero, squares and norms ask for none, so that mechanical systems lose nothing."""
+
+    def signed(function):
+        closed = jax.make_jaxpr(function)(1.0, 1.0)
+        found = equations_with_signed_zeros(closed)
+        return [equation.primitive.name for equation in closed.jaxpr.eqns if id(equation) in found and equation.primitive.name == "sub"]
+
+    assert not signed(lambda x, y: (x - y) * (y - x) / jnp.where(x - y > 0, x, 1) / jnp.where(x > 0, x, 1) / (x * x))
+    assert not signed(lambda x, y: 1 / jnp.sqrt((x - y) ** 2 + 1) + 1 / jnp.abs(y - x))
+    assert len(signed(lambda x, y: 1 / (x - y) + (y - x))) == 1
 
 
 def test_the_largest_of_equal_ones_shares_its_derivative():
