@@ -147,10 +147,22 @@ def states_at(
 
     By diffrax's own loop what has no nodes and is differentiated in reverse mode, or by an adjoint that the user has chosen.
     """
-    reverse = not isinstance(adjoint, dfx.ForwardMode)
-    if has_nodes(equations, args.params) or not (reverse or options.adjoint):
+    reverse, nodes = not isinstance(adjoint, dfx.ForwardMode), has_nodes(equations, args.params)
+    if nodes:
+        _refuse_adjoint(options.adjoint)
+    if nodes or not (reverse or options.adjoint):
         return in_one_loop(equations, options, t0, y0, ts, args, tolerances, reverse=reverse)
     return by_diffrax(equations, options, adjoint, t0, y0, ts, args, tolerances)
+
+
+def _refuse_adjoint(adjoint: dfx.AbstractAdjoint | None) -> None:
+    """Refuses what the loop over intervals has no part for: its derivatives are of its own steps, in forward or in reverse mode."""
+    if adjoint is None or isinstance(adjoint, dfx.ForwardMode) or getattr(adjoint, "checkpoints", 0) is None:
+        return
+    raise ValueError(
+        "`adjoint` must be `diffrax.ForwardMode()` or `diffrax.RecursiveCheckpointAdjoint()` where steps end at contacts, events, updates "
+        f"of states or nodes of signals, but is {adjoint!r}. Leave it out: derivatives of either mode are those of the steps."
+    )
 
 
 def by_diffrax(

@@ -74,7 +74,8 @@ def simulate(
     - `stabilisation`: how the constraints are maintained: `Projection()`, `Baumgarte(...)` or `NoStabilisation()`.
     - `friction`: treatment of dry friction: `StickSlip()` (exact Coulomb friction) or `Regularised(width)`.
     - `max_steps`: step limit.
-    - `adjoint`: a diffrax adjoint, used in place of the derivative rule of this package.
+    - `adjoint`: a diffrax adjoint, used in place of the derivative rule of this package; beside contacts, events, updates of states and
+      signals that jump or bend, either `diffrax.ForwardMode()` or `diffrax.RecursiveCheckpointAdjoint()`, for forward or reverse mode.
     - `works`: integrates the work of each term along with the motion, for `Trajectory.work()` and the energy balance.
     - `progress`: shows a progress bar on standard error; in a log, a line now and then. Says so where compilation takes long.
     - `throw`: whether a failure raises. If not, or under `jit`, `Trajectory.result` holds the reason, and samples not reached are NaN.

@@ -233,6 +233,24 @@ def test_an_adjoint_of_diffrax_can_be_asked_for(adjoint, derivative):
     np.testing.assert_allclose(derivative(lambda l: end(l, adjoint=adjoint))(1.0), jax.grad(end)(1.0), rtol=1e-9)
 
 
+STEPS_END = {
+    "an event": (jl.System(lambda q, qdot: 0.5 * qdot**2 - 2 * q**2, events={"top": jl.Event(lambda qdot: qdot)}), {}),
+    "a signal": (jl.System(lambda qdot: 0.5 * qdot**2, force=lambda t, u: u(t)), {"u": jl.Signal(jnp.arange(3.0), jnp.arange(3.0))}),
+}
+
+
+@pytest.mark.parametrize("name", STEPS_END)
+@pytest.mark.parametrize(
+    "adjoint", [diffrax.DirectAdjoint(), diffrax.RecursiveCheckpointAdjoint(checkpoints=5)], ids=["direct", "checkpoints"]
+)
+def test_an_adjoint_that_cannot_be_heeded_is_refused(name, adjoint):
+    system, params = STEPS_END[name]
+    with pytest.raises(
+        ValueError, match=r"`adjoint` must be `diffrax.ForwardMode\(\)` or .* where steps end at contacts, events, .* Leave it out"
+    ):
+        jl.simulate(system, 1.0, 0.0, [0.0, 1.0], params, adjoint=adjoint)
+
+
 @pytest.mark.slow
 def test_redundant_constraints_have_the_gradients_of_single_ones():
     rod = pendulum.cartesian_rod
