@@ -185,7 +185,9 @@ def _track(motion: Trajectory, at: np.ndarray, name: str, point: Callable) -> np
     x = np.asarray(jax.jit(jax.vmap(position))(state.ts, state.q, state.qdot))
     if x.shape[1] != 2:
         raise ValueError(f"`points` {name!r} must return a position (x, y), but returned {x.shape[1]} numbers. Return two.")
-    return x
+    known = np.all(np.isfinite(x), axis=1)  # not between two impacts within one interval of samples
+    within = lambda column: np.interp(fine, fine[known], column[known], np.nan, np.nan)
+    return x if np.all(known) or not np.any(known) else np.stack([within(column) for column in x.T], axis=1)
 
 
 def _forces(motion: Trajectory, at: np.ndarray, name: str, on: Mapping[str, Callable]) -> dict[str, np.ndarray]:

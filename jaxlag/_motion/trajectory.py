@@ -20,7 +20,7 @@ from .._model.flat import StatesAt, bind
 from .._program.jit import compiled, is_concrete
 from .card import card
 from .export import arrays_of, frame_of, outline, write_arrays
-from .interpolation import Moving, between
+from .interpolation import Moving, between, jumps
 from .moments import ContactState, EventState, FrictionState, Instant, Interpolated, with_counts
 from .provenance import Provenance, Recorded
 from .results import RESULTS, names_of
@@ -141,8 +141,10 @@ class Trajectory(eqx.Module):
            |\delta\ddot q| \le \frac{\sqrt3\,h^3}{216}\,|q^{(5)}| $$
 
         with h from sample to sample, where the motion is smooth; where friction changes or an input jumps between two samples, δq is of
-        the order of h² times the jump of q̈. `q_error` and `qdot_error` are estimates for both cases. λ is not interpolated: it follows
-        from the state by `acceleration`. Differentiable, also in `ts`.
+        the order of h² times the jump of q̈. Nothing is interpolated across an impact, or an event that changes the state: up to it and
+        from it on the motion follows from the sample on its side by q, q̇ and q̈, δq ≤ h³/6 |q⁽³⁾|, exact in free flight. Between the first
+        and the last of several in one interval it is NaN. `q_error` and `qdot_error` are estimates for all cases. λ is not interpolated:
+        it follows from the state by `acceleration`. Differentiable, also in `ts`.
 
         **Raises:** `ValueError` where a time lies outside the motion (under `jit` the state there is NaN), for many motions at once, and
         where there are less than two samples.
@@ -271,5 +273,8 @@ def _energies(motion):
 @compiled
 def _between(motion, at):
     unravelled = jax.vmap(ravel_pytree(jax.tree.map(lambda leaf: leaf[0], motion.q))[1])
-    found, error = between(motion.ts, Moving(*map(_ravelled, (motion.q, motion.qdot, motion.qddot))), at)
+    system = None if isinstance(motion.provenance, Recorded) else motion.provenance.system
+    changing = [event for name, event in motion.events.items() if system is None or dict(system.events)[name].then is not None]
+    of_motion = Moving(*map(_ravelled, (motion.q, motion.qdot, motion.qddot)))
+    found, error = between(motion.ts, of_motion, at, jumps(motion.ts, motion.contacts.values(), changing))
     return [unravelled(x) for x in (*found, error.q, error.v)]

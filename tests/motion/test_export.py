@@ -19,6 +19,7 @@ from oscillator import START, SYSTEM, TRUE, record
 from scipy.interpolate import BPoly, CubicHermiteSpline
 
 import jaxlag as jl
+from jaxlag._motion.moments import ContactState
 from jaxlag._motion.provenance import Provenance
 
 TS = np.array([0.0, 0.1, 0.25, 0.3, 0.55, 0.7])
@@ -122,6 +123,72 @@ def test_outside_there_is_nothing():
     traced = jax.jit(lambda t: motion.at(t).q["x"])
     assert np.all(np.isnan(traced(0.8))) and np.all(np.isfinite(traced(0.7)))
     assert np.all(np.isfinite(motion.at(0.7 * (1 + 1e-16)).q["x"]))
+
+
+BALL = jl.System(lambda q, qdot, g: 0.5 * qdot**2 - g * q, unilateral={"floor": jl.Contact(lambda q: q, restitution=lambda e: e)})
+
+
+def bounce(at, h, g, e):
+    """Position and velocity of a ball that falls from h, in closed form."""
+    start, v = np.sqrt(2 * h / g), np.sqrt(2 * g * h)
+    if at < start:
+        return h - g * at**2 / 2, -g * at
+    while at >= start + 2 * e * v / g:
+        v, start = e * v, start + 2 * e * v / g
+    return e * v * (at - start) - g * (at - start) ** 2 / 2, e * v - g * (at - start)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("length, time", [(1.0, 1.0), (1e-9, 1e6)], ids=["SI", "small and slow"])
+def test_a_bouncing_ball_between_samples_is_exact(length, time):
+    """Also at the impacts, of which the first is a sample of its own; between two of them in one interval nothing is known."""
+    unit, p = np.array([length, length / time]), {"g": 9.81 * length / time**2, "e": 0.8}
+    first = np.sqrt(2 / 9.81)
+    ts = np.sort([*np.linspace(0, 0.9, 10), first, 1.1, 1.9, 2.0])
+    motion = jl.simulate(BALL, length, 0.0, ts * time, p)
+    assert list(motion.contacts["floor"].impacts[-4:]) == [1, 1, 3, 3]
+    at = np.linspace(0, 1.1, 221)
+    expected = np.array([bounce(t, 1.0, 9.81, 0.8) for t in at])
+    found = motion.at(at * time)
+    np.testing.assert_allclose(found.q / unit[0], expected[:, 0], atol=1e-11)
+    np.testing.assert_allclose(found.qdot / unit[1], expected[:, 1], atol=1e-11)
+    np.testing.assert_allclose(found.qddot, -p["g"], rtol=1e-9)
+    assert np.all(found.q_error[at < 0.9] < 1e-9 * length)
+    before, unknown, behind = (motion.at(t * time).q for t in (1.15, 1.5, 1.85))
+    np.testing.assert_allclose([before / length, behind / length], [np.nan, bounce(1.85, 1.0, 9.81, 0.8)[0]], rtol=1e-9)
+    assert np.isnan(unknown)
+
+
+@pytest.mark.parametrize("length, time", [(1.0, 1.0), (1e-9, 1e6)], ids=["SI", "small and slow"])
+def test_samples_on_both_sides_of_impacts_are_not_joined(length, time):
+    """Known exactly, of a ball that leaves with its speed; the third interval has two impacts."""
+    g, v = 2 * length / time**2, 2 * length / time  # up and down in 2, from 1 at the start
+    fall = lambda t: np.stack([v * (t % 2) * time - g * ((t % 2) * time) ** 2 / 2, v - g * (t % 2) * time, np.full_like(t, -g)])
+    ts = np.array([0.2, 0.9, 1.6, 2.6, 3.0, 7.2, 7.8])
+    contact = [jnp.asarray(x) for x in (np.full(7, False), ts // 2, ts // 2 * 2 * time, np.zeros(7))]
+    motion = dataclasses.replace(given(ts * time, *fall(ts)), contacts={"floor": ContactState(*contact)})
+    at = np.array([0.2, 0.5, 1.7, 1.99, 2.01, 2.3, 2.9, 3.0, 6.1, 7.2, 7.5])
+    found = motion.at(at * time)
+    np.testing.assert_allclose([found.q, found.qdot, found.qddot], fall(at), rtol=1e-9, atol=1e-12 * v * time)
+    assert np.all(found.q_error[:6] < 1e-9 * length) and np.all(np.isnan(motion.at(np.array([3.1, 5.0, 5.99]) * time).q))
+
+
+@pytest.mark.slow
+def test_interpolation_at_impacts_is_differentiated_and_compiled():
+    ts, first = np.linspace(0, 0.6, 7), np.sqrt(2 / 9.81)
+    at = lambda e: jl.simulate(BALL, 1.0, 0.0, ts, {"g": 9.81, "e": e}).at(0.47)
+    np.testing.assert_allclose(jax.grad(lambda e: at(e).q)(0.8), np.sqrt(2 * 9.81) * (0.47 - first), rtol=1e-8)
+    np.testing.assert_allclose(jax.jit(lambda e: at(e).qdot)(0.8), bounce(0.47, 1.0, 9.81, 0.8)[1], rtol=1e-8)
+
+
+@pytest.mark.slow
+def test_nothing_is_interpolated_across_an_event_that_changes_the_state():
+    """A free mass is at 0.55, where it is put back to 0.2 and runs twice as fast; another event looks on."""
+    gate = jl.Event(lambda q: q - 0.55, lambda qdot: {"q": 0.2, "qdot": 2 * qdot}, most=1)
+    free = jl.System(lambda qdot: 0.5 * qdot**2, events={"gate": gate, "seen": jl.Event(lambda q: q - 0.32, most=3)})
+    found = jl.simulate(free, 0.0, 1.0, np.linspace(0, 0.7, 8)).at([0.31, 0.51, 0.549, 0.551, 0.58])
+    np.testing.assert_allclose(found.q, [0.31, 0.51, 0.549, 0.202, 0.26], rtol=1e-8)
+    np.testing.assert_allclose(found.qdot, [1, 1, 1, 2, 2], rtol=1e-8)
 
 
 @pytest.mark.parametrize(
