@@ -10,7 +10,7 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
-from .._mechanics.augmented_inertia import unit_lengths
+from .._mechanics.augmented_inertia import unit_lengths, units_of_mass
 from .._mechanics.friction_elements import FrictionElements, find_elements
 from .._mechanics.lagrange import applied_force, constraint_rows, inertia
 from .._mechanics.pseudo_inverse import FOLLOWS, SEEN
@@ -183,8 +183,7 @@ def steady_state(search: Search, system: System, t: Any, q: PyTree, qdot: PyTree
 def _units(M: Float[Array, "n n"]) -> Float[Array, " n"]:
     """Of the coordinates, such that the inertia of each is 1; 0 of those without inertia, and 1 of all where none has any."""
     mass = jax.lax.stop_gradient(jnp.diagonal(M))
-    units = jnp.where(mass > 0, jnp.where(mass > 0, mass, 1) ** -0.5, 0)
-    return jnp.where(jnp.any(mass > 0), units, 1)
+    return jnp.where(jnp.any(mass > 0), units_of_mass(mass), 1)
 
 
 def _described(equations: Equations, given: Given, root: Root) -> Rest:

@@ -32,7 +32,11 @@ def units_alike(M: lx.AbstractLinearOperator, rows: Sequence[Any]) -> Float[Arra
     if not isinstance(M, StructuredInertia) and not any(isinstance(G, SparseMatrix) for G in rows):
         M = M.as_matrix()
         return unit_lengths(M, jnp.concatenate([jnp.zeros((0, len(M)), M.dtype), *rows]))
-    mass = M.slopes.diagonal if isinstance(M, StructuredInertia) else jnp.diagonal(M.as_matrix())
+    return units_of_mass(M.slopes.diagonal if isinstance(M, StructuredInertia) else jnp.diagonal(M.as_matrix()))
+
+
+def units_of_mass(mass: Float[Array, " n"]) -> Float[Array, " n"]:
+    """Units in which each coordinate has inertia 1; 0 of what has none."""
     return jnp.where(mass > 0, jax.lax.rsqrt(jnp.where(mass > 0, mass, 1)), 0)
 
 
@@ -41,11 +45,13 @@ def alike(M: lx.AbstractLinearOperator, rows: Sequence[Any], size: Float[Array, 
     return by_weight(jax.lax.stop_gradient(units_alike(M, rows)), size)
 
 
-def by_weight(units: Float[Array, " n"], size: Float[Array, " n"]) -> Float[Array, " n"]:
+def by_weight(units: Float[Array, " n"], size: Float[Array, "n *k"]) -> Float[Array, "n *k"]:  # noqa: F821
     """Sizes of the numbers of a state, each at least what weighs as much as the largest of the others: mass tells what is small of a number
     that is zero.
     """
-    return jnp.maximum(size, units * jnp.max(jnp.where(units > 0, size / jnp.where(units > 0, units, 1), 0), initial=0.0))
+    units = units.reshape(-1, *[1] * (size.ndim - 1)).astype(size.dtype)
+    share = jnp.where(units > 0, size / jnp.where(units > 0, units, 1), 0)
+    return jnp.maximum(size, units * jnp.max(share, axis=0, keepdims=True, initial=0.0))
 
 
 def _weights(masses: Float[Array, " n"], squares: Float[Array, "m n"]) -> Float[Array, " m"]:

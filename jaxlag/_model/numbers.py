@@ -77,13 +77,17 @@ def number(
 @compiled
 def none_is_nan(params: PyTree) -> Bool[Array | np.ndarray, ""]:
     """Whether no entry of params is NaN. What a program makes of one may hide it: 0·x is 0, whatever x."""
-    leaves = [leaf for leaf in jax.tree.leaves(params) if jnp.issubdtype(getattr(leaf, "dtype", int), jnp.inexact)]
+    leaves = [leaf for leaf in jax.tree.leaves(params) if _may_be_nan(leaf)]
     return ~jnp.any(jnp.stack([jnp.any(jnp.isnan(leaf)) for leaf in leaves])) if leaves else np.array(True)
 
 
 def where_known(sound: Bool[Array | np.ndarray, ""], tree: PyTree) -> PyTree:
     """The numbers of a tree, where they are sound."""
-    return jax.tree.map(lambda x: jnp.where(sound, x, jnp.nan) if jnp.issubdtype(x.dtype, jnp.inexact) else x, tree)
+    return jax.tree.map(lambda x: jnp.where(sound, x, jnp.nan) if _may_be_nan(x) else x, tree)
+
+
+def _may_be_nan(x: Any) -> bool:
+    return jnp.issubdtype(getattr(x, "dtype", int), jnp.inexact)
 
 
 def refuse_nan(params: PyTree, sound: Bool[Array | np.ndarray, ""] | None = None) -> None:

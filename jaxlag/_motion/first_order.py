@@ -195,7 +195,7 @@ class EquationsOfMotion:
     def acceleration(self, mode: Flat, t, q, v) -> SaddlePoint:
         """q̈ and λ of the system in its mode."""
         feedback = self.formulation.stabilisation.feedback()
-        return scalarised(lambda t, q, v: constrained_acceleration(mode, t, q, v, feedback))(t, q, v)
+        return scalarised(lambda t, q, v: constrained_acceleration(mode, t, q, v, feedback), apart=True)(t, q, v)
 
     def accelerated(self, t, parts: Parts, args: Arguments, is_free: bool = False) -> SaddlePoint:
         """q̈ and λ in the mode of `parts`, or of the system `is_free` of its contacts: traced once, however often it is asked for."""

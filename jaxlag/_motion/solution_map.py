@@ -12,6 +12,7 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, PyTree
 
+from .._mechanics.augmented_inertia import units_of_mass
 from .._mechanics.lagrange import inertia
 from .._model.flat import StatesAt
 from .._model.signal import SinceOrigin, is_signal, origin_of, with_second_derivatives
@@ -227,8 +228,7 @@ def _units(equations: EquationsOfMotion, at: StatesAt, args: Arguments) -> Array
     if at.q.size >= MANY:
         return None
     M = inertia(equations.flat_at(args.params, at), at.t, at.q, at.v)[0]
-    mass = jnp.diagonal(M.as_matrix())
-    return jax.lax.stop_gradient(jnp.where(mass > 0, jax.lax.rsqrt(jnp.where(mass > 0, mass, 1)), 0))
+    return jax.lax.stop_gradient(units_of_mass(jnp.diagonal(M.as_matrix())))
 
 
 def _shares(inputs: Inputs, directions: Inputs, duration) -> Array:

@@ -20,6 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
+from .._mechanics.augmented_inertia import by_weight
 from .results import RESULTS, under_diffrax
 from .scales import SHARE, reaching
 
@@ -110,14 +111,14 @@ class StepControl(dfx.AbstractStepSizeController):
         return jnp.where(self._is_motion(size), jnp.maximum(reach, driven.reshape(-1, *[1] * (size.ndim - 1))), reach)
 
     def _rounding(self, reach, args):
-        """What a variation that changes no entry of y beyond its rounding, though its number changes by its own size, may err by; and the
-        rounding of rounding, which is left of an entry that constraints hold.
+        """What a variation may err by where it changes no entry of y beyond its rounding: beside what it changes elsewhere, as in the links
+        of a chain that it has yet to reach, and though its number changes by its own size.
         """
         if not self.variations:
             return 0.0
         eps, of_motion = jnp.finfo(reach.dtype).eps, reach[(..., *[0] * self.variations)]
         own = self._among_others(of_motion, args)
-        faint = (1e2 * eps) ** 2 * own.reshape(*own.shape, *[1] * self.variations) * self._changes(reach, args)
+        faint = 1e2 * eps * own.reshape(*own.shape, *[1] * self.variations) * self._changes(reach, args)
         if shares := self._shares(args):
             blur = eps * functools.reduce(jnp.multiply.outer, shares, of_motion)
             faint = jnp.maximum(faint, jnp.where(reach < MARGIN * blur, blur, 0))
@@ -135,8 +136,7 @@ class StepControl(dfx.AbstractStepSizeController):
         units = None if getattr(args, "scales", None) is None else args.scales.units
         if units is None:
             return reach
-        n, units = self.coordinates, units.reshape(-1, *[1] * (reach.ndim - 1)).astype(reach.dtype)
-        of = lambda part: jnp.maximum(part, units * jnp.max(_ratio_where(units > 0, part, units), axis=0, keepdims=True))
+        n, of = self.coordinates, lambda part: by_weight(units, part)
         return jnp.concatenate([of(reach[:n]), of(reach[n : 2 * n]), reach[2 * n :]])
 
     def _held(self, reach, args, h):

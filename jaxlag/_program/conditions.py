@@ -18,6 +18,7 @@ def _for_all_members(axis_size, in_batched, conditions):
     return everywhere(jnp.all(conditions)), False
 
 
+@jax.custom_jvp
 def computed_first(tree: Any, number: Float[Array, ""]) -> Any:
     """`tree`, which is computed before anything that uses it; `number` is any that the compiler does not know.
 
@@ -28,3 +29,9 @@ def computed_first(tree: Any, number: Float[Array, ""]) -> Any:
     if jax.default_backend() != "cpu":
         return tree
     return jax.lax.cond(everywhere(number == number), lambda tree: tree, jax.lax.optimization_barrier, tree)
+
+
+@computed_first.defjvp
+def _unchanged(primals, tangents):
+    """Changes go past the branch, in which those that nothing asks for would be zeros, and NaN beside a state that was not reached."""
+    return computed_first(*primals), tangents[0]

@@ -41,8 +41,7 @@ def scalarised(function: Callable, *, limit: int = 800, apart: bool = False) -> 
     What has no scalar form (a decomposition, a loop of unknown length) still works on arrays. A function of more than `limit` scalar
     operations is left as it is, and so is one whose variables are complex or of half precision. The results that an infinity or a NaN
     gives in 0·x, x − x or (1/√x)² are not kept, nor is the sign of a zero, except that of x − y where an angle or a quotient depends on
-    it. Results `apart` are put together entry by entry: where they are parts of one array, XLA computes what long chains of operations
-    share anew for each part.
+    it. Results `apart` are put together entry by entry, for programs in which others follow; alone, a batch is one kernel without.
     """
     # 700: a chain of 5 links has 633, and takes half the time of arrays; one of 6 links has 838, and its first derivative would take
     # four times as long to compile, a higher one twice as long (tests/benchmarks/bench_entries.py --limit 100000).
@@ -85,7 +84,9 @@ def _array(array: np.ndarray, dtype) -> jax.Array:
 
 
 def _selected(array: np.ndarray, dtype) -> jax.Array:
-    """The same of few entries without a concatenation."""
+    """The same of few entries without a concatenation: XLA computes what its parts share anew for each of them, and what these share, so
+    that a long chain of operations takes twice the time at each of its links.
+    """
     if not 1 < array.size <= FEW or all(map(is_number, array.flat)):
         return _array(array, dtype)
     wide = [lax.broadcast_in_dim(np.asarray(x, dtype) if is_number(x) else x, (array.size,), ()) for x in array.flat]
@@ -108,7 +109,7 @@ def _without_numbers(arrays: Iterable[np.ndarray]) -> tuple[list, Callable[[list
 
 
 def _whole(equation, *arrays):
-    given = [_array(x, atom.aval.dtype) for x, atom in zip(arrays, equation.invars, strict=True)]
+    given = [_selected(x, atom.aval.dtype) for x, atom in zip(arrays, equation.invars, strict=True)]
     return [_scalars(x) for x in as_function(equation)(*given)]
 
 

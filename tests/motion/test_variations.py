@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import mpmath
 import numpy as np
 import pytest
+import scipy.linalg
 
 import jaxlag as jl
 
@@ -175,3 +176,30 @@ def test_blocks_that_stick_at_first(length, time, mass):
     by_differences = [(motion(x + dx) - motion(x - dx)) / 2e-5 for dx in 1e-5 * jnp.eye(2)]
     np.testing.assert_allclose(jax.jacfwd(motion)(x), by_differences, rtol=1e-6)
     np.testing.assert_allclose(jax.jacrev(motion)(x), by_differences, rtol=1e-6)
+
+
+ROW = jl.System(
+    lambda q, qdot, c, s, E, T: E / s**2 * (0.5 * T**2 * qdot @ qdot - 0.5 * c * jnp.sum(jnp.diff(q, prepend=0.0) ** 2)),
+)
+
+
+@pytest.mark.parametrize("s, E, T", [(1.0, 1.0, 1.0), (1e-9, 1.0, 1.0), (1.0, 1e9, 1e9), (1e-9, 1e-12, 1e-9)])
+@pytest.mark.parametrize("c, start", [(2.0, 1.0), (0.0, 1.0), (2.0, 0.0)])
+def test_links_that_a_motion_has_yet_to_reach(s, E, T, c, start):
+    """Masses in a row, of which the first one's spring is stretched: what the last does grows as t^8 from nothing. 75 times the steps."""
+    n = 4
+    K = 2 * np.eye(n) - np.eye(n, k=1) - np.eye(n, k=-1)
+    K[-1, -1] = 1
+    nothing, one = np.zeros((n, n)), np.eye(n)
+    rates, of_c = np.block([[nothing, one], [-c * K, nothing]]), np.block([[nothing, nothing], [-K, nothing]])
+    exact = scipy.linalg.expm(5 * np.block([[rates, 0 * rates], [of_c, rates]])) @ np.concatenate([start * np.ones(n), np.zeros(3 * n)])
+
+    def last(c):
+        params = {"c": c, "s": s, "E": E, "T": T}
+        motion = jl.simulate(ROW, s * start * np.ones(n), np.zeros(n), T * np.linspace(0, 5, 6), params)
+        return motion.q[-1] / s, motion.stats["num_steps"]
+
+    for derivative in (jax.jacfwd, jax.jacrev):
+        slope, steps = derivative(last, has_aux=True)(c)
+        np.testing.assert_allclose(slope, exact[2 * n : 3 * n], atol=2e-8)
+        assert steps < 100
