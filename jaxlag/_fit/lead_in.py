@@ -22,6 +22,7 @@ SAMPLES = 10  # in a segment at least, where their number is not given,
 SEGMENTS = 20  # and as many of them at most
 AT_BOUND = 0.01  # margins from its bound; an estimate that is closer is moved inside
 MARGIN = 0.1  # of the distance between the bounds, or of the size of the parameter: how far inside at most, or where no error is known
+ALIKE = 1e-3  # of -2 log likelihood: fits that differ by less say the same, and the last is one of whole motions
 
 
 @dataclasses.dataclass(frozen=True)
@@ -91,7 +92,8 @@ def led_in(
         stage("whole motion", found.experiments, found.params, max_steps=most - FIRST_STEPS)
     if not fits:
         raise ValueError("`start` must lead to a motion that can be computed, but none could. Give other `params`, or more segments.")
-    best = min(fits, key=lambda fit: np.nan_to_num(fit.misfit, nan=np.inf))
+    misfits = [np.nan_to_num(fit.misfit, nan=np.inf) for fit in fits]
+    best = [fit for fit, misfit in zip(fits, misfits, strict=True) if misfit <= min(misfits) + ALIKE][-1]
     steps += [] if best is fits[-1] else [f"the best of them is number {fits.index(best) + 1}"]
     return dataclasses.replace(best, led_in=tuple(steps))
 

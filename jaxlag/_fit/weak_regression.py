@@ -15,6 +15,7 @@ from .window_scatter import COLOUR, OVERLAP, scatter
 from .windows import APART
 
 TINY = 1e-20  # of a term: its variation counts as none
+CANCELLED = 1e4  # roundings of terms that are subtracted, integrated over windows in which they cancel
 ROUNDING = 1e-9  # of the terms of an equation, what is left of them
 ROUNDS = 3  # of weighting the equations by their residuals
 
@@ -115,7 +116,10 @@ class Problem:
         """
         if not self.linear:
             return _rms(np.abs(r) + np.linalg.norm(J, axis=2))
-        size, slopes = _rms(r - J @ self._from_zero(y)), _rms(J)
+        here, slopes = self._from_zero(y), _rms(J)
+        size = _rms(r - J @ here)
+        eps = np.finfo(self.records[0].form.nodes.dtype).eps
+        size = np.where(size > CANCELLED * eps * (slopes @ np.abs(here)), size, 0)  # rounding is no term
         for _ in range(self.free.size):
             ratio = np.where((size[:, None] > 0) & (slopes > 0), size[:, None] / np.where(slopes > 0, slopes, 1), np.inf)
             most = np.min(ratio, axis=0, initial=np.inf)

@@ -32,7 +32,7 @@ def units_alike(M: lx.AbstractLinearOperator, rows: Sequence[Any]) -> Float[Arra
     if not isinstance(M, StructuredInertia) and not any(isinstance(G, SparseMatrix) for G in rows):
         M = M.as_matrix()
         return unit_lengths(M, jnp.concatenate([jnp.zeros((0, len(M)), M.dtype), *rows]))
-    return units_of_mass(M.slopes.diagonal if isinstance(M, StructuredInertia) else jnp.diagonal(M.as_matrix()))
+    return units_of_mass(M.slopes.diagonal if isinstance(M, StructuredInertia) else lx.diagonal(M))
 
 
 def units_of_mass(mass: Float[Array, " n"]) -> Float[Array, " n"]:

@@ -55,6 +55,8 @@ def reference(case: Case, question: str) -> Reference:
                 allowed[name] = 0.0
             if seen[name].within is not None:
                 allowed[name] = seen[name].within
+        for name in (name for name in tight if question in INTEGRATED and name.startswith("state ") and allowed[name]):
+            allowed[name] = max(allowed[name], allowed.get("q", 0.0))  # its rate is that of coordinates, and so is what it errs by
         KNOWN[key] = case, Reference(tight, allowed)
     return KNOWN[key][1]
 
