@@ -29,6 +29,8 @@ class Spectrum(NamedTuple):
     @property
     def rounding_of_pairs(self) -> np.ndarray:
         """What rounding does to each eigenvalue or to its conjugate, whichever is more."""
+        if not self.values.size:
+            return self.rounding
         other = np.argmin(np.abs(self.values[:, None].conj() - self.values[None, :]), axis=1)
         return np.maximum(self.rounding, self.rounding[other])
 

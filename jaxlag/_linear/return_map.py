@@ -22,6 +22,7 @@ from .newton import differentiable_root, is_nothing, least_change
 ITERATIONS = 30
 SECTION = "the section"  # among the events of the system
 LATER = 0.382  # of a period: whether the motion that returns does so there, too, is looked at
+MANY = 1000  # of the last digits of the clock: what they move is seen beside the errors of the integration
 
 
 class Setting(NamedTuple):
@@ -104,9 +105,13 @@ def orbit_near(system: System, setting: Setting, given: Given) -> Orbit:
         return after, time, slope
 
     later = given.t + (1 if is_forced else LATER) * frame.usual
-    ends, times, slopes = jax.lax.map(at, jnp.stack([given.t, later]))
+    starts = jnp.stack([given.t, later, later + MANY * jnp.finfo(later.dtype).eps * jnp.abs(later)])
+    ends, times, slopes = jax.lax.map(at, starts)
     left = ends[:, of] - w[None]
-    finds = lambda left: is_nothing(left, jnp.abs(slopes[0] - jnp.eye(w.size)) @ jnp.maximum(jnp.abs(w), scales))
+    of_clock = jnp.abs(left[2] - left[1]) / MANY  # late clocks tell the phase of a force to few digits
+    finds = lambda left: is_nothing(
+        jnp.maximum(jnp.abs(left) - of_clock, 0), jnp.abs(slopes[0] - jnp.eye(w.size)) @ jnp.maximum(jnp.abs(w), scales)
+    )
     values, here = eigen(slopes[0]).values[::-1], frame.first.at[of].set(w)
     checks = jnp.all(jnp.isfinite(frame.first)), finds(left[0]), finds(left[1])
     return Orbit(unravel(here), times[0], unravel(ends[0] - here), values, *jax.lax.stop_gradient((*checks, left[0])))
@@ -153,10 +158,17 @@ def _state(q, qdot, states, i):
 
 
 def _first_passage(system, setting, given):
-    """The state at the second passage of the motion from the guess, the time since the first, and that in which a third is looked for."""
+    """The state at the second passage of the motion from the guess, the time since the first, and that in which a third is looked for.
+
+    A guess that lies in the section and stays near it for a while passes through it more than once by rounding: these are one.
+    """
     passages = _motion(system, setting, given, given.start, given.t, given.longest).events[SECTION]
-    usual = passages.ts[1] - passages.ts[0]
-    return _state(passages.q, passages.qdot, passages.states, 1), usual, 1.9 * usual
+    since = passages.ts - passages.ts[0]
+    later = since > jnp.finfo(since.dtype).eps ** 0.5 * given.longest
+    i = jnp.argmax(later)
+    known = lambda x: jnp.where(jnp.any(later), x, jnp.nan)
+    usual = known(since[i])
+    return known(_state(passages.q, passages.qdot, passages.states, i)), usual, 1.9 * usual
 
 
 def _forced(setting, given):

@@ -179,7 +179,7 @@ def given_state(q: Any, qdot: Any, t: Any, params: PyTree) -> tuple[PyTree, PyTr
 
 def _spectrum(at: float, A: np.ndarray, basis: np.ndarray) -> Spectrum:
     """That of a matrix, in the coordinates of the basis."""
-    values, vectors, bound = map(np.asarray, eigen_and_rounding(A))
+    values, vectors, bound = map(np.asarray, eigen_and_rounding(A)) if A.size else (np.zeros(0, complex), A + 0j, np.zeros(0))
     return Spectrum(at, values, basis @ vectors, bound)
 
 

@@ -131,11 +131,22 @@ class Contacts(NamedTuple):
     acceleration: Float[Array, " c"]
 
     @classmethod
-    def of(cls, flat: Flat, t, q, v, candidates: Bool[Array, " c"], loose: Float[Array, " c"] | None = None) -> "Contacts":
-        """All candidates closed; those that are `loose` open where no more than that presses them."""
+    def of(
+        cls,
+        flat: Flat,
+        t,
+        q,
+        v,
+        candidates: Bool[Array, " c"],
+        loose: Float[Array, " c"] | None = None,
+        least: Float[Array, " c"] | None = None,
+    ) -> "Contacts":
+        """All candidates closed; those that are `loose` open where no more than that presses them, at an acceleration of no less than
+        the `least`.
+        """
         force, acceleration = jax.lax.stop_gradient(scalarised(lambda t, q, v: _scales(flat, t, q, v))(t, q, v))
         force = force if loose is None else jnp.where(loose > 0, -force - loose, force)
-        return cls(candidates, candidates, jnp.array(0), force, acceleration)
+        return cls(candidates, candidates, jnp.array(0), force, acceleration if least is None else jnp.maximum(acceleration, least))
 
     def applied_to(self, flat: Flat) -> Flat:
         """The system with those that are closed."""
@@ -173,7 +184,15 @@ class Chosen(NamedTuple):
     consistent: Bool[Array, ""]
 
 
-def select_closed(flat: Flat, t, q, v, candidates: Bool[Array, " c"], loose: Float[Array, " c"] | None = None) -> Chosen:
+def select_closed(
+    flat: Flat,
+    t,
+    q,
+    v,
+    candidates: Bool[Array, " c"],
+    loose: Float[Array, " c"] | None = None,
+    least: Float[Array, " c"] | None = None,
+) -> Chosen:
     """Which of the candidates are closed, without friction."""
     t, q, v = jax.lax.stop_gradient((t, q, v))
 
@@ -183,7 +202,7 @@ def select_closed(flat: Flat, t, q, v, candidates: Bool[Array, " c"], loose: Flo
         return contacts.next(flat, t, q, v, qddot, multipliers)
 
     most = 4 * len(flat.contacts) + 2 ** min(len(flat.contacts), 10)
-    start = Contacts.of(flat, t, q, v, candidates, loose), jnp.any(candidates)
+    start = Contacts.of(flat, t, q, v, candidates, loose, least), jnp.any(candidates)
     contacts, changes = jax.lax.while_loop(lambda carry: carry[1] & (carry[0].turn < most), turn, start)
     return Chosen(contacts.closed, None, ~changes)
 

@@ -87,7 +87,9 @@ def of_numbers(numbers, distances, defect, dtype):
             "do not trust them, and report the functions of this system as an error of jaxlag"
         )
     if numbers["degrees_of_freedom"] == 0:
-        yield "no degree of freedom is left: the constraints hold every coordinate"
+        names = ", ".join(map(repr, numbers["dissipated"]))
+        beside = f"; of dissipation {names} only λ tells, and dry friction carries nothing at rest" if names else ""
+        yield f"no degree of freedom is left: the constraints hold every coordinate{beside}"
     for name, count in numbers["redundant"].items():
         yield (
             f"of constraint {name!r} {count} of the rows follow from those before: the motion is unique, λ is the one of least norm; "

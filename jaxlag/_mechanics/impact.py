@@ -19,7 +19,7 @@ from jaxtyping import Array, Bool, Float
 
 from .._model.flat import Flat, rows_by_name
 from .constrained_slip import on_constraints
-from .contact import Contacts, accelerated, contact_rows, gap_rates, in_contact, select_closed
+from .contact import ROUNDING, Contacts, accelerated, contact_rows, gap_rates, in_contact, select_closed
 from .friction_elements import FrictionElements, with_all_masses
 from .friction_treatment import Regularised, StickSlip
 from .lagrange import constraint_rows, inertia
@@ -67,7 +67,10 @@ def impact(flat: Flat, elements: FrictionElements | None, t, q, v, near: Bool[Ar
     phases = [_phase(flat, elements, t, q, v, near, returned)]
     if of_poisson.any():
         (compression,) = phases
-        phases.append(_phase(flat, elements, t, q, compression.v, near, returned, jnp.where(of_poisson, e * compression.impulses, 0)))
+        given = jnp.where(of_poisson, e * compression.impulses, 0)
+        little = jnp.finfo(v.dtype).eps ** ROUNDING  # what compression leaves of rates closes no contact that departs as e grows
+        loose = little * jax.lax.stop_gradient(jnp.where(of_poisson, jnp.stack([compression.impulses, jnp.abs(rates)]), 0))
+        phases.append(_phase(flat, elements, t, q, compression.v, near, returned, given, tuple(loose)))
     total = functools.partial(functools.reduce, jnp.add)
     impulses, gained, exchanged = (total([getattr(phase, name) for phase in phases]) for name in ("impulses", "gained", "exchanged"))
     works = {name: total([phase.works[name] for phase in phases]) for name in phases[0].works}
@@ -75,18 +78,20 @@ def impact(flat: Flat, elements: FrictionElements | None, t, q, v, near: Bool[Ar
     return Impact(phases[-1].v, impulses, works, consistent, *jax.lax.stop_gradient((gained <= RISE * exchanged, impulsive)))
 
 
-def _phase(flat, elements, t, q, v, near, returned, given=None) -> Phase:
-    """An impact in which ġ⁺ + `returned` ≥ 0 and impulses are at least those `given`."""
+def _phase(flat, elements, t, q, v, near, returned, given=None, loose=()) -> Phase:
+    """An impact in which ġ⁺ + `returned` ≥ 0 and impulses are at least those `given`; `loose`: what more of impulses and what rates are
+    rounding.
+    """
     approach = gap_rates(flat, t, q, v)
     fast, of_impact = _in_fast_time(flat, elements, t, q, v, returned, given)
     zero, origin = jnp.zeros_like(t), jnp.zeros_like(q)
     if elements is None or of_impact is None:
-        chosen = select_closed(fast, zero, origin, origin, near)
+        chosen = select_closed(fast, zero, origin, origin, near, *loose)
         after, multipliers, _ = accelerated(in_contact(fast, chosen.closed), zero, origin, origin)
         lost, rubbed, consistent, impulsive = jnp.zeros((), v.dtype), {}, chosen.consistent, jnp.array(True)
     else:
         everywhere, still = jnp.ones(of_impact.size, bool), jnp.zeros(of_impact.element_of_row.size, v.dtype)
-        contacts = Contacts.of(fast, zero, origin, origin, near)
+        contacts = Contacts.of(fast, zero, origin, origin, near, *loose)
         mode, contacts = select_mode(fast, of_impact, zero, origin, origin, still, everywhere, ~everywhere, contacts)
         sigma, held, consistent = mode.sigma, mode.held, mode.consistent
         fast = contacts.applied_to(fast)

@@ -20,14 +20,14 @@ from .state_vector import Parts
 from .witnesses import matching, sides
 
 
-def behind_end(equations: EquationsOfMotion, t, y, args: Arguments, ended: Bool[Array, " m"]) -> Change:
-    """y behind the end of modes of friction and contact, and behind the events, that `ended` marks."""
+def behind_end(equations: EquationsOfMotion, t, y, args: Arguments, ended: Bool[Array, " m"], moved: Float[Array, " m"]) -> Change:
+    """y behind the end of modes of friction and contact, and behind the events, that `ended` marks; see `changed`."""
     if not equations.events:
-        return changed(equations, t, y, args, ended)
-    modes, passed = jnp.split(ended, [equations.elements + equations.contacts])
-    yes = jnp.array(True)
+        return changed(equations, t, y, args, ended, moved)
+    count, yes = equations.elements + equations.contacts, jnp.array(True)
+    modes, passed = jnp.split(ended, [count])
     same = lambda: Change(y, yes, yes, yes, yes)
-    change = jax.lax.cond(jnp.any(modes), lambda: changed(equations, t, y, args, modes), same) if modes.size else same()
+    change = jax.lax.cond(jnp.any(modes), lambda: changed(equations, t, y, args, modes, moved[:count]), same) if count else same()
     after, consistent = _settled(equations, t, y, change.y, args, passed | _struck(equations, y, change.y))
     return change._replace(y=after, consistent=change.consistent & consistent)
 

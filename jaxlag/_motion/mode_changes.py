@@ -164,8 +164,8 @@ def at_end(equations: EquationsOfMotion, t, y, args: Arguments, slopes: Float[Ar
 
 
 @jitted
-def changed(equations: EquationsOfMotion, t, y, args: Arguments, ended: Bool[Array, " m"]) -> Change:
-    """y in the mode that follows when those of the elements and contacts `ended` end."""
+def changed(equations: EquationsOfMotion, t, y, args: Arguments, ended: Bool[Array, " m"], moved: Float[Array, " m"]) -> Change:
+    """y in the mode that follows when those of the elements and contacts `ended` end. Slip may be off by `moved`, by the rounding of t."""
     assert args.scales is not None  # ends are located
     parts = equations.parts(y)
     flat, _, elements = equations.mode(t, parts, args)
@@ -173,23 +173,25 @@ def changed(equations: EquationsOfMotion, t, y, args: Arguments, ended: Bool[Arr
     if not equations.contacts:
         assert elements is not None
         stuck, errors = sticking(elements, parts.sigma) | (parts.held > 0), args.scales.of_velocities(parts.v)
-        slow = _slow(elements, t, parts, errors)
+        slow = _slow(elements, t, parts, errors, moved)
         at_rest, there = stuck | of_friction | (slow & ~elements.driven), parts.without(errors)
         given = parts.q, there.v, parts.sigma, at_rest, of_friction & stuck
         mode, _ = select_mode(flat, elements, t, *given, friction_in=in_other(equations, t, there, args))
         after = equations.in_new_mode(t, in_other_mode(elements, parts, mode).y, args)
         return Change(after, mode.consistent, jnp.array(True), jnp.array(True), jnp.all(~of_friction | stuck | slow))
     errors = args.scales.of_positions(parts.q), args.scales.of_velocities(parts.v)
-    return behind_contact(equations, t, parts, args, of_friction, of_contact, errors)
+    return behind_contact(equations, t, parts, args, of_friction, of_contact, errors, moved=moved)
 
 
-def _slow(elements: FrictionElements, t, parts: Parts, errors):
-    """Which elements slip by no more than errors of the velocities amount to."""
-    return elements.norms(elements.slip(t, parts.q, parts.v)) <= slip_of(elements, t, parts.q, parts.v, errors)
+def _slow(elements: FrictionElements, t, parts: Parts, errors, moved):
+    """Which elements slip by no more than errors of the velocities and of the time amount to."""
+    slack = 0 if moved is None else jnp.where(jnp.isfinite(moved), moved, 0)[: elements.size]
+    return elements.norms(elements.slip(t, parts.q, parts.v)) <= slip_of(elements, t, parts.q, parts.v, errors) + slack
 
 
-def behind_contact(equations: EquationsOfMotion, t, parts: Parts, args: Arguments, of_friction, of_contact, errors, anew=False) -> Change:
-    """y behind the end of modes of friction and contact; `errors` of positions and velocities, within which contacts touch and slip rests.
+def behind_contact(equations: EquationsOfMotion, t, parts: Parts, args: Arguments, of_friction, of_contact, errors, anew=False, moved=None):
+    """y behind the end of modes of friction and contact; `errors` of positions and velocities, within which contacts touch and slip rests;
+    `moved`: slip that is rounding of the time as well, where that is known.
 
     `anew`: whether what slides and what sticks follows from the motion alone, as it does behind an impact.
     """
@@ -223,7 +225,7 @@ def behind_contact(equations: EquationsOfMotion, t, parts: Parts, args: Argument
         chosen = select_closed(flat, t, q, found.v, resting, loose)
         slow = stuck = jnp.ones_like(of_friction)
     else:
-        stuck, slow = sticking(elements, parts.sigma) | (parts.held > 0), _slow(elements, t, parts, errors[1])
+        stuck, slow = sticking(elements, parts.sigma) | (parts.held > 0), _slow(elements, t, parts, errors[1], moved)
         slip = elements.slip(t, q, found.v)
         size = elements.norms(slip)[elements.element_of_row]
         anew = is_impact | anew | jnp.any(of_contact & ~closed)

@@ -160,16 +160,15 @@ class StickSlipSolver(ProjectedSolver):
         slack = jnp.maximum(late[nearest], args.scales.rounding)  # times near zero are finer than what happens at them
         usable = jnp.any(falling) & (end >= t0 - slack) & (end <= t1)
         located = split._replace(first=done, cut=split.cut._replace(time=end, estimate=estimate, usable=usable))
-        moved = jax.lax.stop_gradient(jnp.where(falling, -slope, 0) * args.scales.rounding)  # by the last digit of the time
+        moved = jnp.where(falling, -slope, 0) * args.scales.rounding  # by the last digit of the time
         ended = (jnp.arange(value.size) == nearest) | falling & (value <= SIMULTANEOUS * moved)
-        is_exact = jnp.all(~ended | jnp.isfinite(moved) & (jnp.abs(value) <= moved))
-        return jax.lax.cond(last, lambda: self._change(located, ended, is_exact, args), lambda: located)
+        return jax.lax.cond(last, lambda: self._change(located, ended, moved, args), lambda: located)
 
-    def _change(self, split: Split, ended, is_exact, args) -> Split:
-        """With the state in the mode that follows when those of the elements `ended` end, which is known to the last digit of the time."""
-        found = behind_end(self.equations, split.cut.time, split.first.y, args, ended)
+    def _change(self, split: Split, ended, moved, args) -> Split:
+        """With the state in the mode that follows when those of the elements `ended` end; margins may be off by `moved`."""
+        found = behind_end(self.equations, split.cut.time, split.first.y, args, ended, moved)
         fine = {"consistent": found.consistent, "dissipates": found.dissipates, "impulsive": found.impulsive}
-        cut = split.cut._replace(y=found.y, **fine, usable=split.cut.usable & (found.at_rest | is_exact))
+        cut = split.cut._replace(y=found.y, **fine, usable=split.cut.usable & found.at_rest)
         return split._replace(cut=cut)
 
     def _joined(self, split: Split, t0, t1, y0, args):

@@ -151,6 +151,14 @@ def test_branches_keep_their_column_where_frequencies_pass_each_other():
         assert sum(np.allclose(column, branch, rtol=1e-9, atol=1e-9) for column in columns) == 1
 
 
+def test_free_masses_have_no_branch_that_crosses():
+    """All eigenvalues are zero, and stay so."""
+    free = jl.System(lambda qdot, m: 0.5 * m * qdot @ qdot)
+    found = jl.root_locus(free, jnp.zeros(2), params={"m": 1.0}, over="m", values=[1.0, 2.0])
+    np.testing.assert_array_equal(found.eigenvalues, np.zeros((2, 4)))
+    assert found.crossings == ()
+
+
 @pytest.mark.parametrize("per_time", [1.0, 1e6, 1e-6])
 @pytest.mark.parametrize("k2", [1.0, 4.0])
 def test_branches_that_cross_in_opposite_directions_are_both_seen(k2, per_time):

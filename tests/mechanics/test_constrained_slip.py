@@ -65,6 +65,90 @@ def test_a_sledge_stops_on_a_slope_that_holds_it():
     assert motion.stats["transitions"][-1] == 1
 
 
+@pytest.mark.parametrize("dtype", [jnp.float64, jnp.float32])
+@pytest.mark.filterwarnings("ignore:jaxlag runs in single precision")
+def test_a_block_crosses_a_table_in_space(dtype):
+    """On a straight line over x and y, with what presses it on the table, a multiplier, as normal force; s(μ) = v²/2μg."""
+    table = jl.System(
+        lambda q, qdot, m: 0.5 * m * qdot @ qdot - m * G * q[2],
+        dissipation=lambda qdot, multipliers, mu: mu * jnp.abs(multipliers["table"]) * dissipation.speed(qdot),
+        holonomic={"table": lambda q: q[2]},
+    )
+    start = jnp.zeros(3, dtype), jnp.array([1.8, 2.4, 0.0], dtype), jnp.linspace(0, 2, 11, dtype=dtype)
+    slide = lambda mu: jl.simulate(table, *start, {"m": jnp.asarray(2.0, dtype), "mu": mu})
+    motion, along, far = slide(jnp.asarray(0.3, dtype)), np.array([0.6, 0.8, 0]), 4.5 / (0.3 * G)
+    rtol = 1e-10 if dtype == jnp.float64 else 1e-4
+    np.testing.assert_allclose(motion.q[-1], far * along, rtol=rtol, atol=rtol)
+    np.testing.assert_allclose(jax.jacfwd(lambda mu: slide(mu).q[-1])(jnp.asarray(0.3, dtype)), -far / 0.3 * along, rtol=rtol, atol=rtol)
+    assert motion.q.dtype == dtype and motion.stats["transitions"][-1] == 1 and not np.any(motion.qdot[-1])
+
+
+@pytest.mark.parametrize("dtype", [jnp.float64, jnp.float32])
+@pytest.mark.filterwarnings("ignore:jaxlag runs in single precision")
+def test_a_block_on_a_moving_belt_slides_sticks_and_slides(dtype):
+    """Closed form: from rest it swings about x₀ = μmg/c till it is as fast as the belt, is carried to x₀ and swings on from there."""
+    m, c, mu = (jnp.asarray(x, dtype) for x in (2.0, 8.0, 0.3))
+    belt = jl.System(
+        lambda q, qdot, m, c: plane(q, qdot, m) - 0.5 * c * q[0] ** 2,
+        dissipation=lambda qdot, m, mu, V: mu * m * G * dissipation.speed(qdot - jnp.stack([V, 0.0 * V])),
+        holonomic={"belt": lambda q: q[1]},
+    )
+    ts = jnp.linspace(0, 3, 31, dtype=dtype)
+    ride = lambda V: jl.simulate(belt, jnp.zeros(2, dtype), jnp.zeros(2, dtype), ts, {"m": m, "c": c, "mu": mu, "V": V})
+
+    def closed_form(V):
+        rest, w = mu * m * G / c, jnp.sqrt(c / m)
+        sticks = jnp.arcsin(V / (rest * w)) / w
+        there = rest * (1 - jnp.cos(w * sticks))
+        slips = sticks + (rest - there) / V
+        carried = jnp.where(ts < slips, there + V * (ts - sticks), rest + V / w * jnp.sin(w * (ts - slips)))
+        return jnp.where(ts < sticks, rest * (1 - jnp.cos(w * ts)), carried)
+
+    V, rtol = jnp.asarray(0.7, dtype), 1e-6 if dtype == jnp.float64 else 1e-3
+    motion = ride(V)
+    np.testing.assert_allclose(motion.q[:, 0], closed_form(V), atol=rtol)
+    np.testing.assert_allclose(jax.jacfwd(lambda V: ride(V).q[:, 0])(V), jax.jacfwd(closed_form)(V), atol=10 * rtol)
+    assert motion.q.dtype == dtype and motion.stats["transitions"][-1] == 2
+
+
+def bead_by_scipy(F, until):
+    """On y = x², from stop to stop: x at the end, and how often it turned."""
+    arc = lambda x: np.sqrt(1 + 4 * x**2)
+    rate = lambda t, y, way: [y[1], (-4 * y[0] * y[1] ** 2 - 2 * G * y[0] - way * F * arc(y[0])) / arc(y[0]) ** 2]
+    stops = lambda t, y, way: y[1]
+    t, x, turns = 0.0, 1.0, 0
+    while t < until and (turns == 0 or 2 * G * abs(x) > F * arc(x)):
+        way = -1 if x > 0 else 1
+        stops.terminal, stops.direction = True, -way
+        leg = solve_ivp(rate, (t, until), [x, way * 1e-300], "DOP853", events=stops, rtol=1e-12, atol=1e-13, args=(way,))
+        t, x, turns = leg.t[-1], leg.y[0, -1], turns + (leg.status == 1)
+    return x, turns
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore:jaxlag runs in single precision")
+def test_a_bead_on_a_parabola_turns_and_stops_as_in_its_abscissa():
+    """It rests after some half-swings; where it rests depends on F through all of them."""
+    wire = jl.System(
+        lambda q, qdot: plane(q, qdot, 1.0),
+        dissipation=lambda qdot, F: F * dissipation.speed(qdot),
+        holonomic=lambda q: q[1] - q[0] ** 2,
+    )
+    x, turns = bead_by_scipy(1.0, 12.0)
+    by_scipy = (bead_by_scipy(1 + 1e-4, 12.0)[0] - bead_by_scipy(1 - 1e-4, 12.0)[0]) / 2e-4
+    for dtype, atol, rtol in ((jnp.float64, 1e-7, 1e-5), (jnp.float32, 2e-3, 2e-2)):
+        start = jnp.ones(2, dtype), jnp.zeros(2, dtype), jnp.linspace(0, 12, 7, dtype=dtype)
+
+        def slide(F, start=start):
+            motion = jl.simulate(wire, *start, {"F": F})
+            return motion.q[-1, 0], motion
+
+        slope, motion = jax.jacfwd(slide, has_aux=True)(jnp.asarray(1.0, dtype))
+        np.testing.assert_allclose(motion.q[-1], [x, x**2], atol=atol)
+        assert motion.q.dtype == dtype and motion.stats["transitions"][-1] == turns > 3 and not np.any(motion.qdot[-1])
+        np.testing.assert_allclose(slope, by_scipy, rtol=rtol)
+
+
 def pendulum_by_scipy(F, until):
     """From stop to stop: the angle from the horizontal of a rod of length 1 with F‖q̇‖ at its end; and how often it turned."""
     swing, stops = lambda t, y, way: [y[1], -G * np.cos(y[0]) - way * F], lambda t, y, way: y[1]

@@ -113,3 +113,5 @@ def test_a_check_up_without_inertia_and_without_freedom():
     assert "has no inertia" in " ".join(found.findings) and found.smallest_inertia == 0
     held = jl.System(lambda qdot: 0.5 * qdot**2, holonomic=lambda q: q)
     assert "no degree of freedom" in " ".join(jl.examine(held, 0.0, 0.0).findings)
+    rubbing = jl.System(lambda qdot: 0.5 * qdot**2, dissipation={"rub": lambda qdot: jnp.abs(qdot)}, holonomic=lambda t, q: q - t)
+    assert "of dissipation 'rub' only λ tells" in " ".join(jl.examine(rubbing, 0.0, 1.0).findings)

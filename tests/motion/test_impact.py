@@ -190,12 +190,15 @@ def test_the_pecking_woodpecker():
 
 @pytest.mark.slow
 def test_derivatives_by_a_restitution_at_its_bounds():
-    """From a wall at e v, in any unit of length: dq/de = v (t − t_hit) = 2 at 0 and at 1 too, and 0 beyond them."""
-    wall = jl.System(lambda qdot: 0.5 * qdot**2, unilateral={"wall": jl.Contact(lambda q: q, restitution=lambda e: e)})
-    at = jax.value_and_grad(lambda e, unit: jl.simulate(wall, unit, -2 * unit, np.linspace(0, 1.5, 4), {"e": e}).q[-1] / unit)
-    for unit in (1.0, 1e9, 1e-9):
-        for e, there, slope in ((0.0, 0.0, 2.0), (1.0, 2.0, 2.0), (0.5, 1.0, 2.0), (1.2, 2.0, 0.0)):
-            np.testing.assert_allclose(at(e, unit), [there, slope], rtol=1e-9, atol=1e-12)
+    """From a wall at e v, by both laws and in any unit of length: dq/de = v (t − t_hit) = 2 at 0 and at 1 too, and 0 beyond them."""
+    for law in (jl.Newton(), jl.Poisson()):
+        wall = jl.System(lambda qdot: 0.5 * qdot**2, unilateral={"wall": jl.Contact(lambda q: q, restitution=lambda e: e, law=law)})
+        at = jax.value_and_grad(
+            lambda e, unit, wall=wall: jl.simulate(wall, unit, -2 * unit, np.linspace(0, 1.5, 4), {"e": e}).q[-1] / unit
+        )
+        for unit in (1.0, 1e9, 1e-9):
+            for e, there, slope in ((0.0, 0.0, 2.0), (1.0, 2.0, 2.0), (0.5, 1.0, 2.0), (1.2, 2.0, 0.0)):
+                np.testing.assert_allclose(at(e, unit), [there, slope], rtol=1e-9, atol=1e-12)
 
 
 @pytest.mark.slow
