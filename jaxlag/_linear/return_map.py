@@ -109,11 +109,10 @@ def orbit_near(system: System, setting: Setting, given: Given) -> Orbit:
     ends, times, slopes = jax.lax.map(at, starts)
     left = ends[:, of] - w[None]
     of_clock = jnp.abs(left[2] - left[1]) / MANY  # late clocks tell the phase of a force to few digits
-    finds = lambda left: is_nothing(
-        jnp.maximum(jnp.abs(left) - of_clock, 0), jnp.abs(slopes[0] - jnp.eye(w.size)) @ jnp.maximum(jnp.abs(w), scales)
-    )
+    sizes = jnp.abs(slopes[0] - jnp.eye(w.size)) @ jnp.maximum(jnp.abs(w), scales)
+    finds = [is_nothing(jnp.maximum(jnp.abs(off) - of_clock, 0), sizes) for off in left[:2]]
     values, here = eigen(slopes[0]).values[::-1], frame.first.at[of].set(w)
-    checks = jnp.all(jnp.isfinite(frame.first)), finds(left[0]), finds(left[1])
+    checks = jnp.all(jnp.isfinite(frame.first)), *finds
     return Orbit(unravel(here), times[0], unravel(ends[0] - here), values, *jax.lax.stop_gradient((*checks, left[0])))
 
 
