@@ -23,6 +23,7 @@ ITERATIONS = 30
 SECTION = "the section"  # among the events of the system
 LATER = 0.382  # of a period: whether the motion that returns does so there, too, is looked at
 MANY = 1000  # of the last digits of the clock: what they move is seen beside the errors of the integration
+BY_STEPS = 10  # of them, what a motion errs by where each of some hundred steps errs by one
 
 
 class Setting(NamedTuple):
@@ -108,7 +109,7 @@ def orbit_near(system: System, setting: Setting, given: Given) -> Orbit:
     starts = jnp.stack([given.t, later, later + MANY * jnp.finfo(later.dtype).eps * jnp.abs(later)])
     ends, times, slopes = jax.lax.map(at, starts)
     left = ends[:, of] - w[None]
-    of_clock = jnp.abs(left[2] - left[1]) / MANY  # late clocks tell the phase of a force to few digits
+    of_clock = BY_STEPS * jnp.abs(left[2] - left[1]) / MANY  # late clocks tell the phase of a force to few digits
     sizes = jnp.abs(slopes[0] - jnp.eye(w.size)) @ jnp.maximum(jnp.abs(w), scales)
     finds = [is_nothing(jnp.maximum(jnp.abs(off) - of_clock, 0), sizes) for off in left[:2]]
     values, here = eigen(slopes[0]).values[::-1], frame.first.at[of].set(w)

@@ -27,6 +27,7 @@ from .scales import SHARE, reaching
 FIRST_STEP = 1e-3  # of the motion; each step that is refused may be a fifth as long, each that is kept ten times
 UNRESOLVED = 1e-4  # of its own scale, the error of what is rounding: a jump of a rate would err less in a step as short as FAR
 FAR = 1e-4  # of the length tried before: six steps that were refused
+BRIEF = 1e-6  # of the motion, the shortest step in which a late clock says less than the tolerance asks for
 MARGIN = 1e3  # times its last error, what rounding may err by: so that it does not hold the next steps back
 SHARE_OF_VARIATIONS = 0.1  # of theirs: they cross zero more often (a vehicle's three at rtol 1e-8: 106 steps, and 101 for the motion alone)
 
@@ -81,6 +82,7 @@ class StepControl(dfx.AbstractStepSizeController):
         size = jnp.maximum(scale.size, jnp.abs(y1))
         reach = self._reach(size, args)
         allowed = self.allowed(jnp.maximum(jnp.abs(y0), jnp.abs(y1)), reach) + self._rounding(reach, args) + self._held(reach, args, h)
+        allowed = allowed + self._of_the_clock(args) * jnp.abs(y1 - y0) / jnp.maximum(h, BRIEF * self.duration)
         first = jnp.maximum(scale.first, h)
         found = self._noise(scale.size, error, allowed, reach, h, first)
         growth = jnp.where(scale.growth > 0, scale.growth, found / jnp.where(h > 0, h, jnp.inf))
@@ -149,6 +151,11 @@ class StepControl(dfx.AbstractStepSizeController):
         if shares := self._shares(args):
             changes = jnp.maximum(changes, functools.reduce(jnp.multiply.outer, shares)[None])
         return moved.reshape(-1, *[1] * (reach.ndim - 1)) * changes
+
+    def _of_the_clock(self, args):
+        """What the times that functions see round more than those of the motion: y there is known to what it moves by meanwhile."""
+        scales = getattr(args, "scales", None)
+        return 0.0 if scales is None else scales.grain - scales.rounding
 
     def _shares(self, args):
         """Of the motion and each direction of its variations, the share by which it changes a number at most, where that is known."""

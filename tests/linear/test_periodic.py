@@ -60,10 +60,12 @@ def test_forced_vibration():
     np.testing.assert_allclose([orbit.q, orbit.qdot, orbit.period], [A.real, (1j * w * A).real, T], rtol=1e-8)
     expected = np.exp((-d + 1j * np.sqrt(1 - d**2)) * T)
     np.testing.assert_allclose(sorted(orbit.multipliers, key=np.imag), sorted([expected, expected.conj()], key=np.imag), rtol=1e-8)
-    late = 1.7e9  # a clock that tells the phase to 3e-7
-    orbit = jl.periodic(forced, 1.0, 0.0, {"w": w}, section=jl.Every(lambda w: 2 * jnp.pi / w), t=late)
-    turned = A * np.exp(1j * w * late)
-    np.testing.assert_allclose([orbit.q, orbit.qdot], [turned.real, (1j * w * turned).real], atol=1e-6)
+    for late in (1e9, 1.7e9):  # clocks that tell the phase to 3e-7
+        orbit = jl.periodic(forced, 1.0, 0.0, {"w": w}, section=jl.Every(lambda w: 2 * jnp.pi / w), t=late)
+        turned = A * np.exp(1j * w * late)
+        np.testing.assert_allclose([orbit.q, orbit.qdot], [turned.real, (1j * w * turned).real], atol=2e-6)
+        motion = jl.simulate(forced, turned.real, (1j * w * turned).real, late + np.linspace(0, T, 9), {"w": w}, rtol=1e-11)
+        np.testing.assert_allclose(motion.q, (A * np.exp(1j * w * np.asarray(motion.ts))).real, atol=2e-6)
 
 
 @pytest.mark.slow
