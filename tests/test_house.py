@@ -94,6 +94,7 @@ WINGS = {  # each imports only from those above it, and each file of a wing only
         "friction_elements",
         "constrained_slip",
         "load_sharing",
+        "slip_direction",
         "stick_slip",
         "friction_treatment",
         "contact",

@@ -92,8 +92,9 @@ def _left(flat: Flat, elements: FrictionElements, t, q, v) -> Left:
     eps, terms = jnp.finfo(v.dtype).eps, jnp.abs(s0) + jnp.abs(A @ basis.T) @ jnp.abs(b)
     rounding = eps**NOISE * terms + 4 * eps * jnp.abs(A) @ jnp.abs(root * v)
     size = lambda rows: elements.sums(jnp.sum(rows**2, axis=1))
-    there = size(rest) > eps ** (2 * NOISE) * size(A)
     of, line = elements.element_of_row, jnp.zeros(elements.size, bool)
+    there, seen = size(rest) > eps ** (2 * NOISE) * size(A), jnp.sum(rest**2, axis=1) > eps ** (2 * NOISE) * size(A)[of]
+    rest = rest - jax.lax.stop_gradient(jnp.where(seen[:, None], 0, rest))  # no rounding, but what it changes by
     free = jnp.diag(there[of].astype(v.dtype))  # of a single row all or nothing
     for e in np.flatnonzero(elements.is_vector):
         mine = np.flatnonzero(of == e)

@@ -47,10 +47,10 @@ def inverse_of(S: Float[Array, "m m"], c: Float[Array, "m k"], singular: Callabl
     if m < 2:
         D = jnp.where(size > 0, 1 / jnp.where(size > 0, size, 1), 0)
         return Inverse(jnp.array(True), D, S, S), jnp.all((size > 0)[:, None] | (c == 0))
-    there = size > (4 * eps) ** 2 * jnp.max(size)  # a row of nothing but rounding has no part in it
+    there = size > (4 * eps) ** 2 * jnp.max(size)  # what is less may be nothing but rounding, and is refused
     D = jnp.where(there, jax.lax.rsqrt(jnp.where(there, size, 1)), 0)
     nearly_zero = jnp.abs(c) <= eps**FOLLOWS * jnp.max(jnp.abs(c), axis=0, keepdims=True)
-    follows = jnp.all(there[:, None] | nearly_zero)
+    follows = jnp.all(there[:, None] | (nearly_zero & (size == 0)[:, None]))
     one, nothing = jnp.eye(m, dtype=S.dtype), jnp.zeros_like(S)
     scaled = S * jnp.outer(D, D) + jnp.diag(~there).astype(S.dtype)
     regular = everywhere(jnp.all(jnp.diagonal(jnp.linalg.cholesky(scaled - m * eps**0.5 * one)) > 0))
@@ -75,7 +75,9 @@ def by_rows(asked: Request, D) -> tuple[Float[Array, "m m"], Bool[Array, ""]]:
     bound = FARTHER * (length(asked.free) + length(moved)) if asked.reach is None else of_rows(asked.reach)[:, None]
     bound = bound / jnp.max(jnp.abs(U), axis=0)[:, None]  # a direction of many rows goes as far as what all of them touch
     held = clear | (seen & jnp.all(jnp.abs(step) <= bound, axis=1))
-    contradicts = jnp.abs(rest) > eps**FOLLOWS * (of_rows(jnp.abs(wanted)) + length(asked.free))
+    of_each = jnp.abs(wanted) + jnp.sqrt((rows != 0).astype(rest.dtype) @ asked.free**2)  # what each row asks for, and sees move
+    rounding = 10 * len(D) * eps * jnp.max(of_each, axis=0, keepdims=True)  # U errs by eps in every row, if it has a part in it or not
+    contradicts = jnp.abs(rest) > eps**FOLLOWS * (jnp.abs(U.T) @ of_each) + rounding
     satisfied = ~jnp.any(~held & ((values > eps**NOISE * values[0]) | jnp.any(contradicts, axis=1)))
     return _by_values(values**2, U, held, D), satisfied
 

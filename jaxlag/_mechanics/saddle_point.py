@@ -280,7 +280,8 @@ def _solve(A, factor, B):
 
 CONTRADICTION = (
     "`holonomic` and `nonholonomic` must not contradict each other, but no acceleration satisfies them all here, or two rows are too "
-    "nearly the same to tell. Look for constraints that say nearly the same; put a state by hand on them by `consistent_state`."
+    "nearly the same to tell, or one is lost in the rounding of another. Look for constraints that say nearly the same, or multiply one by "
+    "a number; put a state by hand on them by `consistent_state`."
 )
 NO_INERTIA = (
     "`lagrangian` must give every direction inertia that no constraint holds, but the mass matrix is singular "

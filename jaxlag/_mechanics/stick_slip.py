@@ -23,6 +23,7 @@ from .constrained_slip import directed, extent_of, freely, on_constraints
 from .friction_elements import FrictionElements
 from .load_sharing import may_share, shared
 from .massless import completed, nearest_velocity, smooth_force
+from .slip_direction import friction_and_direction, unit
 
 
 def in_mode(flat: Flat, elements: FrictionElements, sigma: Float[Array, " r"]) -> Flat:
@@ -68,7 +69,7 @@ def sticking(elements: FrictionElements, sigma: Float[Array, " r"]) -> Bool[Arra
 
 class Friction(NamedTuple):
     """At one state in one mode: acceleration and multipliers; per row, friction force and rate of the slip; per element, its bound, the
-    margin of its mode, negative where that has ended, and whether constraints drive its slip.
+    margin of its mode, negative where that has ended, whether constraints drive its slip, and whether that is along a line.
     """
 
     qddot: Float[Array, " n"]
@@ -78,6 +79,7 @@ class Friction(NamedTuple):
     bound: Float[Array, " e"]
     margin: Float[Array, " e"]
     driven: Bool[Array, " e"]
+    straight: Bool[Array, " e"]
 
 
 # Scalar operations: those of an acceleration that is scalar code, and half as many for what follows from it. One with a rod and an element
@@ -110,9 +112,9 @@ def _friction(flat, elements, sigma, t, q, v, feedback):
     bound = bound_of(multipliers)
     force = jnp.where(stuck[of], freely(elements, multipliers[flat.rows :]), -pull(bound)[0])
     going = elements.sums(directed(elements, sigma) * slip) + jnp.where(elements.straight, 0, 1e-6 * elements.near_rest)
-    driven = jnp.broadcast_to(elements.driven, stuck.shape)
+    driven, straight = (jnp.broadcast_to(x, stuck.shape) for x in (elements.driven, elements.straight))
     resting = jnp.where(driven, -jnp.abs(bound), left + 1e2 * jnp.finfo(v.dtype).eps * jnp.abs(bound))
-    return Friction(qddot, multipliers, force, slip_rate, bound, jnp.where(stuck, resting, going), driven)
+    return Friction(qddot, multipliers, force, slip_rate, bound, jnp.where(stuck, resting, going), driven, straight)
 
 
 def bounds(elements: FrictionElements, sigma, t, q, v, multipliers) -> Float[Array, " e"]:
@@ -174,42 +176,41 @@ def select_mode(
 ) -> tuple[Mode, Any]:
     """Mode selection where the elements `at_rest` have no slip; the others continue to slip along σ.
 
-    All at rest stick, except those `breaking` away at their bound. One by one, the element farthest beyond its bound slips against its
-    force, and one that would start backwards sticks again, until none is beyond its bound and none moves backwards. Of dependent
-    elements some may be at their bound while others hold them: one of the possible shares, with the same motion for all.
-
-    Where one of the `contacts` pulls or goes deeper in the mode that was found, it changes and all begins anew. `friction_in(σ, contacts)`
-    is the friction of this state in another mode, where there is a program of it already.
+    All at rest stick, except those `breaking` away at their bound; where some have several rows, they begin as they do together
+    (`slip_direction`). One by one, the element farthest beyond its bound slips against its force, and one that would start backwards
+    sticks again, until none is beyond its bound and none moves backwards. Of dependent elements some may be at their bound while others
+    hold them: one of the possible shares, with the same motion for all. Where one of the `contacts` pulls or goes deeper in this mode, it
+    changes and all begins anew. `friction_in(σ, contacts)` is the friction of this state in another mode, if there is a program of it.
     """
-    of, friction_in = elements.element_of_row, friction_in or _in_modes(flat, elements, t, q, v)
-    loose = jnp.finfo(v.dtype).tiny ** 0.25  # a σ of this length slips without a force
-    no, most = jnp.zeros(elements.size, bool), 4 * elements.size + 6
+    of, no, most = elements.element_of_row, jnp.zeros(elements.size, bool), 4 * elements.size + 6
+    friction_in = friction_in or _in_modes(flat, elements, t, q, v)
 
     def turn(search):
         mode, stage = search.mode, search.stage
         released = at_rest & ~sticking(elements, mode.sigma)
         freed = jnp.where(stage == LOOSE, at_rest, released & (stage == HOLD))
-        found = friction_in(jnp.where(freed[of], loose, mode.sigma), search.contacts)
+        of_mode, kinds = lambda sigma: friction_in(sigma, search.contacts), (freed, released, stage == LOOSE, jnp.any(breaking))
+        found, turned, turns = friction_and_direction(elements, of_mode, mode.sigma, *kinds, search.free_rate)
         rate = elements.norms(found.slip_rate)
 
-        stuck = sticking(elements, mode.sigma)
-        over = jnp.where(stuck & ~found.driven, -found.margin, -jnp.inf)
+        over = jnp.where((stuck := sticking(elements, mode.sigma)) & ~found.driven, -found.margin, -jnp.inf)
         idle = search.contacts.unloaded(found.bound)  # let go at once, and for good: it has no part in what the others do
         beyond = _greatest(over, (over > 0) & ~idle)
         backwards = -elements.sums(found.slip_rate * mode.sigma)
-        returning = _greatest(backwards, released & ~idle & (backwards > jnp.where(search.clearly, 0, 1e-6 * search.free_rate)))
+        holds = released & ~idle & ~(elements.is_vector & (found.bound == 0))
+        returning = _greatest(backwards, holds & (backwards > jnp.where(search.clearly, 0, 1e-6 * search.free_rate)))
         torn = _torn(elements, t, q, v, found, search.free_rate, over > -jnp.inf) & ~jnp.any(beyond) | (stuck & found.driven)
         along = (over > -1e-6 * jnp.abs(found.bound)) & elements.are_shared  # those of a share break away together
         leaving = jnp.where((stage == FIRST) & jnp.any(breaking), breaking | along, beyond | torn)
         leaving = (leaving & (stage != LOOSE)) | (idle & (over > -jnp.inf))
-        returning = returning & ~jnp.any(leaving)
+        returning = returning & ~jnp.any(leaving) & ~turns
         onward = jnp.where((rate > 0)[of], found.slip_rate, elements.slip(t, q, v))
         way = jnp.where(((beyond | breaking | along) & ~found.driven)[of], -found.force, onward)
-        size = elements.norms(way)[of]
-        away = jnp.where(idle[of], 1, way / jnp.where(size > 0, size, 1))
-        sigma = jnp.where(leaving[of], away, jnp.where(returning[of], 0, mode.sigma))
-        clearly = (search.clearly | (leaving & (over > 1e-6 * jnp.abs(found.bound)))) & ~returning
-        in_current_mode = ~jnp.any(leaving | returning)
+        away = jnp.where(idle[of], 1, unit(elements, way))
+        sigma = jnp.where(leaving[of], away, jnp.where(returning[of], 0, turned))
+        far = (stage == LOOSE) & ~sticking(elements, turned) | leaving & (over > 1e-6 * jnp.abs(found.bound))
+        clearly = (search.clearly | far) & ~returning
+        in_current_mode = ~jnp.any(leaving | returning) & ~turns
         agrees = in_current_mode & jnp.all(jnp.isfinite(found.force))
 
         all_slip = (stage == LOOSE) & ~jnp.any(at_rest)  # nothing to choose
@@ -229,7 +230,7 @@ def select_mode(
                 jnp.where(within, found.bound, mode.bound),
             ),
             jnp.where(anew, 0, search.turns + 1),
-            jnp.where(within, clearly & ~anew, search.clearly),
+            jnp.where(within | (stage == LOOSE), clearly & ~anew, search.clearly),
             jnp.where(stage == LOOSE, rate, search.free_rate),
         )
 

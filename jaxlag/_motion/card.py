@@ -47,7 +47,9 @@ def card(motion: Any) -> str:
         rows.append(("one-sided", _pulled(name, pulls, motion)))
     rows.append(("result", "successful" if np.all(motion.succeeded) else reason_of(motion.result)))
     of = f"{' × '.join(map(str, batch))} motions of " if batch else ""
-    head = f"Trajectory: {of}{motion.ts.shape[-1]} samples, t = {np.min(motion.ts):g} … {np.max(motion.ts):g}"
+    begin, end = float(np.min(motion.ts)), float(np.max(motion.ts))
+    late = int(np.log10(max(abs(begin), abs(end)) / (end - begin))) if end > begin else 0  # digits that a late clock does not change
+    head = f"Trajectory: {of}{motion.ts.shape[-1]} samples, t = {begin:.{6 + late}g} … {end:.{6 + late}g}"
     return "\n".join([head, *(f"  {name:<15}{value}" for name, value in rows)])
 
 

@@ -50,3 +50,19 @@ def test_what_contradicts_itself_is_seen(length):
     system = jl.System(lambda qdot, s: 0.5 * (qdot / s) ** 2, holonomic=DRIVES)
     with pytest.raises(ValueError, match="none was found"):
         jl.consistent_state(system, 0.5 * length, 0.9 * length, {"s": length}, t=0.5)
+
+
+@pytest.mark.parametrize("n", [3, 80])
+def test_a_row_is_held_in_any_unit_or_refused(n):
+    """q₁ = q₂ = … under forces 1, 2, …: all move with their mean. A row 1e-16 of others had no effect, without a word."""
+
+    def links(q, unit):
+        return jnp.diff(q).at[1].multiply(unit)
+
+    chain = jl.System(lambda q, qdot: 0.5 * qdot @ qdot + q @ jnp.arange(1.0, n + 1), holonomic={"links": links})
+    at = lambda unit: jl.acceleration(chain, jnp.zeros(n), jnp.zeros(n), {"unit": unit}).qddot
+    for unit in (1e-14, 1e-9, 1e9, 1e14):
+        np.testing.assert_allclose(at(unit), (n + 1) / 2, rtol=1e-9)
+    for unit in (1e-18, 1e18):
+        with pytest.raises(ValueError, match="lost in the rounding of another"):
+            at(unit)

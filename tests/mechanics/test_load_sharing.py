@@ -122,3 +122,36 @@ def test_a_plate_slides_to_rest_on_four_legs():
     h = np.array([1e-5, 0.0, 0.0])
     slope = (end(load + h) - end(load - h)) / 2e-5
     np.testing.assert_allclose(jax.grad(end)(load)[0], slope, rtol=1e-5)
+
+
+def test_plates_begin_to_move_where_all_their_legs_let_them():
+    """From rest, under loads below and beyond what friction holds: q̈ minimises ½ (q̈ − f)ᵀM(q̈ − f) + Σ F ‖J q̈‖, which is convex, so that
+    no direction leads down from it. The direction of slip was that of the force which would have held: up to 30 % off. In all units.
+    """
+    legs_of = 4
+    start = jl.System(
+        lambda qdot, m, J: 0.5 * m * (qdot[0] ** 2 + qdot[1] ** 2) + 0.5 * J * qdot[2] ** 2,
+        dissipation=lambda q, qdot, legs, F: jnp.sum(F * jnp.linalg.norm(slips(q, qdot, legs), axis=1)),
+        force=lambda load: load,
+    )
+    begins = jax.jit(lambda params: jl.acceleration(start, jnp.zeros(3), jnp.zeros(3), params).qddot)
+    rng, slipped = np.random.default_rng(5), []
+    for _ in range(300):
+        length, mass, time = 10.0 ** rng.uniform(-6, 6, 3)
+        legs, F = rng.normal(size=(legs_of, 2)), rng.uniform(0.2, 2, legs_of) * (rng.random(legs_of) < 0.8)
+        legs[1] = (legs[0], -legs[0], legs[1])[rng.integers(3)]
+        m, J = 10.0 ** rng.uniform(-1, 1, 2)
+        load, unit, force = rng.normal(size=3) * 10.0 ** rng.uniform(-1, 1), np.array([1, 1, length]), mass * length / time**2
+        given = {"m": m * mass, "J": J * mass * length**2, "legs": legs * length, "F": F * force, "load": load * unit * force}
+        a = np.asarray(begins(given)) * unit * time**2 / length
+        M, jacobian = np.array([m, m, J]), jacobians(legs)
+        slip = jacobian @ a
+        size = np.linalg.norm(slip, axis=1)
+        moves = size > 1e-8 * np.max(np.abs(load / M))
+        descent = M * a - load + np.einsum("e,erk,er->k", F * moves / np.where(moves, size, 1), jacobian, slip)
+        ways = rng.normal(size=(4000, 3))
+        ways /= np.linalg.norm(ways, axis=1, keepdims=True)
+        held = np.einsum("e,ew->w", np.where(moves, 0, F), np.linalg.norm(np.einsum("erk,wk->erw", jacobian, ways), axis=1))
+        assert np.min(ways @ descent + held) > -1e-7 * np.max(np.abs(load))
+        slipped.append(np.sum(moves & (F > 0)))
+    assert min(slipped.count(k) for k in range(5)) > 3  # legs that slip while others stay

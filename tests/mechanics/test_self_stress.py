@@ -159,6 +159,127 @@ def test_a_ring_of_twelve_points_stops_with_all_of_them(speed):
     np.testing.assert_allclose(motion.q[-1], np.array(speed) ** 2 / 2.4, rtol=1e-7, atol=1e-12)
 
 
+def wedge_energy(q, qdot, m, M):
+    pushed, lifted = qdot["X"] ** 2 + qdot["Y"] ** 2, qdot["x"] ** 2 + qdot["y"] ** 2
+    return 0.5 * (M * pushed + m * lifted) - G * (M * q["Y"] + m * q["y"])
+
+
+def on_the_face(qdot, multipliers, mu, slope):
+    x, y = qdot["x"] - qdot["X"], qdot["y"] - qdot["Y"]
+    return mu * jnp.abs(multipliers["face"]) * jnp.abs(x * jnp.cos(slope) - y * jnp.sin(slope))
+
+
+wedge = jl.System(
+    wedge_energy,
+    dissipation={
+        "on the floor": lambda qdot, multipliers, mu: mu * jnp.abs(multipliers["floor"]) * jnp.abs(qdot["X"]),
+        "at the wall": lambda qdot, multipliers, mu: mu * jnp.abs(multipliers["wall"]) * jnp.abs(qdot["y"]),
+        "on the face": on_the_face,
+    },
+    force=lambda t, rate, begin: {"X": rate * (t - begin)},
+    holonomic={
+        "floor": lambda q: q["Y"],
+        "wall": lambda q: q["x"],
+        "face": lambda q, slope: (q["x"] - q["X"]) * jnp.sin(slope) + (q["y"] - q["Y"]) * jnp.cos(slope),
+    },
+)
+
+
+def test_a_wedge_lifts_a_load():
+    """From μ M g + m g tan(α + 2φ) on, μ = tan φ, and then with ẍ = (P − P₀) / (M + m tan α tan(α + 2φ)); a steep one is driven out below
+    m g tan(α − 2φ) − μ M g. The clock is late.
+    """
+    m, M, slope, rate, begin = 3.0, 2.0, 0.2, 10.0, 1e6
+    still = dict.fromkeys("XYxy", 0.0)
+    numbers = {"m": m, "M": M, "slope": slope, "rate": rate, "begin": begin}
+    lifts = lambda mu: mu * M * G + m * G * jnp.tan(slope + 2 * jnp.arctan(mu))
+    falls = lambda mu: m * G * jnp.tan(slope - 2 * jnp.arctan(mu)) - mu * M * G
+
+    def x_at(mu, P):
+        return float(jl.acceleration(wedge, still, still, numbers | {"mu": mu}, t=begin + P / rate).qddot["X"])
+
+    for mu in (0.05, 0.2):
+        assert x_at(mu, lifts(mu) - 1e-3) < 1e-9 < x_at(mu, lifts(mu) + 1e-3)
+    assert x_at(0.05, falls(0.05) - 1e-3) < -1e-9 < x_at(0.05, falls(0.05) + 1e-3)
+
+    def exact(mu):
+        late = 5.0 - lifts(mu) / rate
+        return rate * late**3 / 6 / (M + m * jnp.tan(slope) * jnp.tan(slope + 2 * jnp.arctan(mu)))
+
+    lifted = lambda mu: jl.simulate(wedge, still, still, begin + np.array([0.0, 5.0]), numbers | {"mu": mu}).q["X"][-1]
+    height, slope_of = jax.value_and_grad(lifted)(0.2)
+    np.testing.assert_allclose(height, exact(0.2), rtol=1e-8)
+    np.testing.assert_allclose(slope_of, jax.grad(exact)(0.2), rtol=1e-7)
+
+
+def beside(side, name):
+    return lambda qdot, multipliers, mu, wide: mu * jnp.abs(multipliers[name]) * jnp.abs(qdot["x"] - side * wide * qdot["phi"])
+
+
+drawer = jl.System(
+    lambda qdot, m, J: 0.5 * m * (qdot["x"] ** 2 + qdot["y"] ** 2) + 0.5 * J * qdot["phi"] ** 2,
+    dissipation={"beside the front": beside(1.0, "front"), "beside the rear": beside(-1.0, "rear")},
+    force=lambda t, rate, begin, e: {"x": rate * (t - begin), "phi": -rate * (t - begin) * e},
+    holonomic={
+        "front": lambda q, long: q["y"] + long / 2 * q["phi"],
+        "rear": lambda q, long: q["y"] - long / 2 * q["phi"],
+    },
+)
+
+
+def test_a_drawer_jams():
+    """Pulled so far beside its middle that 2 μ e > l, whatever the force: it stays, and stops where it was in motion. In millimetres."""
+    mu, m, rate, long, begin, end = 0.3, 4.0, 5.0, 500.0, 1e6, 3.0
+    numbers = {"m": m, "J": 2e5, "wide": 400.0, "rate": rate, "long": long, "begin": begin}
+    still = {"x": 0.0, "y": 0.0, "phi": 0.0}
+
+    def x(mu, e, v=0.0, end=end):
+        given = numbers | {"mu": mu, "e": e}
+        return jl.simulate(drawer, still, still | {"x": v}, begin + np.array([0.0, end]), given).q["x"][-1]
+
+    np.testing.assert_allclose(x(mu, 700.0), rate * (1 - 2 * mu * 700 / long) / m * end**3 / 6, rtol=1e-9)
+    np.testing.assert_allclose(x(mu, 850.0), 0, atol=1e-9)
+    stops = lambda mu, e, v: 2 / 3 * v * jnp.sqrt(2 * v * m / (rate * (2 * mu * e / long - 1)))  # after √(2 v m / rate (2 μ e / l − 1))
+    far, slope_of = jax.value_and_grad(x)(0.4, 900.0, 2.0)
+    np.testing.assert_allclose(far, stops(0.4, 900.0, 2.0), rtol=1e-8)
+    np.testing.assert_allclose(slope_of, jax.grad(stops)(0.4, 900.0, 2.0), rtol=1e-7)
+
+
+def face(side, name):
+    def D(qdot, multipliers, mu, slope):
+        slip = jnp.stack([qdot["x"], qdot["y"] * jnp.cos(slope) - side * qdot["z"] * jnp.sin(slope)])
+        return mu * jnp.abs(multipliers[name]) * jl.dissipation.speed(slip)
+
+    return D
+
+
+trough = jl.System(
+    lambda q, qdot, m: 0.5 * m * (qdot["x"] ** 2 + qdot["y"] ** 2 + qdot["z"] ** 2) - m * G * q["z"],
+    dissipation={"on the left": face(1.0, "left"), "on the right": face(-1.0, "right")},
+    force=lambda t, rate: {"x": rate * t},
+    holonomic={
+        "left": lambda q, slope: q["y"] * jnp.sin(slope) + q["z"] * jnp.cos(slope),
+        "right": lambda q, slope: q["z"] * jnp.cos(slope) - q["y"] * jnp.sin(slope),
+    },
+)
+
+
+def test_a_block_in_a_trough():
+    """Planar friction of both sides, whose normal forces decide it: pulled along, it moves from P = μ m g / cos α on. It was said that its
+    constraints contradict each other: across the trough they hold it alone, and what rounding left there counted as a contradiction.
+    """
+    m, mu, slope, rate, end = 2.0, 0.4, 0.6, 5.0, 3.0
+    still, numbers = dict.fromkeys("xyz", 0.0), {"m": m, "slope": slope, "rate": rate}
+    limit = lambda mu: mu * m * G / np.cos(slope)
+    for P in (0.0, limit(mu) - 1e-6):
+        assert abs(jl.acceleration(trough, still, still, numbers | {"mu": mu}, t=P / rate).qddot["x"]) < 1e-12
+    along = lambda mu: jl.simulate(trough, still, still, np.array([0.0, end]), numbers | {"mu": mu}).q["x"][-1]
+    exact = lambda mu: rate * (end - limit(mu) / rate) ** 3 / 6 / m
+    far, slope_of = jax.value_and_grad(along)(mu)
+    np.testing.assert_allclose(far, exact(mu), rtol=1e-8)
+    np.testing.assert_allclose(slope_of, jax.grad(exact)(mu), rtol=1e-7)
+
+
 def test_grasps_of_a_batch_are_those_of_each():
     """A thousand loads at a time: on a CPU one after the other, on threads that do not wait for each other."""
     normal, tangential, _, mu = grasp(np.random.default_rng(3))

@@ -94,6 +94,7 @@ def main():
     count = -(-args.count // len(pairs))
     total, failed, shown, begin = collections.Counter(), collections.Counter(), set(), time.perf_counter()
     for question, kind, n in pairs:
+        jax.clear_caches()  # thousands of programs in one process exceed what a system maps
         if time.perf_counter() - begin > 60 * args.minutes:
             print(f"not asked: {question} {kind} n = {n}")
             continue

@@ -1,0 +1,124 @@
+"""The direction in which elements of several rows begin to slip: that of their slip rate, which their friction has a part in.
+
+With w(σ) = ṡ where friction −F σ acts at rest, s = w(s/‖s‖) is the slip after a unit of time: the gradient, in the metric of the masses,
+of the convex ½‖s − w(0)‖² + Σ F_i ‖s_i‖ is zero. Where a load rises up to the bound, the friction that held it has this direction already;
+where it begins beyond the bound, as one that is switched on, it has not. It is looked for with s/√(‖s‖² + δ²), of an ever smaller δ, and
+made exact by Newton's method.
+Source: Moreau, Unilateral contact and dry friction in finite freedom dynamics (1988), section 8.
+"""
+
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from .friction_elements import FrictionElements
+
+ACROSS = 1e-9  # of the slip rate, what may be left of it across σ
+CLEAR = 1e-6  # of that without friction, a slip rate whose direction can be made exact
+CHANGE = 1e-3  # of σ, for the derivative of w, which is affine in σ but where bounds move with the multipliers
+SMALLEST = 0.6  # power of eps, δ beside the scale of the slip rates in the end
+SLIPS = 30  # times it, what may slip; friction at 0.9995 of its bound slips by as much
+SURELY = 1e-4  # of its scale, what slips beside what breaks away, for which s is some δ^(2/3)
+TURNS = 6  # of Newton's method for each δ
+PARTS = 0.5 ** np.arange(6)  # of a step, of which the best is taken
+
+
+def friction_and_direction(
+    elements: FrictionElements,
+    friction_in: Callable,
+    sigma: Float[Array, " r"],
+    freed: Bool[Array, " e"],
+    released: Bool[Array, " e"],
+    anew: Bool[Array, ""],
+    breaks: Bool[Array, ""],
+    free_rate: Float[Array, " e"],
+) -> tuple[Any, Float[Array, " r"], Bool[Array, ""]]:
+    """Friction in the mode σ, with those `freed` without a force; σ, with those as they begin to slip or stick together where all begins
+    `anew`, and others that begin to slip, being `released`, turned by one step to where they go; and whether any of these was. Where one
+    `breaks` away at its bound, the force that held it says more of small slip rates.
+
+    One program of `friction_in` serves all: it runs once, and once for each row where σ is to be changed.
+    """
+    of, r, eps = elements.element_of_row, sigma.size, jnp.finfo(sigma.dtype).eps
+    given = jnp.where(freed[of], jnp.finfo(sigma.dtype).tiny ** 0.25, sigma)  # a σ of this length slips without a force
+    if not np.any(elements.is_vector):
+        return friction_in(given), jnp.where((freed & anew)[of], 0, sigma), jnp.array(False)
+    begin = anew & jnp.any(freed & elements.is_vector)
+
+    def turning(found):
+        along = elements.sums(sigma * found.slip_rate)
+        across = elements.norms(found.slip_rate - along[of] * sigma)
+        off = across > ACROSS * along + 1e3 * eps * free_rate
+        off = off & (along > CLEAR * free_rate) | (found.bound == 0) & (off | (along < 0))  # without a bound, it goes where it goes
+        return released & ~freed & elements.is_vector & ~found.straight & off
+
+    def evaluated(carry):
+        i, found, rates = carry
+        other = friction_in(given + jnp.where(jnp.arange(1, r + 1) == i, CHANGE, jnp.zeros_like(sigma)))
+        found = jax.tree.map(lambda new, old: jnp.where(i == 0, new, old), other, found)
+        return i + 1, found, rates.at[i].set(other.slip_rate)
+
+    going_on = lambda carry: (carry[0] == 0) | ((carry[0] <= r) & (begin | jnp.any(turning(carry[1]))))
+    nothing = jax.tree.map(lambda like: jnp.zeros(like.shape, like.dtype), jax.eval_shape(friction_in, given))
+    _, found, rates = jax.lax.while_loop(going_on, evaluated, (0, nothing, jnp.zeros((r + 1, r), sigma.dtype)))
+
+    w, turns = rates[0], turning(found)
+    slope = ((rates[1:] - w[None]) / CHANGE).T
+    line = jnp.where(found.straight[of], jnp.abs(unit(elements, w)), 1)  # a change of σ across a line is turned along it
+    slope = slope * line[None, :]
+    unbound = (turns & (found.bound == 0))[of]
+    turned = jnp.where(unbound, unit(elements, w), _turned(elements, sigma, w, slope, turns & (found.bound != 0)))
+    begun = lambda: _begun(elements, w, slope, freed & ~found.driven & ~elements.follows, found.bound, breaks)
+    begun = jax.lax.cond(begin, begun, lambda: jnp.zeros_like(sigma))
+    return found, jnp.where((freed & anew)[of], begun, turned), jnp.any(turns)
+
+
+def unit(elements: FrictionElements, rows: Float[Array, " r"]) -> Float[Array, " r"]:
+    """The rows of each element by their length; zero where that is zero."""
+    length = elements.norms(rows)[elements.element_of_row]
+    return rows / jnp.where(length > 0, length, 1)
+
+
+def _turned(elements, sigma, w, slope, turns):
+    """σ by one step of Newton's method for s = w(s/‖s‖) in the elements that turn."""
+    of, one = elements.element_of_row, jnp.eye(sigma.size, dtype=sigma.dtype)
+    rows, size = turns[of], jnp.where(turns, elements.sums(sigma * w), 1)[of]
+    same = (of[:, None] == of[None, :]) & rows[:, None]
+    turn = (one - jnp.where(same, jnp.outer(sigma, sigma), 0)) / size[:, None]
+    among = jnp.where(rows[:, None] & rows[None, :], slope, 0)
+    onward = size * sigma + jnp.linalg.solve(one - among @ turn, jnp.where(rows, w - size * sigma, 0))
+    return jnp.where(rows, unit(elements, onward), sigma)
+
+
+def _begun(elements, w, slope, freed, bound, breaks):
+    """σ of the elements that were without friction, those that stick zero: of s = w(s/√(‖s‖² + δ²)) for a small δ."""
+    of, one = elements.element_of_row, jnp.eye(w.size, dtype=w.dtype)
+    rows = freed[of]
+    slope = jnp.where(rows[:, None] & rows[None, :], slope, 0)
+    scale = elements.norms(w) + elements.norms(jnp.sqrt(jnp.sum(slope**2, axis=1)))
+    of_each = jnp.where(scale > 0, scale, 1)[of]
+    slope, w = slope / of_each[:, None], jnp.where(rows, w, 0) / of_each
+    same = of[:, None] == of[None, :]
+
+    halvings = int(-SMALLEST * np.log2(float(jnp.finfo(w.dtype).eps))) + 1
+
+    def residual(s, delta):
+        length = jnp.sqrt(elements.sums(s**2) + delta**2)[of]
+        return s - w - slope @ (s / length), s / length, length
+
+    def newton(i, s):
+        delta = 0.5 ** (i // TURNS)
+        left, sigma, length = residual(s, delta)
+        turn = (one - jnp.where(same, jnp.outer(sigma, sigma), 0)) / length[:, None]
+        step = jnp.linalg.solve(one - slope @ turn, left)
+        tried = s[None] - jnp.multiply.outer(PARTS.astype(s.dtype), step)
+        return tried[jnp.argmin(jax.vmap(lambda s: jnp.sum(residual(s, delta)[0] ** 2))(tried))]
+
+    s = jax.lax.fori_loop(0, TURNS * halvings, newton, w)
+    least = jnp.where(breaks, SURELY, SLIPS * 0.5**halvings)
+    slips = (elements.norms(s) > least) | (bound == 0)  # without a bound, it holds nothing
+    return jnp.where((freed & slips)[of], unit(elements, s), 0)
