@@ -9,6 +9,7 @@ import lineax as lx
 import numpy as np
 import optimistix as optx
 
+from .._program.implicit import undifferentiated
 from .._program.jit import compiled
 
 RUNNING, CONVERGED, STALLED, STEP_LIMIT, INTERRUPTED, FAILED, UNRELATED, DISCONTINUOUS, KINKED = range(9)
@@ -143,28 +144,28 @@ def _propose(now, bounds):
     lower, upper = ((bound - now.y) * scale for bound in bounds)
     J, slope = _across_the_kink(now) / scale[None, :], now.residuals @ now.jacobian
     active = ((lower >= 0) & (slope > 0)) | ((upper <= 0) & (slope < 0))
+    Q, R = jnp.linalg.qr(J)
+    step, free_change = undifferentiated(_damped, in_turn=True)(R, now.residuals @ Q, now.damping, active, lower, upper)
+    return Trial(jnp.clip(now.y + step / scale, *bounds), J @ step, free_change, active)
+
+
+def _damped(R, r, damping, active, lower, upper):
+    """The damped step within the bounds, and the square of the part of r that R can take away without the `active` columns."""
     descent = optx.DampedNewtonDescent()
 
     def solve_anew(last):
         step, fixed, _ = last
         step = jnp.where(fixed, step, 0)
-        info = optx.FunctionInfo.ResidualJac(now.residuals + J @ step, lx.MatrixLinearOperator(jnp.where(fixed[None], 0, J)))
-        others, _ = descent.step(1 / now.damping, descent.query(now.y, info, None))  # type: ignore[arg-type]
+        info = optx.FunctionInfo.ResidualJac(r + R @ step, lx.MatrixLinearOperator(jnp.where(fixed[None], 0, R)))
+        others, _ = descent.step(1 / damping, descent.query(lower, info, None))  # type: ignore[arg-type]
         step = jnp.where(fixed, step, others)
         crossing = (step < lower) | (step > upper)
         return jnp.clip(step, lower, upper), fixed | crossing, jnp.any(crossing)
 
-    first = jnp.zeros_like(now.y), active, jnp.asarray(True)
-    step, _, _ = jax.lax.while_loop(lambda last: last[2], solve_anew, first)
-    return Trial(jnp.clip(now.y + step / scale, *bounds), J @ step, _in_range(jnp.where(active[None], 0, J), now.residuals), active)
-
-
-def _in_range(J, r):
-    """The square of the part of r that J can take away: however slowly a damped step does so along a valley of the cost."""
-    Q, R = jnp.linalg.qr(J)
-    U, values, _ = jnp.linalg.svd(R, full_matrices=False)
+    step, _, _ = jax.lax.while_loop(lambda last: last[2], solve_anew, (jnp.zeros_like(lower), active, jnp.asarray(True)))
+    U, values, _ = jnp.linalg.svd(jnp.where(active[None], 0, R), full_matrices=False)
     clear = values > jnp.finfo(r.dtype).eps ** CLEAR * jnp.max(values, initial=0.0)
-    return jnp.sum(jnp.where(clear, (r @ Q) @ U, 0) ** 2)
+    return step, jnp.sum(jnp.where(clear, r @ U, 0) ** 2)  # however slowly a damped step takes it away along a valley of the cost
 
 
 @compiled

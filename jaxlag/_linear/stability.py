@@ -48,12 +48,14 @@ def stability(system: System, found: Rest) -> tuple[Array | None, str]:
 
 def _units(M: np.ndarray, K: np.ndarray) -> np.ndarray:
     """Units of the coordinates in which the inertia of each is 1, and the stiffness of those without inertia as large as the largest."""
-    mass, size = np.diagonal(M), np.max(np.abs(K), axis=1, initial=0.0)
+    mass = np.diagonal(M)
     has_mass = mass > 0
     squares = np.abs(np.diagonal(K))[has_mass] / mass[has_mass]
-    largest = np.max(squares, initial=0.0) or 1.0
-    light = np.where(size > 0, np.sqrt(largest / np.where(size > 0, size, 1)), 1)
-    return np.where(has_mass, 1 / np.sqrt(np.where(has_mass, mass, 1)), light)
+    largest, units = np.max(squares, initial=0.0) or 1.0, 1 / np.sqrt(np.where(has_mass, mass, 1))
+    for _ in range(TURNS):  # what couples those without inertia to others has the units of both
+        size = np.max(np.abs(K * np.outer(units, units)), axis=1, initial=0.0)
+        units = np.where(has_mass | (size == 0), units, units * np.sqrt(largest / np.where(size > 0, size, 1)))
+    return units
 
 
 def _kind(K: np.ndarray, G: np.ndarray, eps: float) -> str:

@@ -7,8 +7,10 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from .._model.flat import Flat
+from .._program.sparse_matrix import dense
 from .lagrange import applied_force, inertia, velocity_residual, velocity_rows
 from .massless import completed, first_order, inertial_part
+from .pseudo_inverse import Constraints
 from .saddle_point import SaddlePoint, Sound, saddle_point
 from .self_consistent import others, self_consistent
 
@@ -34,20 +36,32 @@ def _by_inertia(flat: Flat, t, q, v, feedback) -> SaddlePoint:
     c = -gamma if feedback is None else -gamma - feedback(flat, t, q, v)
     force = lambda multipliers: applied_force(flat, t, q, v, multipliers)
     if not flat.needs_multipliers:
-        found = saddle_point(M, G, inertial + force(jnp.zeros_like(c)), c)
+        found = saddle_point(M, G, inertial + force(jnp.zeros_like(c)), c, near=_near(flat, t, q, v, c.size))
         return found._replace(multipliers=_pushing(flat, found.multipliers))
-    columns, reaction, unit = _by_force(flat, M, G, inertial, c, force)
+    columns, reaction, unit = _by_force(flat, M, G, inertial, c, force, _near(flat, t, q, v, c.size))
     multipliers = _pushing(flat, self_consistent(reaction, unit))
     return SaddlePoint(_affine(columns.x, force(multipliers)), multipliers, columns.sound)
 
 
-def _by_force(flat: Flat, M, G, inertial, c, force: Callable) -> tuple[SaddlePoint, Callable, Float[Array, " m"]]:
+def _near(flat: Flat, t, q, v, rows: int) -> Constraints | None:
+    """The constraints about a state within a step, which is off them by its error; one row depends on no other."""
+    if not flat.holonomic_names or rows < 2:
+        return None
+
+    def off():
+        g = jax.lax.stop_gradient(flat.holonomic(t, q))
+        return jnp.pad(g, (0, rows - g.size))
+
+    return Constraints(off, lambda change: jax.lax.stop_gradient(dense(velocity_rows(flat, t, q + change, v)[1])))
+
+
+def _by_force(flat: Flat, M, G, inertial, c, force: Callable, near=None) -> tuple[SaddlePoint, Callable, Float[Array, " m"]]:
     """The solution, which is affine in the applied force: beside that without one, what each force adds; λ ↦ the λ that the forces of λ
     bring about; and a unit of each: as large as the forces of one size, in the metric of M, make it.
     """
     beside = lambda vector, matrix: jnp.concatenate([vector[:, None], matrix], axis=1)
     n, dtype = inertial.size, inertial.dtype
-    columns = saddle_point(M, G, beside(inertial, jnp.eye(n, dtype=dtype)), beside(c, jnp.zeros((c.size, n), dtype)))
+    columns = saddle_point(M, G, beside(inertial, jnp.eye(n, dtype=dtype)), beside(c, jnp.zeros((c.size, n), dtype)), near=near)
     reaction = lambda multipliers: _affine(columns.multipliers, force(_pushing(flat, multipliers)))
     by_force = columns.multipliers[:, 1:]
     size = jnp.sqrt(jnp.sum(by_force.T * jax.vmap(M.mv, 1, 1)(by_force.T), axis=0))

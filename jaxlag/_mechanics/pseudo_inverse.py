@@ -14,17 +14,33 @@ from .._program.conditions import everywhere
 
 # Exponents of eps (1.3e-5, 1.6e-10, 1.8e-12 and 1.3e-6 in double precision) and a factor, with which ranks are judged
 CLEAR, SEEN, NOISE, FOLLOWS, FARTHER = 0.3125, 0.625, 0.75, 0.375, 2
+MAY_BE = 3  # times as large as to first order
+
+
+class Constraints(NamedTuple):
+    """By how much a state is `off` each of them, and what their `rows` are at δq from it."""
+
+    off: Callable[[], Float[Array, " m"]]
+    rows: Callable[[Float[Array, " n"]], Float[Array, "m n"]]
+
+
+class Beside(NamedTuple):
+    """A state beside its constraints: by how much it is `off` each, and what rows `change` by, in the metric of M, at q + M⁻¹Gᵀy."""
+
+    off: Float[Array, " m"]
+    change: Callable[[Float[Array, " m"]], Float[Array, "m n"]]
 
 
 class Request(NamedTuple):
     """Of a constrained solve, in the metric of M: the `rows` of G, what is asked of them, the `free` motion without them, and, where
-    that is given, how far what each row sees may `reach` in directions that are barely held.
+    that is given, how far what each row sees may `reach` in directions that are barely held, and where the state is `beside` them.
     """
 
     rows: Float[Array, "m n"]
     c: Float[Array, "m k"]
     free: Float[Array, "n k"]
     reach: Float[Array, " m"] | None
+    beside: Beside | None
 
 
 class Inverse(NamedTuple):
@@ -63,6 +79,7 @@ def by_rows(asked: Request, D) -> tuple[Float[Array, "m m"], Bool[Array, ""]]:
 
     Values above `CLEAR` of the largest count. Those down to `SEEN` count where what they ask for is no more than `FARTHER` times all the
     rest, or `reach`. Others are left out: below `NOISE`, where dependent rows have them by rounding, for good; above it, unsatisfied.
+    Left out for good is too what rows that depend on each other on the constraints alone ask of a state `beside` them.
     """
     eps, rows = jnp.finfo(D.dtype).eps, D[:, None] * asked.rows
     U, values = _left_singular_vectors(jnp.concatenate([rows, _absent(D)], axis=1))
@@ -74,12 +91,21 @@ def by_rows(asked: Request, D) -> tuple[Float[Array, "m m"], Bool[Array, ""]]:
     moved = rows.T @ (U @ (jnp.where(clear[:, None], step, 0) / jnp.where(clear, values, 1)[:, None]))
     bound = FARTHER * (length(asked.free) + length(moved)) if asked.reach is None else of_rows(asked.reach)[:, None]
     bound = bound / jnp.max(jnp.abs(U), axis=0)[:, None]  # a direction of many rows goes as far as what all of them touch
-    held = clear | (seen & jnp.all(jnp.abs(step) <= bound, axis=1))
+    blur = jnp.zeros_like(values) if asked.beside is None else _blur(asked.beside, D, U, values, clear)
+    held = (clear | (seen & jnp.all(jnp.abs(step) <= bound, axis=1))) & (values > blur)
     of_each = jnp.abs(wanted) + jnp.sqrt((rows != 0).astype(rest.dtype) @ asked.free**2)  # what each row asks for, and sees move
     rounding = 10 * len(D) * eps * jnp.max(of_each, axis=0, keepdims=True)  # U errs by eps in every row, if it has a part in it or not
-    contradicts = jnp.abs(rest) > eps**FOLLOWS * (jnp.abs(U.T) @ of_each) + rounding
-    satisfied = ~jnp.any(~held & ((values > eps**NOISE * values[0]) | jnp.any(contradicts, axis=1)))
+    slight = eps**FOLLOWS + MAY_BE * blur / jnp.where(values[0] > 0, values[0], 1)
+    contradicts = jnp.abs(rest) > slight[:, None] * (jnp.abs(U.T) @ of_each) + rounding
+    satisfied = ~jnp.any(~held & ((values > jnp.maximum(eps**NOISE * values[0], blur)) | jnp.any(contradicts, axis=1)))
     return _by_values(values**2, U, held, D), satisfied
+
+
+def _blur(beside, D, U, values, clear):
+    """What values rows may have but for the state being off: those of their changes on the way back to the constraints."""
+    back = D * (U @ (jnp.where(clear, U.T @ (D * -beside.off), 0) / jnp.where(clear, values, 1) ** 2))
+    blur = MAY_BE * jnp.linalg.norm(U.T @ (D[:, None] * beside.change(back)), axis=1)
+    return jnp.where(jnp.isfinite(blur), blur, 0)
 
 
 def _absent(D):

@@ -15,7 +15,7 @@ from .._program.sparse_jacobian import MANY
 from .._program.sparse_matrix import SparseMatrix, dense
 from . import block_saddle_point, sparse_saddle_point
 from .augmented_inertia import augmented
-from .pseudo_inverse import Inverse, Request, applied, by_rows, inverse_of
+from .pseudo_inverse import Beside, Constraints, Inverse, Request, applied, by_rows, inverse_of
 from .structured_inertia import MOST_FULL, StructuredInertia, by_inertia, is_positive, root_of_inverse
 from .structured_inertia import factorised as structure_factorised
 
@@ -48,7 +48,9 @@ class SaddlePoint(NamedTuple):
     sound: Sound
 
 
-def saddle_point(M: lx.AbstractLinearOperator, G: Rows, f, c, reach: Float[Array, " n"] | None = None) -> SaddlePoint:
+def saddle_point(
+    M: lx.AbstractLinearOperator, G: Rows, f, c, reach: Float[Array, " n"] | None = None, near: Constraints | None = None
+) -> SaddlePoint:
     """The unique x and the λ of least norm with M x = f + Gᵀλ and G x = c.
 
     f and c are vectors, or as many columns each. M need be positive definite on the null space of G only, and rows of G may
@@ -56,21 +58,22 @@ def saddle_point(M: lx.AbstractLinearOperator, G: Rows, f, c, reach: Float[Array
     missing. Beside it G may be sparse.
 
     A direction that G barely holds is held where that takes x about as far as all else does, or, where x puts a state right, no farther
-    than its `reach`. What is asked beyond that, the error of a state asks for, as of a mechanism that passes a singular position.
+    than its `reach`. What is asked beyond that, the error of a state asks for, as of a mechanism that passes a singular position. What
+    rows are but for the state being off the constraints that are `near`, as within a step, is not held.
     """
     if f.ndim == 1:
-        found = saddle_point(M, G, f[:, None], c[:, None], reach)
+        found = saddle_point(M, G, f[:, None], c[:, None], reach, near)
         return found._replace(x=found.x[:, 0], multipliers=found.multipliers[:, 0])
     M, G = _for_rows(M, G)
     if isinstance(G, SparseMatrix):
         return _sparse_saddle_point(M, G, f, c)
     if not isinstance(M, lx.DiagonalLinearOperator):
-        return _with_all_numbers_where_singular(M, G, lambda M: _saddle_point(M, G, f, c, reach))
+        return _with_all_numbers_where_singular(M, G, lambda M: _saddle_point(M, G, f, c, reach, near))
     if not c.size and f.shape[0] >= MANY:
         return _free(M, f, c)
     there = M.diagonal > 0
-    divided = _saddle_point(lx.DiagonalLinearOperator(jnp.where(there, M.diagonal, 1)), G, f, c, reach)
-    full = lambda: _saddle_point(lx.MatrixLinearOperator(M.as_matrix()), G, f, c, reach)
+    divided = _saddle_point(lx.DiagonalLinearOperator(jnp.where(there, M.diagonal, 1)), G, f, c, reach, near)
+    full = lambda: _saddle_point(lx.MatrixLinearOperator(M.as_matrix()), G, f, c, reach, near)
     return jax.lax.cond(everywhere(jnp.all(there)), lambda: divided, full)
 
 
@@ -99,8 +102,8 @@ def _free(M: lx.DiagonalLinearOperator, f, c) -> SaddlePoint:
     return SaddlePoint(x, c, Sound(jnp.all(there), jnp.array(True)))
 
 
-def _saddle_point(M, G, f, c, reach) -> SaddlePoint:
-    factors = _factorised(*jax.lax.stop_gradient((M, G, f, c, reach)))
+def _saddle_point(M, G, f, c, reach, near) -> SaddlePoint:
+    factors = _factorised(*jax.lax.stop_gradient((M, G, f, c, reach)), near)
     x, multipliers = _solution(M, G, f, c, factors)
     return SaddlePoint(x, multipliers, Sound(factors.determined, factors.satisfied))
 
@@ -130,8 +133,7 @@ def saddle_solver(M: lx.AbstractLinearOperator, G: Rows, f, c, reach: Float[Arra
                 factors = _way(M).factorised(*jax.lax.stop_gradient((M, G)))
             else:
                 factors = _factorised(*jax.lax.stop_gradient((M, G, f[:, None], c[:, None], reach)))
-            solve, _ = _solver(M, G, factors)
-            x, multipliers = solve(f_other[:, None], c_other[:, None])
+            x, multipliers = _solver(M, G, factors)[0](f_other[:, None], c_other[:, None])
             return x[:, 0], multipliers[:, 0]
 
         return _with_all_numbers_where_singular(M, G, by)
@@ -151,7 +153,7 @@ class Factors(NamedTuple):
     satisfied: Bool[Array, ""]
 
 
-def _factorised(M, G, f, c, reach) -> Factors:
+def _factorised(M, G, f, c, reach, near=None) -> Factors:
     """On the constraint M + GᵀWG says the same as M, with GᵀWc added to f, and is positive definite: so one factorisation and the
     pseudo-inverse of the small matrix S serve every case.
 
@@ -169,11 +171,15 @@ def _factorised(M, G, f, c, reach) -> Factors:
         determined = _is_positive(cholesky, A)
         by_root = lambda B: jax.scipy.linalg.solve_triangular(cholesky, B, lower=True)
 
-    def request():
-        return Request(by_root(G.T).T, c, by_root(_load(G, W, f, c)), _reach_of_rows(M, G, W, reach))
+    moved = _by_inertia(M, G, W, cholesky)
+    change = lambda y: by_root((near.rows(moved((G.T @ y)[:, None])[:, 0]) - G).T).T
 
-    S = G @ _by_inertia(M, G, W, cholesky)(G.T)
-    judged = scalarised(by_rows) if len(G) == 2 else by_rows
+    def request():
+        beside = near and Beside(near.off(), change)
+        return Request(by_root(G.T).T, c, by_root(_load(G, W, f, c)), _reach_of_rows(M, G, W, reach), beside)
+
+    S = G @ moved(G.T)
+    judged = scalarised(by_rows) if len(G) == 2 and near is None else by_rows
     inverse, satisfied = inverse_of(S, c, lambda D: judged(request(), D))
     return Factors(W, cholesky, inverse, determined, satisfied)
 

@@ -15,11 +15,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from .._program.implicit import implicit_root, open_function
 from .friction_elements import FrictionElements
 
 ACROSS = 1e-9  # of the slip rate, what may be left of it across σ
 CLEAR = 1e-6  # of that without friction, a slip rate whose direction can be made exact
 CHANGE = 1e-3  # of σ, for the derivative of w, which is affine in σ but where bounds move with the multipliers
+AGREES = 1e-3  # what σ and the direction of w(σ) may differ by: at the very bound w is rounding, and goes any way
 SMALLEST = 0.6  # power of eps, δ beside the scale of the slip rates in the end
 SLIPS = 30  # times it, what may slip; friction at 0.9995 of its bound slips by as much
 SURELY = 1e-4  # of its scale, what slips beside what breaks away, for which s is some δ^(2/3)
@@ -49,7 +51,7 @@ def friction_and_direction(
         return friction_in(given), jnp.where((freed & anew)[of], 0, sigma), jnp.array(False)
     begin = anew & jnp.any(freed & elements.is_vector)
 
-    def turning(found):
+    def turning_in(found):
         along = elements.sums(sigma * found.slip_rate)
         across = elements.norms(found.slip_rate - along[of] * sigma)
         off = across > ACROSS * along + 1e3 * eps * free_rate
@@ -62,11 +64,11 @@ def friction_and_direction(
         found = jax.tree.map(lambda new, old: jnp.where(i == 0, new, old), other, found)
         return i + 1, found, rates.at[i].set(other.slip_rate)
 
-    going_on = lambda carry: (carry[0] == 0) | ((carry[0] <= r) & (begin | jnp.any(turning(carry[1]))))
+    going_on = lambda carry: (carry[0] == 0) | ((carry[0] <= r) & (begin | jnp.any(turning_in(carry[1]))))
     nothing = jax.tree.map(lambda like: jnp.zeros(like.shape, like.dtype), jax.eval_shape(friction_in, given))
     _, found, rates = jax.lax.while_loop(going_on, evaluated, (0, nothing, jnp.zeros((r + 1, r), sigma.dtype)))
 
-    w, turns = rates[0], turning(found)
+    w, turns = rates[0], turning_in(found)
     slope = ((rates[1:] - w[None]) / CHANGE).T
     line = jnp.where(found.straight[of], jnp.abs(unit(elements, w)), 1)  # a change of σ across a line is turned along it
     slope = slope * line[None, :]
@@ -75,6 +77,26 @@ def friction_and_direction(
     begun = lambda: _begun(elements, w, slope, freed & ~found.driven & ~elements.follows, found.bound, breaks)
     begun = jax.lax.cond(begin, begun, lambda: jnp.zeros_like(sigma))
     return found, jnp.where((freed & anew)[of], begun, turned), jnp.any(turns)
+
+
+def turning(elements: FrictionElements, slip_rate_in: Callable, sigma: Float[Array, " r"], begin: Bool[Array, " e"]) -> Array:
+    """σ, which turns with all that `slip_rate_in(σ)` depends on where elements `begin` to slip: there it is w(σ)/‖w(σ)‖."""
+    if not np.any(elements.is_vector):
+        return sigma
+    of, given = elements.element_of_row, jax.lax.stop_gradient(sigma)
+    rate, closed_over = open_function(slip_rate_in, given)
+
+    def residual(args, sigma):
+        given, begin, *closed_over = args
+        way = unit(elements, rate(sigma, *closed_over))
+        agrees = elements.norms(jax.lax.stop_gradient(way) - given)[of] < AGREES
+        return sigma - jnp.where((begin > 0) & agrees, way, given)
+
+    def change(args, sigma, left):
+        return -jnp.linalg.solve(jax.jacfwd(lambda sigma: residual(args, sigma))(sigma), left)
+
+    begin = (begin & elements.is_vector & ~elements.straight)[of].astype(sigma.dtype)
+    return implicit_root(residual, change, (given, begin, *closed_over), given)
 
 
 def unit(elements: FrictionElements, rows: Float[Array, " r"]) -> Float[Array, " r"]:

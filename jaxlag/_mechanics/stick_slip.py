@@ -23,7 +23,7 @@ from .constrained_slip import directed, extent_of, freely, on_constraints
 from .friction_elements import FrictionElements
 from .load_sharing import may_share, shared
 from .massless import completed, nearest_velocity, smooth_force
-from .slip_direction import friction_and_direction, unit
+from .slip_direction import friction_and_direction, turning, unit
 
 
 def in_mode(flat: Flat, elements: FrictionElements, sigma: Float[Array, " r"]) -> Flat:
@@ -163,16 +163,7 @@ class NoContact(NamedTuple):
 
 
 def select_mode(
-    flat: Flat,
-    elements: FrictionElements,
-    t,
-    q,
-    v,
-    sigma,
-    at_rest: Bool[Array, " e"],
-    breaking: Bool[Array, " e"],
-    contacts: Any = NoContact(),
-    friction_in: Callable | None = None,
+    flat: Flat, elements: FrictionElements, t, q, v, sigma, at_rest, breaking, contacts: Any = NoContact(), friction_in: Any = None
 ) -> tuple[Mode, Any]:
     """Mode selection where the elements `at_rest` have no slip; the others continue to slip along σ.
 
@@ -270,7 +261,10 @@ def first_mode(
     size = elements.norms(slip)
     at_rest = elements.follows | (size <= slip_of(elements, t, q, v, 1e2 * jnp.finfo(v.dtype).eps * jnp.abs(v)))
     sigma = slip / jnp.where(at_rest, 1, size)[elements.element_of_row]
-    return select_mode(flat, elements, t, q, v, sigma, at_rest, jnp.zeros_like(at_rest), contacts, friction_in)
+    friction_in = friction_in or _in_modes(flat, elements, t, q, v)
+    mode, contacts = select_mode(flat, elements, t, q, v, sigma, at_rest, jnp.zeros_like(at_rest), contacts, friction_in)
+    begin = at_rest & ~sticking(elements, mode.sigma) & ~mode.held & ~elements.follows
+    return mode._replace(sigma=turning(elements, lambda sigma: friction_in(sigma, contacts).slip_rate, mode.sigma, begin)), contacts
 
 
 def slip_of(elements: FrictionElements, t, q, v, errors: Float[Array, " n"]) -> Float[Array, " e"]:
@@ -283,7 +277,10 @@ def redirected(elements: FrictionElements, sigma, held, t, q, v):
     of, slip = elements.element_of_row, elements.slip(t, q, v)
     several, size = elements.is_vector & ~elements.straight, elements.norms(slip)
     turns = (several & (size > slip_of(elements, t, q, v, jnp.finfo(v.dtype).eps * jnp.abs(v))) & ~sticking(elements, sigma) & ~held)[of]
-    return jnp.where(turns, slip / jnp.where(turns, size[of], 1), directed(elements, sigma)) if np.any(elements.is_vector) else sigma
+    if not np.any(elements.is_vector):
+        return sigma
+    new = jax.lax.stop_gradient(jnp.where(turns, slip / jnp.where(turns, size[of], 1), directed(elements, sigma)))
+    return jnp.where(new == sigma, sigma, new)  # where nothing moved, with the derivative that it begins with
 
 
 def friction_by_term(elements: FrictionElements, sigma, held, t, q, v, found: Friction) -> dict[str, tuple[Array, Array]]:

@@ -291,5 +291,5 @@ def _projected(equations: EquationsOfMotion, t, y, args, found):
         lift = energy_exchange(mode, t, on_q, on_v)[0] - energy_exchange(mode, t, q, v)[0]
         works = works.at[equations.works.index(PROJECTION)].add(lift)
     if elements is not None:
-        sigma = jax.lax.stop_gradient(redirected(elements, sigma, parts.held > 0, t, on_q, on_v))
+        sigma = redirected(elements, sigma, parts.held > 0, t, on_q, on_v)
     return parts._replace(q=on_q, v=on_v, works=works, sigma=sigma).y

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 from jax.extend import source_info_util
 
-from .walker import CALLS, CALLS_WITH_DERIVATIVE_RULE, called_program, walk
+from .walker import CALLS, CALLS_WITH_DERIVATIVE_RULE, called_program, parts_of_scan, walk
 
 OWN = str(pathlib.Path(__file__).parents[1])
 BY_VALUE = {
@@ -101,7 +101,7 @@ def _evaluated(equation: Any, operands: list[Value], within: _Call | None) -> Se
 
 def _scanned(params: dict, operands: list[Value], within: _Call) -> list[Value]:
     """Turns until no carry depends on more."""
-    i, j = params["num_consts"], params["num_consts"] + params["num_carry"]
+    i, j = parts_of_scan(params)
     carry = list(operands[i:j])
     while True:
         outputs = _walked(params["jaxpr"], [*operands[:i], *carry, *operands[j:]], within)

@@ -16,13 +16,13 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.extend.core import get_opaque_trace_state, take_current_trace
+from jax.extend.core import get_opaque_trace_state
 from jaxtyping import PyTree
 
 from .kept_programs import KEPT
 
 OLD_EMITTERS = {"xla_cpu_use_fusion_emitters": False}
-with take_current_trace():
+with jax.ensure_compile_time_eval():
     NOTHING_TRACED = get_opaque_trace_state()
 
 

@@ -14,7 +14,7 @@ from jax.extend import core
 from jaxtyping import Array
 
 from .constants import has_extended_dtype, is_numeric
-from .walker import CALLS, called_program, walk
+from .walker import CALLS, called_program, parts_of_scan, walk
 
 
 class Term(NamedTuple):
@@ -42,7 +42,8 @@ class Turn(NamedTuple):
         p = equation.params
         inputs = [Term(frozenset([k]), {k: frozenset()}) for k in range(len(equation.invars))]
         terms = walk(p["jaxpr"], inputs, _term, _constant, _constant)
-        return cls(p["jaxpr"], p["num_consts"], p["num_carry"], p["length"], p["reverse"], terms)
+        i, j = parts_of_scan(p)
+        return cls(p["jaxpr"], i, j - i, p["length"], p["reverse"], terms)
 
     def reached_from(self, depends: list[bool]) -> list[bool]:
         """Which inputs depend on those that do, the carries by way of other turns."""

@@ -12,7 +12,7 @@ from jaxtyping import Array
 
 from .constants import as_function, has_extended_dtype
 from .interval_arithmetic import DECREASING, INCREASING, INTERVAL_RULES, LOGICAL, MAY_OVERFLOW, Interval, anything, in_integers, without_nan
-from .walker import CALLS, called_program, walk
+from .walker import CALLS, called_program, parts_of_scan, walk
 
 
 class TimeDependence(NamedTuple):
@@ -183,8 +183,8 @@ def _run_intervals(closed, operands):
 
 def _scan(params, operands):
     """A `scan` over intervals is a `scan` as well, of as many iterations."""
-    closed, split = params["jaxpr"], np.cumsum([params["num_consts"], params["num_carry"]])
-    consts, carry, rows = (operands[i:j] for i, j in itertools.pairwise((0, *split, len(operands))))
+    closed, (i, j) = params["jaxpr"], parts_of_scan(params)
+    consts, carry, rows = operands[:i], operands[i:j], operands[j:]
 
     def iteration(carry, row):
         outputs = _run_intervals(closed, [*consts, *carry, *row])

@@ -53,11 +53,19 @@ def branch_index(index: Any, params: dict) -> int:
     return min(max(int(index), 0), len(params["branches"]) - 1)
 
 
+def parts_of_scan(params: dict) -> tuple[int, int]:
+    """Where in the inputs of a `scan` its carries begin, behind what is constant, and where its rows do; JAX 0.10 and 0.11."""
+    if "num_consts" in params:
+        return params["num_consts"], params["num_consts"] + params["num_carry"]
+    constants, carries, _ = (len(list(part)) for part in params["ft_in"].unpack())
+    return constants, constants + carries
+
+
 def unrolled_scan(
     params: dict, operands: Sequence[Any], turn: Callable[[list[Any]], Any], row: Callable[[Any, int], Any] = lambda x, k: x[k]
 ) -> tuple[list[Any], list[tuple]]:
     """The last carry of a `scan`, and the columns of its rows, in the order in which they are stacked: turn(inputs) once for each row."""
-    i, j = params["num_consts"], params["num_consts"] + params["num_carry"]
+    i, j = parts_of_scan(params)
     carry, rows = list(operands[i:j]), {}
     for k in reversed(range(params["length"])) if params["reverse"] else range(params["length"]):
         outputs = turn([*operands[:i], *carry, *(row(x, k) for x in operands[j:])])

@@ -108,3 +108,22 @@ def test_the_lowest_of_many_modes(length, energy, time):
     np.testing.assert_allclose(np.asarray(modes.angular_frequency) * time, 4 * np.sin(np.arange(1, 4) * np.pi / (2 * N + 2)), rtol=1e-6)
     with pytest.raises(ValueError, match="must be at rest"):
         jl.lowest_modes(CHAIN, 1.1 * s * SAG, params, count=3)
+
+
+LIGHT = jl.System(
+    lambda q, qdot, K, s: 0.5 * (qdot[0] / s[0]) ** 2 - 0.5 * (q / s) @ K @ (q / s),
+    dissipation=lambda qdot, s: 0.5 * jnp.sum((qdot / s) ** 2),
+)
+
+
+def test_coordinates_without_inertia_have_units_of_their_own():
+    """Positive where all eigenvalues of K are, in units where they are near one."""
+    random = np.random.default_rng(5)
+    seen = set()
+    for _ in range(60):
+        turn = np.linalg.qr(random.normal(size=(4, 4)))[0]
+        K = turn @ np.diag(random.uniform(0.3, 3, 4) * random.choice([1, 1, 1, 1, 1, 1, -1], 4)) @ turn.T
+        found = jl.equilibrium(LIGHT, np.zeros(4), {"K": K, "s": 10 ** random.uniform(-8, 8, 4)})
+        assert found.stability == ("stable" if np.all(np.linalg.eigvalsh(K) > 0) else "unstable")
+        seen.add(found.stability)
+    assert len(seen) == 2

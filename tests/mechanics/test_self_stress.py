@@ -185,6 +185,7 @@ wedge = jl.System(
 )
 
 
+@pytest.mark.slow
 def test_a_wedge_lifts_a_load():
     """From μ M g + m g tan(α + 2φ) on, μ = tan φ, and then with ẍ = (P − P₀) / (M + m tan α tan(α + 2φ)); a steep one is driven out below
     m g tan(α − 2φ) − μ M g. The clock is late.
@@ -264,6 +265,7 @@ trough = jl.System(
 )
 
 
+@pytest.mark.slow
 def test_a_block_in_a_trough():
     """Planar friction of both sides, whose normal forces decide it: pulled along, it moves from P = μ m g / cos α on. It was said that its
     constraints contradict each other: across the trough they hold it alone, and what rounding left there counted as a contradiction.

@@ -252,9 +252,10 @@ def test_an_adjoint_that_cannot_be_heeded_is_refused(name, adjoint):
 
 
 @pytest.mark.slow
-def test_redundant_constraints_have_the_gradients_of_single_ones():
+@pytest.mark.parametrize("factor", [lambda q: 2.0, lambda q: 2 + jnp.cos(q["x"])], ids=["the same", "by another equation"])
+def test_redundant_constraints_have_the_gradients_of_single_ones(factor):
     rod = pendulum.cartesian_rod
-    twice = jl.System(pendulum.cartesian_lagrangian, holonomic={"rod": rod, "again": lambda q, l: 2 * rod(q, l)})
+    twice = jl.System(pendulum.cartesian_lagrangian, holonomic={"rod": rod, "again": lambda q, l: factor(q) * rod(q, l)})
     ts, p = jnp.linspace(0, 2, 5), pendulum.params
 
     def end(system, l):
