@@ -13,6 +13,7 @@ if "JAX_COMPILATION_CACHE_DIR" not in os.environ:  # what one worker has compile
     folder = tempfile.TemporaryDirectory(prefix="jaxlag-tests-")  # removed at the end of the run
     os.environ |= {"JAX_COMPILATION_CACHE_DIR": folder.name, "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0"}
 
+import costs
 import jax
 import jaxlib
 import pytest
@@ -36,6 +37,7 @@ with install_import_hook([".".join(file.parts) for file in FILES], "beartype.bea
 
 def pytest_addoption(parser):
     parser.addoption("--part", metavar="I/N", help="of the tests marked slow only every N-th, from the I-th on")
+    parser.addoption("--costs", metavar="FILE", help="appends what each test takes: see tests/costs.py")
 
 
 def pytest_collection_modifyitems(config, items):
@@ -47,6 +49,15 @@ def pytest_collection_modifyitems(config, items):
         left_out = {item for i, item in enumerate(slow) if i % parts != first % parts}
         config.hook.pytest_deselected(items=[item for item in items if item in left_out])
         items[:] = [item for item in items if item not in left_out]
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_protocol(item, nextitem):
+    """A line of `--costs` for each test."""
+    if not item.config.getoption("--costs"):
+        return (yield)
+    with costs.measured(item.config.getoption("--costs"), item.nodeid):
+        return (yield)
 
 
 @pytest.fixture(autouse=True, scope="module")

@@ -110,7 +110,7 @@ def coloured_information(J: np.ndarray, r: np.ndarray, sizes: np.ndarray) -> np.
         shocks[there[a.size :], c] = signal.lfilter(np.append(1.0, -a), [1.0], r[there, c])[a.size :]
         deviations[c] = sizes[c] / np.linalg.norm(response(a, 2 * T))
     covariance = _correlations(shocks) * np.outer(deviations, deviations)
-    return np.einsum("tci,cd,tdj->ij", K, covariance, K, optimize=True)
+    return np.tensordot(K, covariance @ K, axes=([0, 1], [0, 1]))
 
 
 def _correlations(shocks):

@@ -191,7 +191,8 @@ def _update(now, trial, linearised, bounds, tolerance, freedom, size):
     across = jnp.where(taken, jnp.where(short & ~as_expected, now.jacobian, J), jnp.where(short, J, now.across))
     fell = now.mark - jnp.where(taken, after, before) > SLIGHT**2 / 2 * per_error
     slow = jnp.where(fell, 0, now.slow + (taken & ~newton_like))
-    status = jnp.where((status == RUNNING) & (slow >= PATIENCE), KINKED, status)
+    within = trial.free_change <= last  # no kink that matters: the last of the steps are rounding of the motion
+    status = jnp.where((status == RUNNING) & (slow >= PATIENCE), jnp.where(within, CONVERGED, KINKED), status)
     mark = jnp.where(fell, jnp.where(taken, after, before), now.mark)
     chosen = take((trial.y, r, J, aux, after), now[:5])
     scale = jnp.maximum(now.scale, _norms(jnp.where(taken, J, 0)))

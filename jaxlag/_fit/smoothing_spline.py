@@ -18,7 +18,7 @@ MOST_COEFFICIENTS = 0.7  # of the measurements
 ITERATIONS = 8  # of Gauss and Newton, where sensors are not linear in the motion
 START_WEIGHT = 1e3  # of the known start, relative to the sensors
 REWEIGHTED = 2  # times, where channels have no sigma
-ROUNDING = 1e-6  # of a channel: no sensor is trusted more
+RESOLVED = 1e-6  # of the spread of a channel: no sensor is trusted more
 PENALTY = 1e-6  # of differences of third order, relative to the sensors: decides only where nothing is measured
 
 
@@ -115,9 +115,9 @@ class _Sensors:
         """Weighs each channel by one over the size of its residuals; whether that changed their ratios by more than a tenth."""
         h, _ = self._linearised(jnp.asarray(splines.ts), jnp.asarray(np.concatenate(splines.motions(C), axis=1)))
         off = self.measured - np.asarray(h)
-        there = np.isfinite(off)
-        rms = lambda x: np.sqrt(np.sum(np.where(there, x, 0) ** 2, axis=0) / np.maximum(np.sum(there, axis=0), 1))
-        size = np.maximum(rms(off), ROUNDING * rms(self.measured))
+        rms = lambda x: np.sqrt(_mean(np.where(np.isfinite(off), x, np.nan) ** 2))
+        rounding = np.finfo(off.dtype).eps * rms(self.measured)
+        size = np.maximum(rms(off), np.maximum(RESOLVED * _deviation(self.measured), rounding))
         change = self.weights[0] * np.where(size > 0, size, 1)
         self.weights = self.weights / change
         return np.max(change) > 1.1 * np.min(change)
@@ -125,10 +125,18 @@ class _Sensors:
 
 def _spread(measured):
     """The standard deviation of each channel, in its unit; one where nothing changes."""
-    there = np.isfinite(measured)
-    mean_of = lambda x: np.sum(np.where(there, x, 0), axis=0) / np.maximum(np.sum(there, axis=0), 1)
-    deviation = np.sqrt(mean_of((measured - mean_of(measured)) ** 2))
+    deviation = _deviation(measured)
     return np.broadcast_to(np.where(deviation > 0, deviation, 1), measured.shape)
+
+
+def _deviation(measured):
+    return np.sqrt(_mean((measured - _mean(measured)) ** 2))
+
+
+def _mean(x):
+    """Of each channel, of what was measured."""
+    there = np.isfinite(x)
+    return np.sum(np.where(there, x, 0), axis=0) / np.maximum(np.sum(there, axis=0), 1)
 
 
 class _UnknownForces(dict):

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from .._mechanics.pseudo_inverse import CLEAR
+from .._program.conditions import halved, repeated
 from .._program.size_of_terms import size_of_terms
 
 STEPS = 200
@@ -55,8 +56,7 @@ def minimum_near(V: Callable, g: Callable, q: Float[Array, " n"], moving: Any, u
         step = step * jnp.where((reach > 0) & (longest > 0.5 * reach), 0.5 * reach / jnp.where(longest > 0, longest, 1), 1)
         tried = lambda part: on_constraints(x + part * step)
         is_lower = lambda part: (V(at(tried(part))) < V(at(x))) & is_on(tried(part))
-        part = jax.lax.while_loop(lambda part: (part > eps) & ~is_lower(part), lambda part: part / 2, jnp.ones((), q.dtype))
-        lower = is_lower(part)
+        part, lower = halved(is_lower, eps, q.dtype)
         return jnp.where(lower, tried(part), x), lower & ~(flat & ~falls), i + 1
 
     def is_on(x):
@@ -79,5 +79,5 @@ def far_down(V: Callable, h: Float[Array, ""]) -> Float[Array, ""]:
     """How far to go down from a saddle: h, or, where that is zero since the saddle is at zero, as far as V falls, found by doubling."""
     limits = jnp.finfo(h.dtype).tiny ** 0.25, jnp.finfo(h.dtype).max ** 0.25
     going_on = lambda h: (h > 0) & (h < limits[1]) & (V(2 * h) <= V(h))
-    found = jax.lax.while_loop(going_on, lambda h: 2 * h, jnp.where(h > 0, 0, limits[0]).astype(h.dtype))
+    found = repeated(lambda h: 2 * h, jnp.where(h > 0, 0, limits[0] / 2).astype(h.dtype), going_on)
     return jnp.where(h > 0, h, found)

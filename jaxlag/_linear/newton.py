@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import lineax as lx
 from jaxtyping import Array, Bool, Float
 
+from .._program.conditions import halved
 from .._program.implicit import implicit_root
 from .._program.size_of_terms import size_of_terms
 from .._program.sparse_matrix import SparseMatrix
@@ -89,7 +90,7 @@ def newton(
             after = length(change(w + part * step), w)
             return jnp.isfinite(after) & (after <= (1 - part / 4) * length(step, w))
 
-        part = jax.lax.while_loop(lambda part: (part > 1e-3) & ~is_shorter(part), lambda part: part / 2, jnp.ones((), w.dtype))
+        part, _ = halved(is_shorter, 1e-3, w.dtype)
         near = length(step, w) <= eps**0.5  # where rounding decides what is shorter
         return w + jnp.where(near, 1.0, part) * step, length(step, w) <= 8 * eps, i + 1
 

@@ -9,6 +9,7 @@ from jax import lax
 from jaxtyping import Array, Float, Int
 
 from .._program.block_tridiagonal_lu import Factors, factorised, positive_eigenvalues, solution
+from .._program.conditions import halved, repeated
 from .._program.sparse_matrix import SparseMatrix, row_sums
 from .descent import STEPS, far_down
 
@@ -46,8 +47,7 @@ def sparse_minimum_near(V: Callable, slope_and_curvature: Callable, q: Float[Arr
         longest = jnp.max(jnp.abs(step))
         step = step * jnp.where((reach > 0) & (longest > 0.5 * reach), 0.5 * reach / jnp.where(longest > 0, longest, 1), 1)
         is_lower = lambda part: V(units * (x + part * step)) < V(units * x)
-        part = lax.while_loop(lambda part: (part > eps) & ~is_lower(part), lambda part: part / 2, jnp.ones((), q.dtype))
-        lower = is_lower(part)
+        part, lower = halved(is_lower, eps, q.dtype)
         return jnp.where(lower, x + part * step, x), added, lower & ~(flat & ~falls), i + 1
 
     start = q / units, jnp.zeros((), q.dtype), jnp.array(True), jnp.array(0)
@@ -57,15 +57,21 @@ def sparse_minimum_near(V: Callable, slope_and_curvature: Callable, q: Float[Arr
 def _made_definite(K: SparseMatrix, added: Array) -> tuple[Array, Factors]:
     """The factors of K − σ, which is negative definite, and σ."""
     largest = jnp.max(row_sums(K))
-    attempt = lambda added: (added, factorised(K.plus_diagonal(jnp.full(K.shape[0], -added))))
+    factors_with = lambda added: factorised(K.plus_diagonal(jnp.full(K.shape[0], -added)))
+
+    def attempt(carry):
+        *_, following = carry
+        return following, factors_with(following), jnp.maximum(4 * following, FIRST * largest)
 
     def is_indefinite(carry):
-        added, factors = carry
+        added, factors, _ = carry
         positive, _ = positive_eigenvalues(K.plus_diagonal(jnp.full(K.shape[0], -added)), factors)
         sound = jnp.all(jnp.isfinite(factors.inverse)) & (positive == 0)
         return ~sound & (added < 8 * largest)
 
-    return lax.while_loop(is_indefinite, lambda carry: attempt(jnp.maximum(4 * carry[0], FIRST * largest)), attempt(added))
+    nothing = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), jax.eval_shape(factors_with, added))
+    added, factors, _ = repeated(attempt, (added, nothing, added), is_indefinite)
+    return added, factors
 
 
 def eigenvalues_below(J: SparseMatrix, scale: Float[Array, " n"], bound: Array) -> tuple[Int[Array, ""], Float[Array, ""]]:

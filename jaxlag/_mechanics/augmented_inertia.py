@@ -45,11 +45,11 @@ def alike(M: lx.AbstractLinearOperator, rows: Sequence[Any], size: Float[Array, 
     return by_weight(jax.lax.stop_gradient(units_alike(M, rows)), size)
 
 
-def by_weight(units: Float[Array, " n"], size: Float[Array, "n *k"]) -> Float[Array, "n *k"]:  # noqa: F821
+def by_weight(units: Float[Array, "n *members"], size: Float[Array, "n *k"]) -> Float[Array, "n *k"]:  # noqa: F821
     """Sizes of the numbers of a state, each at least what weighs as much as the largest of the others: mass tells what is small of a number
     that is zero.
     """
-    units = units.reshape(-1, *[1] * (size.ndim - 1)).astype(size.dtype)
+    units = units.reshape(*units.shape, *[1] * (size.ndim - units.ndim)).astype(size.dtype)
     share = jnp.where(units > 0, size / jnp.where(units > 0, units, 1), 0)
     return jnp.maximum(size, units * jnp.max(share, axis=0, keepdims=True, initial=0.0))
 

@@ -27,6 +27,7 @@ from .friction_elements import find_elements, with_all_masses
 from .lagrange import inertia, position_rows, velocity_residual, velocity_rows
 from .massless import completed, inertial_part
 from .projection import metric_of_positions
+from .pseudo_inverse import Constraints
 from .saddle_point import NO_INERTIA, Rows, is_determined, reach_of
 from .singular_directions import NOT_AFFINE, UNDEFINED, explained, not_affine_in
 from .stick_slip import first_mode, in_mode
@@ -80,7 +81,8 @@ def nearest_state(flat: Flat, t, q0, v0, free: Sequence[int] | None = None, *, f
 
     @undifferentiated
     def judged(t, q0, v0, q, v, M, given):
-        reached = (off_constraints(flat, t, q, v) < _small(q)) & jnp.all(jnp.isfinite(q))
+        reach = jnp.maximum(jnp.abs(q0), jnp.abs(q)), jnp.maximum(jnp.abs(v0), jnp.abs(v))  # of what is held all is rounding
+        reached = (off_constraints(flat, t, q, v, reach) < _small(q)) & jnp.all(jnp.isfinite(q))
         return reached, ~jnp.any(not_affine_in(flat, t, q0, v0)), jnp.all(jnp.isfinite(given)) & _is_finite(M)
 
     reached, affine, defined = judged(t, q0, v0, q, v, M, given)
@@ -152,7 +154,8 @@ def _nearest_position(flat: Flat, moving, t, q0, M, found: bool) -> Float[Array,
         def newton(carry):
             w, before, _, i = carry
             step = linear(args, w)
-            found = step.solution()
+            rows = lambda change: dense(linear(args, w.at[:free].add(change)).G)
+            found = step.solution(Constraints(lambda: -step.c, rows))
             change = jnp.abs(found.x)  # of each coordinate in its own unit, until rounding makes it
             # Rows that depend on each other on the constraints alone hold more directions off them: one or two ever smaller steps
             # onto the constraints are followed by a larger one along them, which leads off them again.
@@ -245,7 +248,8 @@ def consistent_state(
 
 IMPOSSIBLE = (
     "`holonomic` and `nonholonomic` must be satisfied by some state near the start, but none was found. "
-    "Start nearer, fix fewer coordinates, or look for constraints that contradict each other."
+    "Start nearer, fix fewer coordinates, or look for constraints that contradict each other, or of which one is lost in the rounding of "
+    "another."
 )
 
 

@@ -10,6 +10,7 @@ from jaxtyping import Array, Float
 
 from .._program.implicit import implicit_root
 from .._program.sparse_matrix import SparseMatrix
+from .pseudo_inverse import Constraints
 from .saddle_point import Rows, SaddlePoint, saddle_point, saddle_solver
 from .structured_inertia import StructuredInertia
 
@@ -25,9 +26,9 @@ class Linear(NamedTuple):
     c: Float[Array, " m"]
     reach: Float[Array, " k"] | None = None
 
-    def solution(self) -> SaddlePoint:
-        """x and λ."""
-        return saddle_point(self.M, self.G, self.f, self.c, self.reach)
+    def solution(self, near: Constraints | None = None) -> SaddlePoint:
+        """x and λ, of a state `near` the constraints."""
+        return saddle_point(self.M, self.G, self.f, self.c, self.reach, near)
 
     def change(self, residual: Float[Array, " w"]) -> Float[Array, " w"]:
         """What (x, λ) change where this is added to the left-hand sides; the rank is that of the step."""

@@ -10,13 +10,14 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Float
 
+from .._program.conditions import repeated
 from .._program.implicit import implicit_root, open_function
 from .._program.sparse_jacobian import sparsity_pattern
 
 ITERATIONS = 60
-HALVINGS = 30
+SHORTEST = 1e-9  # part of a step
 OTHERS = 40  # starts of a search for other solutions, of sizes from 1e-4 to 1e4 of the one that is known
 
 NOT_CONSISTENT = (
@@ -40,47 +41,46 @@ def self_consistent(reaction: Callable, unit: Float[Array, " m"]) -> Float[Array
     """λ = r(λ), where each λ is compared with others in a `unit`; NaN where none is found."""
     start = jnp.zeros_like(unit)
     if is_affine(reaction, start):  # then one step is exact
-        step, sound = _step(reaction, start)
-        return jnp.where(sound, step, jnp.nan)
+        slope = _slope(reaction, start)
+        return jnp.where(jnp.linalg.det(slope) > 0, jnp.linalg.solve(slope, reaction(start)), jnp.nan)
     reaction, within = open_function(reaction, start)
     fixed = jax.lax.stop_gradient(within)
-    found = _by_newton(lambda x: reaction(x, *fixed), start, jax.lax.stop_gradient(unit))
+    found = _by_newton(lambda x: reaction(x, *fixed), jax.lax.stop_gradient(unit))
 
     def change(within, w, R):
-        slope = jnp.eye(w.size, dtype=w.dtype) - jax.jacfwd(lambda x: reaction(x, *within))(w)
-        return -jnp.linalg.solve(slope, R)
+        return -jnp.linalg.solve(_slope(lambda x: reaction(x, *within), w), R)
 
     return implicit_root(lambda within, w: w - reaction(w, *within), change, within, jax.lax.stop_gradient(found))
 
 
-def _step(reaction: Callable, x: Float[Array, " m"]) -> tuple[Float[Array, " m"], Bool[Array, ""]]:
-    """What Newton's method adds to x; and whether the determinant is positive."""
-    slope = jnp.eye(x.size, dtype=x.dtype) - jax.jacfwd(reaction)(x)
-    return jnp.linalg.solve(slope, reaction(x) - x), jnp.linalg.det(slope) > 0
+def _slope(reaction: Callable, x: Float[Array, " m"]) -> Float[Array, "m m"]:
+    """1 − ∂r/∂λ."""
+    return jnp.eye(x.size, dtype=x.dtype) - jax.jacfwd(reaction)(x)
 
 
-def _by_newton(reaction: Callable, start: Float[Array, " m"], unit: Float[Array, " m"], anywhere: bool = False) -> Float[Array, " m"]:
-    """λ = r(λ); NaN where it does not converge or, but `anywhere`, where the determinant is not positive on the way."""
+def _by_newton(reaction: Callable, unit: Float[Array, " m"], start: Float[Array, " m"] | None = None) -> Float[Array, " m"]:
+    """λ = r(λ), from zero or from a `start`; NaN where it does not converge or, from zero, where the determinant is not positive on the
+    way.
+    """
     eps, size = jnp.finfo(unit.dtype).eps, lambda x: jnp.linalg.norm(x / unit)
-    left = lambda x: size(reaction(x) - x)
+    left = lambda x: reaction(x) - x
 
     def newton(carry):
-        x, _, sound, i = carry
-        d, positive = _step(reaction, x)
-        nearer = lambda share: left(x + share * d) <= (1 - share / 4) * left(x)
-        share, _ = jax.lax.while_loop(
-            lambda s: ~nearer(s[0]) & (s[1] < HALVINGS), lambda s: (s[0] / 2, s[1] + 1), (jnp.ones((), unit.dtype), 0)
-        )
-        there = x + share * d
-        better = left(there) < left(x)
+        x, r, _, sound, i = carry
+        slope = _slope(reaction, x)
+        d, positive = jnp.linalg.solve(slope, r), jnp.linalg.det(slope) > 0
+        shorter = lambda tried: (tried[0] / 2, left(x + tried[0] / 2 * d))
+        too_far = lambda tried: ~(size(tried[1]) <= (1 - tried[0] / 4) * size(r)) & (tried[0] > SHORTEST)
+        share, after = repeated(shorter, (jnp.full((), 2, unit.dtype), r), too_far)
+        there, better = x + share * d, size(after) < size(r)
         moves = better & jnp.any(jnp.abs(share * d) > 4 * eps * jnp.abs(there))
-        return jnp.where(better, there, x), moves, sound & (positive | anywhere), i + 1
+        return jnp.where(better, there, x), jnp.where(better, after, r), moves, sound & (positive | (start is not None)), i + 1
 
-    yes = jnp.array(True)
-    x, _, sound, _ = jax.lax.while_loop(lambda carry: carry[1] & carry[2] & (carry[3] < ITERATIONS), newton, (start, yes, yes, 0))
-    _, positive = _step(reaction, x)
-    solved = left(x) <= eps**0.5 * (size(x) + size(reaction(jnp.zeros_like(x))))
-    return jnp.where(solved & sound & (positive | anywhere), x, jnp.nan)
+    yes, at_zero = jnp.array(True), reaction(jnp.zeros_like(unit))
+    begin = (jnp.zeros_like(unit), at_zero) if start is None else (start, left(start))
+    going_on = lambda carry: carry[2] & carry[3] & (carry[4] < ITERATIONS)
+    x, r, _, sound, _ = jax.lax.while_loop(going_on, newton, (*begin, yes, yes, 0))
+    return jnp.where((size(r) <= eps**0.5 * (size(x) + size(at_zero))) & sound, x, jnp.nan)
 
 
 def others(reaction: Callable, found: Float[Array, " m"], unit: Float[Array, " m"], key: Any) -> Float[Array, "o m"]:
@@ -88,7 +88,7 @@ def others(reaction: Callable, found: Float[Array, " m"], unit: Float[Array, " m
     scale = jnp.linalg.norm(found / unit)
     sizes = jnp.where(scale > 0, scale, 1) * jnp.logspace(-4, 4, OTHERS, dtype=unit.dtype)
     starts = sizes[:, None] * unit[None] * jax.random.normal(key, (OTHERS, unit.size), unit.dtype)
-    ends = jax.vmap(lambda start: _by_newton(reaction, start, unit, anywhere=True))(starts)
+    ends = jax.vmap(lambda start: _by_newton(reaction, unit, start))(starts)
     apart = jnp.linalg.norm((ends - found[None]) / unit[None], axis=1, keepdims=True)
     sizes = jnp.linalg.norm(ends / unit[None], axis=1, keepdims=True) + scale
     return jnp.where(apart > jnp.finfo(unit.dtype).eps ** 0.25 * sizes, ends, jnp.nan)

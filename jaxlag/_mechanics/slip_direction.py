@@ -15,6 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from .._program.conditions import repeated
 from .._program.implicit import implicit_root, open_function
 from .friction_elements import FrictionElements
 
@@ -64,9 +65,9 @@ def friction_and_direction(
         found = jax.tree.map(lambda new, old: jnp.where(i == 0, new, old), other, found)
         return i + 1, found, rates.at[i].set(other.slip_rate)
 
-    going_on = lambda carry: (carry[0] == 0) | ((carry[0] <= r) & (begin | jnp.any(turning_in(carry[1]))))
+    going_on = lambda carry: (carry[0] <= r) & (begin | jnp.any(turning_in(carry[1])))
     nothing = jax.tree.map(lambda like: jnp.zeros(like.shape, like.dtype), jax.eval_shape(friction_in, given))
-    _, found, rates = jax.lax.while_loop(going_on, evaluated, (0, nothing, jnp.zeros((r + 1, r), sigma.dtype)))
+    _, found, rates = repeated(evaluated, (0, nothing, jnp.zeros((r + 1, r), sigma.dtype)), going_on)
 
     w, turns = rates[0], turning_in(found)
     slope = ((rates[1:] - w[None]) / CHANGE).T

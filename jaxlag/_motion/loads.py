@@ -6,38 +6,77 @@ import jax
 import jax.numpy as jnp
 import lineax as lx
 import numpy as np
+from jaxtyping import Array, Bool
 
-from .._mechanics.lagrange import inertia, velocity_rows
-from .._program.sparse_jacobian import MANY
+from .._mechanics.augmented_inertia import units_alike
+from .._mechanics.lagrange import applied_force, inertia, position_rows, velocity_rows
+from .._model.flat import Flat
+from .._program.size_of_terms import size_of_terms
+from .._program.sparse_jacobian import MANY, sparsity_pattern
 from .._program.sparse_matrix import SparseMatrix
+from .batch import BatchedEquations
 from .first_order import EquationsOfMotion
-from .protocol import Arguments
+from .protocol import Arguments, AugmentedSystem
 
 
 def told_of_loads(equations: Any, t, y, args: Arguments) -> Arguments:
-    """With what constraints at the start, and dry friction at its bound, make of each velocity: where they hold another force, the rounding
-    of both is a rate of its own; where slip begins in a plane, it has no scale of its own yet, and its direction follows the load at a
-    rate of 1/|v|.
-    """
-    if not isinstance(equations, EquationsOfMotion) or args.scales is None or not (equations.elements or equations.system.constraints):
+    """With what weighs as much as one of each coordinate, and what forces at the start make of each velocity."""
+    if args.scales is None:
         return args
-    args, parts = args._replace(scales=args.scales._replace(driven=None)), equations.parts(y)
+    found = _loads(equations, t, y, args._replace(scales=args.scales._replace(driven=None)))
+    return args if found is None else args._replace(scales=args.scales._replace(**jax.lax.stop_gradient(found)))
+
+
+def _loads(equations: Any, t, y, args: Arguments) -> dict[str, Any] | None:
+    """What `Scales` calls units, held and driven; of a motion, or of each member of a batch.
+
+    Where forces, those of constraints and of dry friction at its bound among them, hold one another, the rounding of all is a rate of its
+    own. Where slip begins in a plane, it has no scale of its own yet, and its direction follows the load at a rate of 1/|v|.
+    """
+    if isinstance(equations, BatchedEquations):
+        return equations.along_axis(lambda *of_member: _loads(equations.equations, *of_member), t, y, args)
+    if isinstance(equations, AugmentedSystem):
+        return _loads(equations.equations, t, y[..., 0], args)
+    if not isinstance(equations, EquationsOfMotion):
+        return None
+    parts = equations.parts(y)
     flat, elements = equations.contents(t, parts, args)
     M = inertia(flat, t, parts.q, parts.v)[0]
+    units = units_alike(M, [])
     if not isinstance(M, lx.DiagonalLinearOperator) and equations.size >= MANY and elements is None:
-        return args
+        return {"units": units}
     mass = M.diagonal if isinstance(M, lx.DiagonalLinearOperator) else jnp.diagonal(M.as_matrix())
     rate = lambda pulls: pulls / jnp.where(mass > 0, mass, jnp.inf)
-    scales, held = args.scales, jnp.zeros_like(parts.v)
+    terms = size_of_terms(lambda q: _forces(flat, t, q, parts.v), parts.q)
+    held, driven = rate(jnp.where(jnp.isfinite(terms), terms, 0)), None
     if equations.system.constraints:
         G = velocity_rows(flat, t, parts.q, parts.v)[1]
         G = SparseMatrix(jnp.abs(G.values), G.places) if isinstance(G, SparseMatrix) else jnp.abs(G)
         held = held + rate(G.T @ jnp.abs(equations.accelerated(t, parts, args, False).multipliers[: flat.rows]))
+        if equations.projection is not None:
+            held = jnp.where(_prescribed(flat, t, parts.q), jnp.finfo(held.dtype).max ** 0.5, held)
     if elements is not None:
         slopes = jnp.abs(jax.jacfwd(lambda v: elements.slip(t, parts.q, v))(parts.v))
         bound = jnp.abs(equations.friction(t, parts, args).bound)[elements.element_of_row]
         in_plane = elements.is_vector[elements.element_of_row]
         held = held + rate(bound @ slopes)
         if np.any(in_plane):
-            scales = scales._replace(driven=0.1 * scales.duration * rate(bound[in_plane] @ slopes[in_plane]))
-    return args._replace(scales=jax.lax.stop_gradient(scales._replace(held=held)))
+            driven = 0.1 * args.scales.duration * rate(bound[in_plane] @ slopes[in_plane])
+    return {"units": units, "held": held, "driven": driven}
+
+
+def _prescribed(flat: Flat, t, q) -> Bool[Array, " n"]:
+    """Which coordinates a constraint on them alone gives as a function of the time, so that nothing of them is integrated."""
+    G = position_rows(flat, t, q)[1]
+    if isinstance(G, SparseMatrix):
+        rows, columns = np.asarray(G.places.rows), np.asarray(G.places.columns)
+    else:
+        rows, columns = np.nonzero(sparsity_pattern(lambda q: flat.holonomic(t, q), q)) if q.size < MANY else np.zeros((2, 0), int)
+    alone = np.bincount(rows, minlength=1)[rows] == 1
+    values = G.values[alone] if isinstance(G, SparseMatrix) else G[rows[alone], columns[alone]]
+    return jnp.zeros(q.size, bool).at[columns[alone]].set(values != 0)
+
+
+def _forces(flat: Flat, t, q, v) -> Array:
+    """Those of the Lagrangian at rest, and the applied ones."""
+    return jax.grad(flat.lagrangian, argnums=1)(t, q, v) + applied_force(flat, t, q, v, jnp.zeros(flat.rows, q.dtype))

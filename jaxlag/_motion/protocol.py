@@ -91,7 +91,7 @@ class AugmentedSystem(abc.ABC):
         return _along_axis(self, "projected", t, y, args)
 
     @abc.abstractmethod
-    def along_axis(self, function: Callable, t: Any, y: Any, args: Arguments) -> Array:
+    def along_axis(self, function: Callable, t: Any, y: Any, args: Arguments) -> Any:
         """A function (t, y, args) of the equations, for all that lies along the last axis."""
 
 

@@ -12,20 +12,16 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, PyTree
 
-from .._mechanics.augmented_inertia import units_of_mass
-from .._mechanics.lagrange import inertia
 from .._model.flat import StatesAt
 from .._model.signal import SinceOrigin, is_signal, origin_of, with_second_derivatives
 from .._model.state_values import start_values
 from .._model.system import System
 from .._model.validation import check
 from .._program.conditions import computed_first
-from .._program.sparse_jacobian import MANY
 from .event_record import records
 from .first_order import EquationsOfMotion
 from .guarantees import verified
 from .integrate import SolverOptions, Variations, in_one_loop, initialised, is_variational, states_at, with_status
-from .loads import told_of_loads
 from .moments import ContactState, EventState, FrictionState
 from .protocol import Arguments
 from .provenance import Provenance
@@ -85,9 +81,8 @@ class SolutionMap:
     def _solve(self, inputs: Inputs, ts: Array, adjoint: dfx.AbstractAdjoint) -> tuple[Samples, Unchanging]:
         equations, at = self._equations(inputs, ts)
         params, times, tolerances = _counted(inputs, ts), ts - ts[0], inputs.tolerances
-        smooth = with_second_derivatives(params)
-        args = Arguments(smooth, Scales.of(tolerances, times, smooth, at.q, at.v, equations.sees_time))
-        start = initialised(equations, at, smooth, args.scales, self.search)
+        args = self._arguments(equations, at, inputs, ts)
+        start = initialised(equations, at, args.params, args.scales, self.search)
         if isinstance(adjoint, dfx.ForwardMode) or self.options.adjoint or not is_variational(equations, self.options, None, params):
             ys, result, stats = states_at(equations, self.options, adjoint, at.t, start.y, times, args, tolerances)
         else:
@@ -107,19 +102,21 @@ class SolutionMap:
         last_t, last_y = stats["last"]
         return ys[..., 0], result, stats | {"last": (last_t, last_y[..., 0])}
 
-    def _arguments(self, equations, inputs: Inputs, ts: Array) -> Arguments:
-        params, at = with_second_derivatives(_counted(inputs, ts)), self._at(inputs, ts)
-        return Arguments(params, Scales.of(inputs.tolerances, ts - ts[0], params, at.q, at.v, equations.sees_time))
+    def _arguments(self, equations, at: StatesAt, inputs: Inputs, ts: Array) -> Arguments:
+        params = with_second_derivatives(_counted(inputs, ts))
+        scales = Scales.of(inputs.tolerances, ts - ts[0], params, at.q, at.v, equations.sees_time)
+        return Arguments(params, scales)
 
     def _variations(self, equations, inputs: Inputs, directions: tuple[Inputs, ...], ts: Array) -> Variations:
         """The equations of the motion with its variations along directions, for each order."""
 
         def initial(inputs):
-            args = self._arguments(equations, inputs, ts)
-            start = initialised(equations, self._at(inputs, ts), args.params, args.scales, self.search)
+            at = self._at(inputs, ts)
+            args = self._arguments(equations, at, inputs, ts)
+            start = initialised(equations, at, args.params, args.scales, self.search)
             return start.y, start
 
-        arguments = lambda inputs: (_first_time(inputs, ts), self._arguments(equations, inputs, ts)._replace(scales=None))
+        arguments = lambda inputs: (_first_time(inputs, ts), Arguments(with_second_derivatives(_counted(inputs, ts)), None))
         variations = Variations(equations, initial)
         for of_order in directions:
             variations = variations.along(of_order, (SinceOrigin(of_order.params, None), None), of_order.t0, arguments)
@@ -133,11 +130,11 @@ class SolutionMap:
         varying = [split_varying(inputs, of_order)[0].params for of_order in directions]
         variations, times = self._variations(equations, inputs, directions, ts), ts - ts[0]
         y0, start = variations.initial(inputs)
-        args, tolerances = self._arguments(equations, inputs, ts), inputs.tolerances
+        args, tolerances = self._arguments(equations, at, inputs, ts), inputs.tolerances
         shares = tuple(_shares(inputs, of_order, args.scales.duration) for of_order in directions)
-        args = args._replace(scales=args.scales._replace(shares=shares, units=_units(equations, at, args)))
+        args = args._replace(scales=args.scales._replace(shares=shares))
         if is_variational(equations, self.options, varying, inputs.params):
-            args = told_of_loads(equations, at.t, y0[(..., *[0] * len(directions))], args)._replace(directions=variations.directions)
+            args = args._replace(directions=variations.directions)
             ys, result, stats = in_one_loop(variations.equations, self.options, at.t, y0, times, args, tolerances)
             last_t, last_y = stats["last"]
             stats = stats | {"last": (last_t, last_y[(..., *[0] * len(directions))])}
@@ -221,14 +218,6 @@ def _at_random(inputs: Inputs) -> Inputs:
     parts = inputs.q0, inputs.qdot0, inputs.params, inputs.states
     q0, qdot0, params, states = (jax.tree.map(one, part, is_leaf=is_signal) for part in parts)
     return Inputs(None, q0, qdot0, params, jax.tree.map(lambda _: None, inputs.tolerances), states)
-
-
-def _units(equations: EquationsOfMotion, at: StatesAt, args: Arguments) -> Array | None:
-    """Of each coordinate, what weighs as much as one of any other: 1/√M at the start, 0 without inertia. Of many it is not asked."""
-    if at.q.size >= MANY:
-        return None
-    M = inertia(equations.flat_at(args.params, at), at.t, at.q, at.v)[0]
-    return jax.lax.stop_gradient(units_of_mass(jnp.diagonal(M.as_matrix())))
 
 
 def _shares(inputs: Inputs, directions: Inputs, duration) -> Array:

@@ -25,6 +25,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float
 
 from .._mechanics.lagrange import imbalance
+from .._program.conditions import repeated
 from .._program.jit import jitted
 from .._program.sparse_jacobian import MANY
 from .._program.sparse_matrix import Places
@@ -138,7 +139,7 @@ class SparseImplicit(dfx.AbstractImplicitSolver, dfx.AbstractAdaptiveSolver):
 
             one = jnp.ones((), guess.dtype)
             start = Iteration(guess, one, one, 0)
-            end = lax.while_loop(lambda it: it.goes_on(finder.kappa, self.root_find_max_steps), changed, start)
+            end = repeated(changed, start, lambda it: it.goes_on(finder.kappa, self.root_find_max_steps))
             return end.u, end.has_converged(finder.kappa).astype(guess.dtype)  # a number: JAX wants its derivative, too
 
         u, converged = lax.custom_root(residual, guess, iterated, lambda push, b: linear_solution(push, self.places, b), has_aux=True)

@@ -16,6 +16,7 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float
 
+from .._program.conditions import repeated
 from .._program.time_bounds import TimeDependence, time_dependence
 from .pulses import BRIEF, UNBOUNDED
 
@@ -110,7 +111,7 @@ def first_end(
 
     nothing, time = jnp.zeros(2 * elements, path(t0).dtype), jnp.asarray(t0, path(t0).dtype)
     start = _Search(time, jnp.asarray(t1, time.dtype), jnp.array(False), 0, 0, *[nothing] * 4)
-    done = jax.lax.while_loop(going_on, closer, start)
+    done = repeated(closer, start, going_on, start.low < t1)
     slope = jnp.where(_jumps(done), -jnp.inf, done.slope)
     is_margin = jnp.any(done.behind[:elements] < 0)
     return Seen(done.found & is_margin, done.found & ~is_margin, ~done.found & (done.low < t1), done.high, slope[:elements])

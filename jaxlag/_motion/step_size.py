@@ -29,6 +29,7 @@ UNRESOLVED = 1e-4  # of its own scale, the error of what is rounding: a jump of 
 FAR = 1e-4  # of the length tried before: six steps that were refused
 BRIEF = 1e-6  # of the motion, the shortest step in which a late clock says less than the tolerance asks for
 MARGIN = 1e3  # times its last error, what rounding may err by: so that it does not hold the next steps back
+MARGIN_OF_ROUNDING = 64  # of what weighs most, by which all others are compared at least
 SHARE_OF_VARIATIONS = 0.1  # of theirs: they cross zero more often (a vehicle's three at rtol 1e-8: 106 steps, and 101 for the motion alone)
 
 
@@ -104,8 +105,13 @@ class StepControl(dfx.AbstractStepSizeController):
         return keep, t, end, made_jump, (scale, planned, inner), result
 
     def _reach(self, size, args):
-        """The scale of each entry; that of a motion is at least a part of what friction drives."""
+        """The scale of each entry; that of a motion is at least a part of what friction drives, and rounding of what weighs most: what
+        others have yet to move, as the far links of a chain, grows by any power of the time before.
+        """
         reach, n = reaching(size, self.coordinates, self.duration), self.coordinates
+        of_motion = reach[(..., *[0] * self.variations)]
+        least = MARGIN_OF_ROUNDING * jnp.finfo(reach.dtype).eps * self._among_others(of_motion, args)
+        reach = jnp.where(self._is_motion(reach), jnp.maximum(reach, least.reshape(*least.shape, *[1] * self.variations)), reach)
         if getattr(args, "scales", None) is None or args.scales.driven is None:
             return reach
         driven = args.scales.driven
@@ -146,11 +152,11 @@ class StepControl(dfx.AbstractStepSizeController):
         if getattr(args, "scales", None) is None or args.scales.held is None:
             return 0.0
         moved = 10 * jnp.finfo(reach.dtype).eps * args.scales.held * h
-        moved = jnp.concatenate([moved * h, moved, jnp.zeros(len(reach) - 2 * len(moved))]).astype(reach.dtype)
+        moved = jnp.concatenate([moved * h, moved, jnp.zeros((len(reach) - 2 * len(moved), *moved.shape[1:]))]).astype(reach.dtype)
         changes = self._changes(reach, args)
         if shares := self._shares(args):
             changes = jnp.maximum(changes, functools.reduce(jnp.multiply.outer, shares)[None])
-        return moved.reshape(-1, *[1] * (reach.ndim - 1)) * changes
+        return moved.reshape(*moved.shape, *[1] * (reach.ndim - moved.ndim)) * changes
 
     def _of_the_clock(self, args):
         """What the times that functions see round more than those of the motion: y there is known to what it moves by meanwhile."""

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PyTree
 
-from .._program.jit import options
+from .._program.jit import is_called_by_python, options
 from .padding import EXACT
 from .trajectory import Trajectory, of_samples
 
@@ -45,7 +45,8 @@ class Table:
 
     def trajectory(self, length: int, params: PyTree) -> Trajectory:
         """The first samples of the motion, which was computed from these params."""
-        rows, columns = _cut()(self.rows, self.columns, length) if len(self.rows) else (self.rows, self.columns)
+        cut = _cut() if is_called_by_python([self.rows]) else _first
+        rows, columns = cut(self.rows, self.columns, length) if len(self.rows) else (self.rows, self.columns)
         known = [leaf for leaf in jax.tree.leaves(params) if eqx.is_array(leaf)]
         leaves = [*rows, *columns, *self.others, *known]
         return jax.tree.unflatten(self.structure, [leaves[i] for i in self.order])

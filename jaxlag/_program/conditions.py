@@ -1,5 +1,6 @@
-"""Conditions that stay conditions in a batch, and what they keep apart."""
+"""Conditions that stay conditions in a batch, loops whose condition is one there, and what conditions keep apart."""
 
+from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -16,6 +17,26 @@ def everywhere(condition: Bool[Array, ""]) -> Bool[Array, ""]:
 @everywhere.def_vmap
 def _for_all_members(axis_size, in_batched, conditions):
     return everywhere(jnp.all(conditions)), False
+
+
+def repeated(turn: Callable, start: Any, going_on: Callable, begins: Bool[Array, ""] | bool = True) -> Any:
+    """`start` after one turn, if it `begins` at all, and after as many more as it is `going_on`, which is decided within the turn.
+
+    In a batch `while_loop` computes its condition in two places: whether any member goes on, and which. Where it is more than a comparison
+    of what is carried, rounding may differ between the two, and a loop in which one says yes and the other no runs for ever.
+    """
+
+    def turned(carry):
+        after = turn(carry[1])
+        return going_on(after), after
+
+    return jax.lax.while_loop(lambda carry: carry[0], turned, (jnp.asarray(begins), start))[1]
+
+
+def halved(is_good: Callable, least: float, dtype: Any) -> tuple[Float[Array, ""], Bool[Array, ""]]:
+    """The largest of 1, ½, ¼, … that is good, and whether there is one: the last that is tried is not above the `least`."""
+    turn = lambda carry: (carry[0] / 2, is_good(carry[0] / 2))
+    return repeated(turn, (jnp.full((), 2, dtype), jnp.array(False)), lambda carry: ~carry[1] & (carry[0] > least))
 
 
 @jax.custom_jvp

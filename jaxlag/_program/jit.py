@@ -91,7 +91,7 @@ def _split(given, named):
     leaves, structure = jax.tree.flatten((given, named))
     is_array = [isinstance(leaf, (np.ndarray, jax.Array, np.number)) for leaf in leaves]
     arrays = [leaf if traced else None for leaf, traced in zip(leaves, is_array, strict=True)]
-    static = tuple(None if traced else leaf for leaf, traced in zip(leaves, is_array, strict=True))
+    static = tuple([None if traced else leaf for leaf, traced in zip(leaves, is_array, strict=True)])
     return arrays, (static, structure)
 
 

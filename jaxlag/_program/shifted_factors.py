@@ -9,6 +9,8 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float
 
+from .conditions import repeated
+
 SHIFT = 0.35  # exponent of eps: what is added then, in units in which the matrix has numbers near one
 GROWTH = 0.85  # exponent of 1/eps: what the inverse makes of a number then; that of a straight chain of m links makes m²/8 of it
 REFINEMENTS = 12, 400  # times that a solution is put right then, at least and at most: a straight chain of 1000 links takes 40
@@ -53,7 +55,7 @@ def put_right(once: Callable, matvec: Callable, b: Array, least: int, shifted: B
         return (i < least) | (shifted & ((i < few) | (shrinking & (i < most))))
 
     unknown = jnp.asarray(jnp.inf, b.dtype)
-    x, change, before, i = lax.while_loop(going_on, turn, (once(b), unknown, unknown, 0))
+    x, change, before, i = repeated(turn, (once(b), unknown, unknown, 0), going_on, shifted | (least > 0))
     to_come = change**2 / jnp.where(before > change, before - change, 1)  # of a geometric series
     is_found = ~shifted | (i < most) | (to_come <= jnp.finfo(b.dtype).eps ** 0.5 * largest(x))
     return jnp.where(is_found, x, jnp.nan)

@@ -75,6 +75,20 @@ def test_velocities_or_accelerations_are_enough():
         np.testing.assert_allclose([found.estimates["c"], found.estimates["b"]], [4.0, 0.3], rtol=1e-3)
 
 
+def test_a_regression_does_not_depend_on_where_a_coordinate_is_counted_from():
+    """Two sensors of one motion are weighed by their noise, not by how far from zero they read: along a rail of kilometres too."""
+    rail = jl.System(lambda q, qdot, c, origin: 0.5 * qdot**2 - 0.5 * c * (q - origin) ** 2, dissipation=lambda qdot, b: 0.5 * b * qdot**2)
+    noise = np.random.default_rng(3).standard_normal((2, osc.TIMES.size)) * np.array([[1e-3], [3e-2]])
+
+    def found(origin):
+        seen = dict(zip("ab", origin + osc.position(osc.TIMES) + noise, strict=True))
+        e = jl.Experiment(osc.TIMES, seen, origin + 1.0, 0.0, observe=lambda q: {"a": q, "b": q})
+        r = jl.regress(rail, e, {"c": np.nan, "b": np.nan, "origin": origin}, free=("c", "b"))
+        return np.array([r.estimates["c"], r.estimates["b"], r.standard_errors["c"], r.standard_errors["b"]])
+
+    np.testing.assert_allclose(found(2e4), found(0.0), rtol=1e-6)
+
+
 def test_equations_in_which_everything_is_free_have_no_scale():
     with pytest.raises(ValueError, match="only their ratios are determined. Fix one of them."):
         jl.regress(osc.SYSTEM, osc.record(0), osc.START, free=("m", "c", "b"))

@@ -63,6 +63,32 @@ def test_a_row_is_held_in_any_unit_or_refused(n):
     at = lambda unit: jl.acceleration(chain, jnp.zeros(n), jnp.zeros(n), {"unit": unit}).qddot
     for unit in (1e-14, 1e-9, 1e9, 1e14):
         np.testing.assert_allclose(at(unit), (n + 1) / 2, rtol=1e-9)
+    off = lambda unit: jl.consistent_state(chain, jnp.zeros(n), jnp.arange(1.0, n + 1), {"unit": unit})[1]
+    for unit in (1e-14, 1e14):
+        np.testing.assert_allclose(off(unit), (n + 1) / 2, rtol=1e-9)
     for unit in (1e-18, 1e18):
-        with pytest.raises(ValueError, match="lost in the rounding of another"):
-            at(unit)
+        for question in (at, off):
+            with pytest.raises(ValueError, match="lost in the rounding of another"):
+                question(unit)
+
+
+@pytest.mark.parametrize("length", [1.0, 1e-9, 1e9])
+def test_what_is_held_altogether_rests(length):
+    """(3, 4) on a circle and on a line: both velocities are none, and what is left of them is rounding."""
+    held = jl.System(
+        lambda qdot: 0.5 * qdot @ qdot, holonomic={"circle": lambda q, s: q @ q - 25 * s**2, "line": lambda q: 4 * q[0] - 3 * q[1]}
+    )
+    q, qdot = jl.consistent_state(held, length * np.array([3.1, 3.8]), length * np.array([1.0, -2.0]), {"s": length})
+    np.testing.assert_allclose(q / length, [3.0, 4.0], rtol=1e-12)
+    np.testing.assert_allclose(qdot / length, 0, atol=1e-12)
+
+
+@pytest.mark.parametrize("length", [1.0, 1e-9, 1e9])
+def test_a_state_far_from_what_is_stated_twice(length):
+    """A circle by two equations, whose rows there differ as if they held both coordinates."""
+    circle = lambda q, s: (q @ q) / s**2 - 25
+    again = lambda q, s: circle(q, s) * (2 + jnp.cos(q[0] / s))
+    stated = jl.System(lambda qdot: 0.5 * qdot @ qdot, holonomic={"circle": circle, "again": again})
+    q, qdot = jl.consistent_state(stated, length * np.array([4.5, 6.0]), length * np.array([1.0, 0.0]), {"s": length})
+    np.testing.assert_allclose(q / length, [3.0, 4.0], rtol=1e-12)
+    np.testing.assert_allclose(qdot / length, [0.64, -0.48], rtol=1e-12)

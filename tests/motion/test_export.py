@@ -249,6 +249,11 @@ def test_a_slice_is_a_motion_that_starts_later(rubbed):
     assert "41 samples, t = 10 … 14" in str(late) and "'table' never pulls" in str(late)
 
 
+@pytest.mark.parametrize("start, said", [(1.7e9, "t = 1700000000 … 1700000014"), (1e5, "t = 100000 … 100014"), (0.0, "t = 0 … 14")])
+def test_the_card_of_a_late_motion_tells_its_times_apart(rubbed, start, said):
+    assert said in str(dataclasses.replace(rubbed, ts=start + rubbed.ts))
+
+
 def test_the_card_of_a_motion_that_failed_counts_what_was_reached(rubbed):
     unreached = lambda x: x.at[100:].set(jnp.nan) if x.shape[:1] == (141,) and x.dtype == float else x
     failed = dataclasses.replace(jax.tree.map(unreached, rubbed), ts=rubbed.ts, result=jl.RESULTS.max_steps_reached)

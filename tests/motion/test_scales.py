@@ -80,6 +80,48 @@ def test_a_chain_named_mass_by_mass():
     np.testing.assert_allclose(found, exact, atol=1e-13)
 
 
+CHAIN = jl.System(
+    lambda q, qdot: 0.5 * qdot @ qdot - 0.5 * jnp.sum(jnp.diff(q, prepend=0, append=0) ** 2),
+    force=lambda t, q: jnp.zeros_like(q).at[0].set(jnp.sin(t)),
+)
+
+
+def test_a_chain_that_is_shaken_at_one_end():
+    """From rest at zero: the motion of its masses grows like t³, t⁵, …, t⁸¹. What is yet to be moved does not set the steps."""
+    run = lambda **given: jl.simulate(CHAIN, np.zeros(40), np.zeros(40), [0.0, 20.0, 60.0], **given)
+    motion, coarse = run(), run(atol=1e-10)
+    assert motion.stats["num_steps"] < 3 * coarse.stats["num_steps"]
+    batch = jl.simulate_many(CHAIN, np.zeros((2, 40)), np.zeros(40), [0.0, 20.0, 60.0], over=("q0",), common_steps=True)
+    assert np.all(batch.stats["num_steps"] < 1.2 * motion.stats["num_steps"])
+    w2, modes = np.linalg.eigh(2 * np.eye(40) - np.eye(40, k=1) - np.eye(40, k=-1))
+    w, t = np.sqrt(w2), np.array([[20.0], [60.0]])
+    exact = (modes[0] * (np.sin(t) - np.sin(w * t) / w) / (w2 - 1)) @ modes.T
+    np.testing.assert_allclose(motion.q[1:], exact, atol=1e-7)
+
+
+def net(q, l):
+    return [jnp.linalg.norm(jnp.diff(q, axis=side), axis=-1) - l for side in (0, 1)]
+
+
+NET = jl.System(
+    lambda q, qdot, l: 0.5 * 0.025 * jnp.sum(qdot**2) - 0.025 * 9.81 * jnp.sum(q[..., 2]) - 1e3 * sum(jnp.sum(s**2) for s in net(q, l)),
+    holonomic={"left": lambda q, origin: q[0, 0] - origin, "right": lambda q, origin: q[-1, 0, 1:] - origin},
+)
+
+
+def test_a_net_that_begins_to_hang():
+    """Springs of 0.1 m cancel but for rounding in coordinates that are zero, or held by a hook: it does not matter where the origin is."""
+    flat = 0.1 * np.stack(np.meshgrid(np.arange(3), np.arange(3), [0.0], indexing="ij"), axis=-1)[:, :, 0]
+
+    def run(origin):
+        motion = jl.simulate(NET, flat + origin, np.zeros((3, 3, 3)), np.linspace(0, 0.5, 6), {"l": 0.1, "origin": origin})
+        return motion.q - origin, int(motion.stats["num_steps"])
+
+    (here, steps), (there, of_there) = run(0.0), run(3.0)
+    assert steps < 1.5 * of_there
+    np.testing.assert_allclose(here, there, atol=1e-6)
+
+
 def test_a_slow_slider_beside_a_fast_rotor():
     """Each is compared with its own scale: 1e-6 beside 1e4."""
     system = jl.System(lambda q, qdot: 0.5 * qdot["x"] ** 2 - 0.5 * q["x"] ** 2 + 0.5 * qdot["phi"] ** 2)

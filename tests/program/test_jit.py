@@ -115,3 +115,9 @@ def test_within_the_users_own_jit_a_motion_ends():
     said = subprocess.run([sys.executable, "-c", WITHIN_JIT], env=environment, capture_output=True, text=True, timeout=600, check=True)
     alone, within = np.reshape([float(x) for x in said.stdout.split()], (2, 2))
     np.testing.assert_allclose(within, alone, rtol=1e-9)
+
+
+def test_within_the_users_own_jit_everything_may_be_known():
+    """A motion of nothing but constants."""
+    motion = lambda: jl.simulate(vehicle.system, vehicle.q0, vehicle.qdot0, TS, vehicle.params).q["y"]
+    np.testing.assert_allclose(jax.jit(motion)(), motion(), rtol=1e-12)

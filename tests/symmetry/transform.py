@@ -44,6 +44,9 @@ def plain(case: Case) -> Units:
     return Units(0.0, 1.0, 1.0, one, 0 * one, 0 * one, rows, dict.fromkeys(case.states, 1.0), params)
 
 
+APART = 1e-14  # of a row to another, at least: their lengths in one unit differ by a few
+
+
 def drawn_units(case: Case, seed: int, which: str) -> Units:
     """Units of a transformation: each number a power of ten."""
     draw, units = np.random.default_rng([seed, *which.encode()]), plain(case)
@@ -62,7 +65,9 @@ def drawn_units(case: Case, seed: int, which: str) -> Units:
         case "each length":
             return units._replace(length=decades(9, case.n))
         case "rows":
-            return units._replace(rows=named(units.rows, 9), states=named(units.states, 9))
+            rows = named(units.rows, 9)  # one that is lost in the rounding of another is refused
+            least = APART * max(rows.values(), default=0.0)
+            return units._replace(rows={name: max(x, least) for name, x in rows.items()}, states=named(units.states, 9))
         case "params":
             return units._replace(params=named(units.params, 9))
         case "channels":
