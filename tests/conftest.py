@@ -1,28 +1,15 @@
-"""Tests run in double precision, without implicit broadcasting of ranks, and with every shape annotation checked.
-
-They are compiled with the flag that README recommends for a CPU and few of LLVM's optimisations, in less than two thirds of the time, most
-of which is compilation; `program/test_jit` compares with the defaults. Level 0 beside that flag is not right: a gradient is off by a third.
-"""
+"""Tests run in double precision, without implicit broadcasting of ranks, and with every shape annotation checked."""
 
 import collections
-import os
 import pathlib
-import tempfile
+import shutil
 
-if "JAX_COMPILATION_CACHE_DIR" not in os.environ:  # what one worker has compiled serves all, and the programs that tests start
-    folder = tempfile.TemporaryDirectory(prefix="jaxlag-tests-")  # removed at the end of the run
-    os.environ |= {"JAX_COMPILATION_CACHE_DIR": folder.name, "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0"}
-
+import compiling  # isort: skip
 import costs
 import jax
-import jaxlib
 import pytest
 from jax.experimental.compilation_cache import compilation_cache as cache_of_jax
 from jaxtyping import install_import_hook
-
-os.environ["XLA_FLAGS"] = f"--xla_backend_optimization_level=1 {os.environ.get('XLA_FLAGS', '')}"
-if tuple(map(int, jaxlib.__version__.split(".")[:2])) <= (0, 10):  # an unknown flag would end the process
-    os.environ["XLA_FLAGS"] = f"--xla_cpu_use_fusion_emitters=false {os.environ['XLA_FLAGS']}"
 
 jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_numpy_rank_promotion", "raise")
@@ -30,14 +17,28 @@ jax.config.update("jax_numpy_rank_promotion", "raise")
 ROOT = pathlib.Path(__file__).parents[1]
 FILES = [file.relative_to(ROOT).with_suffix("") for file in ROOT.glob("jaxlag/**/*.py") if "from jaxtyping import" in file.read_text()]
 
-# Files without annotations of shapes have nothing to check, and the checks of their calls took a sixth of the CPU time of the tests
-with install_import_hook([".".join(file.parts) for file in FILES], "beartype.beartype"):
-    from jaxlag._program.kept_programs import KEPT
-
 
 def pytest_addoption(parser):
     parser.addoption("--part", metavar="I/N", help="of the tests marked slow only every N-th, from the I-th on")
     parser.addoption("--costs", metavar="FILE", help="appends what each test takes: see tests/costs.py")
+    parser.addoption("--recompile", action="store_true", help="empties the folder of compiled programs that is kept between runs")
+
+
+def pytest_configure(config):
+    is_worker = hasattr(config, "workerinput")
+    if config.getoption("--recompile") and not is_worker:
+        shutil.rmtree(compiling.KEPT_IN, ignore_errors=True)
+    if is_worker or not getattr(config.option, "numprocesses", None):  # what starts workers runs no test itself
+        # Files without annotations of shapes have nothing to check, and the checks of their calls took a sixth of the time of the tests
+        with install_import_hook([".".join(file.parts) for file in FILES], "beartype.beartype"):
+            import jaxlag  # noqa: F401
+
+
+def pytest_ignore_collect(collection_path, config):
+    """With `-m fast` files without such tests are not even imported."""
+    if config.option.markexpr == "fast" and collection_path.suffix == ".py" and "mark.fast" not in collection_path.read_text():
+        return True
+    return None
 
 
 def pytest_collection_modifyitems(config, items):
@@ -98,4 +99,6 @@ def compilation_cache(tmp_path):
     for name, value in before.items():
         jax.config.update(name, value)
     cache_of_jax.reset_cache()
+    from jaxlag._program.kept_programs import KEPT
+
     KEPT.keep_in(None)

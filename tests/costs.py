@@ -1,4 +1,4 @@
-"""What tests take, most of it compilation: `pytest --costs FILE` measures, `python tests/costs.py FILE` prints a table by file.
+"""What tests take, most of it compilation: `pytest --costs=FILE` measures, `python tests/costs.py FILE` prints a table by file.
 
 Of each test a line: its name, seconds, of these what JAX traced, what XLA compiled, and how many programs it compiled. What a test starts
 as another process counts as seconds alone.

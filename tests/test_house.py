@@ -7,6 +7,7 @@ import re
 import subprocess
 import sys
 
+import mutate
 import pytest
 
 import jaxlag
@@ -306,10 +307,10 @@ def _imported(file):
                 yield from ((file.parent.name if inside else "", alias.name) for alias in node.names)
 
 
-@pytest.mark.parametrize("wing, name", FILES)
-def test_a_file_imports_only_from_files_before_it(wing, name):
-    allowed = FILES[: FILES.index((wing, name))] + [("", beside) for beside in BESIDE]
-    assert set(_imported(PACKAGE / wing / f"{name}.py")) <= set(allowed)
+def test_a_file_imports_only_from_files_before_it():
+    for i, (wing, name) in enumerate(FILES):
+        allowed = FILES[:i] + [("", beside) for beside in BESIDE]
+        assert set(_imported(PACKAGE / wing / f"{name}.py")) <= set(allowed), f"{wing}/{name}"
 
 
 def test_every_file_has_its_place():
@@ -368,3 +369,11 @@ def test_import_has_no_side_effects():
 def test_the_version_is_that_of_the_metadata_and_the_types_are_shipped():
     assert jaxlag.__version__ == importlib.metadata.version("jaxlag")
     assert (PACKAGE / "py.typed").exists()
+
+
+def test_mutations_are_of_what_stands_in_the_package():
+    found = mutate.mutations()
+    assert len({mutation.wrong for mutation in found}) == len(found) >= 60
+    for mutation in found:
+        assert mutate.mutated(mutation, (mutate.ROOT / mutation.file).read_text())
+        assert all((mutate.ROOT / "tests" / path).exists() for path in mutation.first), mutation.wrong

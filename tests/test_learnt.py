@@ -200,6 +200,7 @@ def test_batches_of_networks_and_single_precision():
     np.testing.assert_allclose(single, double[1], atol=1e-4)
 
 
+@pytest.mark.slow
 def test_a_potential_conserves_energy_and_is_bounded():
     net = Potential({"x": 0.3, "y": 0.5}, energy=4.0, key=jax.random.key(11))
     system = jl.System(lambda q, qdot, m, net: 0.5 * m * (qdot["x"] ** 2 + qdot["y"] ** 2) - net(q))

@@ -5,9 +5,12 @@ import io
 import pathlib
 import re
 
+import pytest
+
 README = (pathlib.Path(__file__).parents[1] / "README.md").read_text()
 
 
+@pytest.mark.slow
 def test_the_examples_print_what_they_say(compilation_cache):
     examples = re.findall(r"```python\n(.*?)```\n\n```text\n(.*?)```", README, re.S)
     assert len(examples) == README.count("```python")

@@ -111,7 +111,9 @@ def matrices(choice: Choice, system: System, t: Any, q: PyTree, qdot: PyTree, pa
     by_held = jnp.abs(jnp.concatenate([of.by_inputs[0, :, len(choice.inputs) - choice.loops :] for of in (qddot, z, updates)]))
     of_state, of_terms = _sizes(dynamics, y, forces.multipliers, M)
     independent = np.array([*positions, *(n + velocities), *range(2 * n, len(of_state))], int)
-    size = by_state @ of_state[independent] + by_held @ jnp.abs(dynamics.held[: choice.loops]) + of_terms
+    size = by_state @ of_state[independent] + of_terms
+    of_updates = size[size.size - dynamics.held.size :]  # an update that comes to nothing leaves what it rounds
+    size = size + by_held @ jnp.maximum(jnp.abs(dynamics.held), of_updates)[: choice.loops]
     allowed = jnp.finfo(y.q.dtype).eps ** STEADY * size
     left = jnp.concatenate([forces.qddot, found.z, found.updates - dynamics.held])
     steadiness = Steadiness(left, allowed, forces.sound.determined & forces.sound.satisfied)

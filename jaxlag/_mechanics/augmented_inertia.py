@@ -29,6 +29,8 @@ def units_alike(M: lx.AbstractLinearOperator, rows: Sequence[Any]) -> Float[Arra
     """`unit_lengths` of an M and rows of any kind; of many coordinates those of their masses, and 0 where these are not seen."""
     if isinstance(M, StructuredInertia) and M.sums:
         return jnp.zeros(M.size, M.slopes.values.dtype)
+    if isinstance(M, lx.DiagonalLinearOperator) and not rows:
+        return jnp.where(M.diagonal > 0, units_of_mass(M.diagonal), 1)
     if not isinstance(M, StructuredInertia) and not any(isinstance(G, SparseMatrix) for G in rows):
         M = M.as_matrix()
         return unit_lengths(M, jnp.concatenate([jnp.zeros((0, len(M)), M.dtype), *rows]))

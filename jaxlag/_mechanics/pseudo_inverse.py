@@ -12,8 +12,8 @@ from jaxtyping import Array, Bool, Float
 
 from .._program.conditions import everywhere
 
-# Exponents of eps (1.3e-5, 1.6e-10, 1.8e-12 and 1.3e-6 in double precision) and a factor, with which ranks are judged
-CLEAR, SEEN, NOISE, FOLLOWS, FARTHER = 0.3125, 0.625, 0.75, 0.375, 2
+# Exponents of eps (1.3e-5, 1.6e-10, 1.8e-12, 1.3e-6 and 1.1e-2 in double precision) and a factor, with which ranks are judged
+CLEAR, SEEN, NOISE, FOLLOWS, FAR, FARTHER = 0.3125, 0.625, 0.75, 0.375, 0.125, 2
 MAY_BE = 3  # times as large as to first order
 
 
@@ -79,7 +79,7 @@ def by_rows(asked: Request, D) -> tuple[Float[Array, "m m"], Bool[Array, ""]]:
 
     Values above `CLEAR` of the largest count. Those down to `SEEN` count where what they ask for is no more than `FARTHER` times all the
     rest, or `reach`. Others are left out: below `NOISE`, where dependent rows have them by rounding, for good; above it, unsatisfied.
-    Left out for good is too what rows that depend on each other on the constraints alone ask of a state `beside` them.
+    Left out for good is too what rows that depend on each other on the constraints alone ask of a state `beside` them, but not `FAR` off.
     """
     eps, rows = jnp.finfo(D.dtype).eps, D[:, None] * asked.rows
     U, values = _left_singular_vectors(jnp.concatenate([rows, _absent(D)], axis=1))
@@ -102,10 +102,12 @@ def by_rows(asked: Request, D) -> tuple[Float[Array, "m m"], Bool[Array, ""]]:
 
 
 def _blur(beside, D, U, values, clear):
-    """What values rows may have but for the state being off: those of their changes on the way back to the constraints."""
+    """What values rows may have but for the state being off: those of their changes on the way back to the constraints; from far away,
+    where these are as large as the rows, they say nothing.
+    """
     back = D * (U @ (jnp.where(clear, U.T @ (D * -beside.off), 0) / jnp.where(clear, values, 1) ** 2))
     blur = MAY_BE * jnp.linalg.norm(U.T @ (D[:, None] * beside.change(back)), axis=1)
-    return jnp.where(jnp.isfinite(blur), blur, 0)
+    return jnp.where(blur < jnp.finfo(D.dtype).eps ** FAR * values[0], blur, 0)
 
 
 def _absent(D):

@@ -23,12 +23,12 @@ def told_of_loads(equations: Any, t, y, args: Arguments) -> Arguments:
     """With what weighs as much as one of each coordinate, and what forces at the start make of each velocity."""
     if args.scales is None:
         return args
-    found = _loads(equations, t, y, args._replace(scales=args.scales._replace(driven=None)))
-    return args if found is None else args._replace(scales=args.scales._replace(**jax.lax.stop_gradient(found)))
+    found = _loads(equations, *jax.lax.stop_gradient((t, y, args._replace(scales=args.scales._replace(driven=None)))))
+    return args if found is None else args._replace(scales=args.scales._replace(**found))
 
 
 def _loads(equations: Any, t, y, args: Arguments) -> dict[str, Any] | None:
-    """What `Scales` calls units, held and driven; of a motion, or of each member of a batch.
+    """What `Scales` calls units, held, given and driven; of a motion, or of each member of a batch.
 
     Where forces, those of constraints and of dry friction at its bound among them, hold one another, the rounding of all is a rate of its
     own. Where slip begins in a plane, it has no scale of its own yet, and its direction follows the load at a rate of 1/|v|.
@@ -48,13 +48,13 @@ def _loads(equations: Any, t, y, args: Arguments) -> dict[str, Any] | None:
     mass = M.diagonal if isinstance(M, lx.DiagonalLinearOperator) else jnp.diagonal(M.as_matrix())
     rate = lambda pulls: pulls / jnp.where(mass > 0, mass, jnp.inf)
     terms = size_of_terms(lambda q: _forces(flat, t, q, parts.v), parts.q)
-    held, driven = rate(jnp.where(jnp.isfinite(terms), terms, 0)), None
+    held, given, driven = rate(jnp.where(jnp.isfinite(terms), terms, 0)), None, None
     if equations.system.constraints:
         G = velocity_rows(flat, t, parts.q, parts.v)[1]
         G = SparseMatrix(jnp.abs(G.values), G.places) if isinstance(G, SparseMatrix) else jnp.abs(G)
         held = held + rate(G.T @ jnp.abs(equations.accelerated(t, parts, args, False).multipliers[: flat.rows]))
         if equations.projection is not None:
-            held = jnp.where(_prescribed(flat, t, parts.q), jnp.finfo(held.dtype).max ** 0.5, held)
+            given = _prescribed(flat, t, parts.q)
     if elements is not None:
         slopes = jnp.abs(jax.jacfwd(lambda v: elements.slip(t, parts.q, v))(parts.v))
         bound = jnp.abs(equations.friction(t, parts, args).bound)[elements.element_of_row]
@@ -62,7 +62,7 @@ def _loads(equations: Any, t, y, args: Arguments) -> dict[str, Any] | None:
         held = held + rate(bound @ slopes)
         if np.any(in_plane):
             driven = 0.1 * args.scales.duration * rate(bound[in_plane] @ slopes[in_plane])
-    return {"units": units, "held": held, "driven": driven}
+    return {"units": units, "held": held, "given": given, "driven": driven}
 
 
 def _prescribed(flat: Flat, t, q) -> Bool[Array, " n"]:

@@ -36,6 +36,7 @@ class Scales(NamedTuple):
     of_v: Any
     driven: Any = None  # of each velocity, the least scale that dry friction in a plane gives it
     held: Any = None  # of each velocity, the rate that forces which may hold one another give it
+    given: Any = None  # of each coordinate, whether a constraint alone gives it as a function of the time
     units: Any = None  # of each coordinate, what weighs as much as one of any other
     shares: tuple = ()  # of each direction of variations, for each order, the share by which it changes a number at most
 

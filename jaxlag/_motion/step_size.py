@@ -30,6 +30,7 @@ FAR = 1e-4  # of the length tried before: six steps that were refused
 BRIEF = 1e-6  # of the motion, the shortest step in which a late clock says less than the tolerance asks for
 MARGIN = 1e3  # times its last error, what rounding may err by: so that it does not hold the next steps back
 MARGIN_OF_ROUNDING = 64  # of what weighs most, by which all others are compared at least
+ON_THE_WAY = 1e-2  # of its own scale, by which what is given as a function of the time may be off before it is projected
 SHARE_OF_VARIATIONS = 0.1  # of theirs: they cross zero more often (a vehicle's three at rtol 1e-8: 106 steps, and 101 for the motion alone)
 
 
@@ -148,7 +149,9 @@ class StepControl(dfx.AbstractStepSizeController):
         return jnp.concatenate([of(reach[:n]), of(reach[n : 2 * n]), reach[2 * n :]])
 
     def _held(self, reach, args, h):
-        """What the rounding of forces that constraints and friction hold moves in a step: where a motion rests, it is all that moves."""
+        """What the rounding of forces that constraints and friction hold moves in a step: where a motion rests, it is all that moves. Of
+        what is given as a function of the time a step has but to be near enough that projection finds it.
+        """
         if getattr(args, "scales", None) is None or args.scales.held is None:
             return 0.0
         moved = 10 * jnp.finfo(reach.dtype).eps * args.scales.held * h
@@ -156,7 +159,12 @@ class StepControl(dfx.AbstractStepSizeController):
         changes = self._changes(reach, args)
         if shares := self._shares(args):
             changes = jnp.maximum(changes, functools.reduce(jnp.multiply.outer, shares)[None])
-        return moved.reshape(*moved.shape, *[1] * (reach.ndim - moved.ndim)) * changes
+        moved = moved.reshape(*moved.shape, *[1] * (reach.ndim - moved.ndim)) * changes
+        if args.scales.given is None:
+            return moved
+        given = args.scales.given
+        given = jnp.concatenate([given, given, jnp.zeros((len(reach) - 2 * len(given), *given.shape[1:]), bool)])
+        return jnp.where(given.reshape(*given.shape, *[1] * (reach.ndim - given.ndim)), jnp.maximum(moved, ON_THE_WAY * reach), moved)
 
     def _of_the_clock(self, args):
         """What the times that functions see round more than those of the motion: y there is known to what it moves by meanwhile."""

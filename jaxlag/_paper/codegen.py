@@ -66,12 +66,17 @@ C_FUNCTIONS = re.findall(
 RESERVED_IN_C = frozenset((*reserved_words, *OWN_NAMES, *C_FUNCTIONS))
 
 
-LEAST_NORM = [
-    "size = numpy.abs(matrix).max(axis=1)",
-    "size[size == 0] = 1",
-    "# constraints may be redundant: then the multipliers are those of least norm",
-    "solution = numpy.linalg.lstsq(matrix / size[:, None], right / size, rcond=1e-12)[0]",
-]
+LEAST_NORM = """# in units of each coordinate and each row in which inertias and the largest entries of rows are 1
+units, mass = numpy.ones(len(matrix)), numpy.abs(numpy.diag(matrix)[:{n}])
+units[:{n}][mass > 0] = mass[mass > 0] ** -0.5
+size = numpy.abs(matrix[{n}:, :{n}] * units[:{n}]).max(axis=1)
+units[{n}:][size > 0] = 1 / size[size > 0]
+u, size, v = numpy.linalg.svd(units[:, None] * matrix * units)
+there = size > 1e-12 * size[0]
+solution = units * (v[there].T @ ((u.T @ (units * right))[there] / size[there]))
+# constraints may be redundant: then the multipliers are those of least norm
+free = units[{n}:, None] * v[~there, {n}:].T
+solution[{n}:] -= free @ numpy.linalg.lstsq(free, solution[{n}:], rcond=None)[0]"""
 
 
 def to_python(program: Program) -> str:
@@ -88,7 +93,7 @@ def to_python(program: Program) -> str:
     else:
         rows = [f"    [{', '.join(row)}]," for row in writer.A]
         body += ["matrix = numpy.array([", *rows, "], float)", f"right = {array(writer.b)}"]
-        body += LEAST_NORM if program.multipliers else ["solution = numpy.linalg.solve(matrix, right)"]
+        body += LEAST_NORM.format(n=n).splitlines() if program.multipliers else ["solution = numpy.linalg.solve(matrix, right)"]
         body += [f"return solution[:{n}], solution[{n}:]"]
     needed = [f"import {module}" for module in ("functools", "math") if any(f"{module}." in line for line in body)]
     head = [*needed, *[""] * bool(needed), "import numpy", "", "", "def acceleration(t, q, qdot, params):"]
@@ -109,7 +114,7 @@ def to_c(program: Program) -> str:
     if not writer.z:
         rows = ", ".join(f"{{{', '.join(row)}}}" for row in writer.A)
         body += [f"double matrix[{size}][{size}] = {{{rows}}}, right[{size}] = {{{', '.join(writer.b)}}}, solution[{size}];"]
-        body += [f"solve({size}, matrix, right, solution);"]
+        body += [f"solve({size}, {n}, matrix, right, solution);"]
     body += [f"{target} = {formula};" for target, formula in zip(targets, z, strict=True)]
     order = [*given, ("multipliers", program.multipliers)]
     comment = "; ".join(f"{part}: {', '.join(writer.names[symbol] for symbol in symbols)}" for part, symbols in order if symbols)
@@ -170,17 +175,21 @@ class _Writer:
 
 
 CONSTANTS = {constant: sympy.Float(constant, 17) for constant in (sympy.pi, sympy.E)}
-SOLVE = """/* z of A z = b, by elimination with complete pivoting; of least norm where rows are linearly dependent. */
-static void solve(int n, double A[n][n], double *b, double *z)
+SOLVE = """/* z of A z = b, by elimination with complete pivoting, in units in which the inertia of each of the m coordinates and the
+   largest entry of each row behind them are 1; of least norm where rows are linearly dependent. */
+static void solve(int n, int m, double A[n][n], double *b, double *z)
 {
     int place[n], rank = 0;
-    double free[n][n];
+    double unit[n], free[n][n];
     for (int i = 0; i < n; i++) {
-        double size = 0;
-        for (int j = 0; j < n; j++) size = fmax(size, fabs(A[i][j]));
-        for (int j = 0; j < n; j++) A[i][j] /= size > 0 ? size : 1;
-        b[i] /= size > 0 ? size : 1;
+        double size = i < m ? sqrt(fabs(A[i][i])) : 0;
+        for (int j = 0; i >= m && j < m; j++) size = fmax(size, fabs(A[i][j] * unit[j]));
+        unit[i] = size > 0 ? 1 / size : 1;
         place[i] = i;
+    }
+    for (int i = 0; i < n; i++) {
+        for (int j = 0; j < n; j++) A[i][j] *= unit[i] * unit[j];
+        b[i] *= unit[i];
     }
     for (; rank < n; rank++) {
         int row = rank, column = rank;
@@ -199,13 +208,13 @@ static void solve(int n, double A[n][n], double *b, double *z)
             b[i] -= factor * b[rank];
         }
     }
-    for (int i = 0; i < n; i++) z[place[i]] = i < rank ? b[i] / A[i][i] : 0;
-    for (int k = rank; k < n; k++) { /* remove the null space of A, by orthogonal null vectors */
-        for (int i = 0; i < n; i++) free[k][place[i]] = i < rank ? -A[i][k] / A[i][i] : i == k;
+    for (int i = 0; i < n; i++) z[place[i]] = i < rank ? unit[place[i]] * b[i] / A[i][i] : 0;
+    for (int k = rank; k < n; k++) { /* remove the null space of A from what stands behind coordinates, by orthogonal null vectors */
+        for (int i = 0; i < n; i++) free[k][place[i]] = unit[place[i]] * (i < rank ? -A[i][k] / A[i][i] : i == k);
         for (int l = rank; l <= k; l++) {
             double *target = l < k ? free[k] : z, *along = l < k ? free[l] : free[k], dot = 0, square = 0;
-            for (int i = 0; i < n; i++) dot += along[i] * target[i], square += along[i] * along[i];
-            for (int i = 0; i < n; i++) target[i] -= dot / square * along[i];
+            for (int i = m; i < n; i++) dot += along[i] * target[i], square += along[i] * along[i];
+            for (int i = m; i < n; i++) target[i] -= square > 0 ? dot / square * along[i] : 0;
         }
     }
 }

@@ -56,6 +56,7 @@ def test_motions_have_lines_at_events(bouncing):
     assert "apex" in [text.get_text() for text in ax.get_legend().texts]
 
 
+@pytest.mark.slow
 def test_a_bouncing_ball_is_animated(bouncing):
     moving = jl.animate(bouncing, {"ball": lambda q: (0.0, q)}, fps=10)
     moving.draw(7)

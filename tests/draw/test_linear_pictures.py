@@ -44,6 +44,7 @@ def test_nyquist():
     np.testing.assert_array_equal(point.get_xydata(), [[-1, 0]])
 
 
+@pytest.mark.slow
 def test_root_locus():
     """A bead at the bottom of a hoop that turns: λ² = Ω² − g; a ring at Ω = √g, where it diverges."""
     bead = jl.System(lambda q, qdot, w: 0.5 * (qdot**2 + (jnp.sin(q) * w) ** 2) + G * jnp.cos(q))
@@ -109,6 +110,7 @@ def test_a_complex_mode_runs_along_ellipses():
     assert "ζ" in moving.ax.get_title("left")
 
 
+@pytest.mark.slow
 def test_what_modes_are_not_drawn():
     with pytest.raises(ValueError, match="`trajectory` must be one mode"):
         jl.animate(modes(), POINTS, links=LINKS)

@@ -178,6 +178,7 @@ def test_the_confidence_band_is_that_of_linear_regression(fall):
     assert band.get_label() == "90 % confidence" and np.isfinite(band.get_paths()[0].vertices).all()
 
 
+@pytest.mark.slow
 def test_parameters_have_bars_in_percent_and_correlations(fall):
     fit = example("parameters")["fit"]
     bars, matrix = plot.parameters(fit, ("k", "b"))

@@ -138,6 +138,7 @@ def test_the_covariance_is_the_sandwich_and_all_that_is_made_of_it(one):
     np.testing.assert_allclose(other.standard_errors, spread(slopes(one, x0=0.0, v0=1.0)), rtol=2e-3, atol=1e-8)
 
 
+@pytest.mark.slow
 def test_the_card_and_a_comparison_say_so(one):
     times = " to ".join(f"{x:.2g}" for x in sorted(one.inflation))
     assert one.correlated == one.channels[0].correlated > 2 and one.remarks == []

@@ -62,6 +62,7 @@ def one():
     return fit(record(0))
 
 
+@pytest.mark.slow
 def test_the_estimates_are_the_most_likely_ones(one):
     theta, least = by_scipy(record(0))
     errors = np.array([float(one.standard_errors[name]) for name in FREE])

@@ -53,6 +53,7 @@ def test_a_parameter_that_starts_at_zero_in_any_units(scale):
     np.testing.assert_allclose(found.estimates["b"] * scale, expected, rtol=1e-5)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("count", [1, 3])
 def test_channels_that_are_predicted_exactly(count):
     """They say nothing of the noise of x: the standard error is that of x alone."""
@@ -107,6 +108,7 @@ def listened(**more):
     )
 
 
+@pytest.mark.slow
 def test_predictions_of_events_have_their_errors():
     """Of t_k = (k + ½) π/√c: t/2c of that of c; of x, t sin(√c t)/2√c."""
     fit = jl.fit(ringing, listened(), {"c": 3.9}, free=("c",))

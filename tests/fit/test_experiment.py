@@ -197,6 +197,7 @@ def test_times_are_irregular_and_samples_missing():
     assert found.measurements == 40
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", [Oscillator, Machine])
 def test_params_that_are_no_mapping_are_named_by_their_fields(kind):
     """From starts far off, with the names `c` and `damper.b`; the same kind comes back, and all that a fit tells of."""
@@ -217,6 +218,7 @@ def test_masked_samples_are_missing():
     np.testing.assert_array_equal(experiment(values=masked).values, np.where(np.arange(5) == 2, np.nan, X))
 
 
+@pytest.mark.slow
 def test_directions_of_an_unknown_start_in_any_units():
     """On a sphere and in a plane, rows and coordinates of which are in units 18 decades apart: one position and one velocity move."""
     s = np.array([1e9, 1e-9, 1.0])

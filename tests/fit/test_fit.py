@@ -93,6 +93,7 @@ def test_a_given_sigma_gives_absolute_errors():
     np.testing.assert_allclose(given.standard_errors["c"] * given.sigma, estimated.standard_errors["c"], rtol=1e-4)
 
 
+@pytest.mark.slow
 def test_several_experiments_and_the_card():
     pair = [experiment(5), experiment(6, samples=200)]
     fit = jl.fit(vehicle.system, pair, GUESS, free=("b", "c", "k"))
@@ -178,6 +179,7 @@ def test_a_step_too_small_to_be_seen_is_taken():
     np.testing.assert_allclose(outcome.best.y[0], expected.x[0], atol=1e-4 * error)
 
 
+@pytest.mark.slow
 def test_an_input_that_ends_before_the_record_is_remarked():
     cart = jl.System(lambda qdot, m: 0.5 * m * qdot**2, force=lambda t, u: u(t))
     ts = np.linspace(0.0, 2.0, 21)

@@ -156,6 +156,7 @@ def test_estimates_and_errors_from_a_frequency_response_are_those_of_scipy():
     assert np.all(np.isnan(errors[7]))
 
 
+@pytest.mark.slow
 def test_information_is_that_of_fisher():
     found = jl.information(CHAIN, modal_test(0, noise=0.0), TRUTH, free=("k", "c"))
     scaled = of_modes(modal_test(0, noise=0.0))
@@ -173,6 +174,7 @@ def test_what_coherence_says_of_the_scatter_of_a_measured_response():
     np.testing.assert_allclose([np.std(measured.real), np.std(measured.imag)], test.sigma[0], rtol=0.03)  # formula: of large n
 
 
+@pytest.mark.slow
 def test_a_mode_that_looks_like_none_is_in_doubt():
     test = modal_test(0, noise=0.0)
     same = jl.ModalTest(F, REST, sigma=OF_F, damping_ratio=ZETA, damping_sigma=OF_ZETA, shapes=test.shapes[[0, 0, 2]])
@@ -182,6 +184,7 @@ def test_a_mode_that_looks_like_none_is_in_doubt():
     assert "and by 1.00 with another" in fit.remarks[0]
 
 
+@pytest.mark.slow
 def test_predictions_of_another_test():
     fit = jl.fit(CHAIN, modal_test(1), GUESS, free=("k", "c"))
     test, measured, _ = response_test(8)
@@ -418,6 +421,7 @@ def test_what_cannot_be_fitted_is_refused(call, said):
         call()
 
 
+@pytest.mark.slow
 def test_a_picture_is_of_recordings_alone():
     fit = jl.fit(SPRING, ONE, HARDENING, free=("c",))
     with pytest.raises(ValueError, match="`number` must be that of a recording in time, but number 0 is a ModalTest"):

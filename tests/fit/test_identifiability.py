@@ -59,6 +59,7 @@ def test_a_fit_of_each_is_the_fit_of_each(plain):
     assert pair[0].estimates["c"] != pair[1].estimates["c"]
 
 
+@pytest.mark.slow
 def test_profile_likelihood_against_scipy():
     """Few samples and much noise: the interval is not symmetric."""
     ts = osc.TIMES[::4]
@@ -78,6 +79,7 @@ def test_profile_likelihood_against_scipy():
     assert abs(profile.upper - linear.upper) > 0.02 * (linear.upper - linear.lower)  # linearised is something else here
 
 
+@pytest.mark.slow
 def test_ratios_are_named_where_only_they_are_determined():
     found = fit(osc.record(0), osc.START | {"m": 1.3}, free=("b", "c", "m"))
     assert found.remarks == ["only b/m and c/m are determined; their common factor is not"]
@@ -86,6 +88,7 @@ def test_ratios_are_named_where_only_they_are_determined():
     assert "! only b/m and c/m are determined" in repr(found) and repr(found).count("not determined by these measurements") == 3
 
 
+@pytest.mark.slow
 def test_sums_and_idle_parameters_are_named():
     system = jl.System(
         lambda q, qdot, c: 0.5 * qdot**2 - 0.5 * c * q**2, dissipation=lambda qdot, b1, b2, idle: 0.5 * (b1 + 2 * b2) * qdot**2 + 0 * idle
@@ -174,6 +177,7 @@ def test_prediction_with_a_band_and_validation(plain):
     assert wrong.channels[0].fit_percent < 50 and wrong.channels[0].whiteness < 1e-6
 
 
+@pytest.mark.slow
 def test_is_there_really_a_damper():
     undamped, damped = osc.noisy(5, b=1e-12), osc.noisy(5)
     for z, best in ((undamped, "without"), (damped, "with")):
@@ -189,6 +193,7 @@ def test_is_there_really_a_damper():
         jl.compare({"a": models["with"], "b": fit(osc.record(6))})
 
 
+@pytest.mark.slow
 def test_information_is_what_a_fit_then_has():
     plan = jl.Experiment(osc.TIMES, None, 1.0, 0.0, sigma=0.01)
     expected = jl.information(osc.SYSTEM, plan, osc.TRUE, FREE)
@@ -221,6 +226,7 @@ def test_many_starts_find_what_one_does_not():
     np.testing.assert_allclose(many.estimates["c"], by_scipy(osc.noisy(0)).x[0], rtol=1e-5)
 
 
+@pytest.mark.slow
 def test_starts_that_cannot_be_simulated_do_no_harm():
     """Without a bound on c some of the motions explode within the steps allowed."""
     found = fit(osc.record(0), osc.START | {"c": 0.5}, starts=8, max_steps=60)
@@ -283,6 +289,7 @@ def test_a_hopeless_end_is_not_called_converged():
     assert not other_units.converged and "unrelated to the measurements" in other_units.reason
 
 
+@pytest.mark.slow
 def test_optimisers_of_optax(plain):
     method = optax.lbfgs()
     found = fit(osc.record(0), method=method, max_steps=40)
@@ -310,6 +317,7 @@ def test_an_interrupted_fit_returns_the_best_so_far(monkeypatch):
     assert found.cost < found.costs[0]
 
 
+@pytest.mark.slow
 def test_interrupted_starts_are_not_called_converged(monkeypatch):
     """Though the best of them had converged by then."""
     original, calls = levenberg_marquardt.BATCHED[1], []
@@ -365,12 +373,14 @@ def test_gain_offset_and_delay_of_a_sensor():
     np.testing.assert_allclose(fixed.estimates["c"], 4.0, rtol=1e-6)
 
 
+@pytest.mark.slow
 def test_single_precision(single_precision):
     found = fit(osc.record(0))
     assert found.estimates["c"].dtype == jnp.float32
     np.testing.assert_allclose([found.estimates[name] for name in FREE], by_scipy(osc.noisy(0)).x, rtol=2e-3)
 
 
+@pytest.mark.slow
 def test_a_robust_fit_in_segments_is_the_robust_fit():
     z = osc.noisy(2)
     z[::7] += 0.5
@@ -396,6 +406,7 @@ def test_a_model_that_does_not_explain_the_data_is_remarked():
     assert fit(osc.record(0)).remarks == []
 
 
+@pytest.mark.slow
 def test_what_trades_with_the_unknown_start_is_said():
     """A sliding mass whose sensor has an offset: only offset + x₀ shows."""
     system = jl.System(lambda qdot: 0.5 * qdot**2, dissipation=lambda qdot, b: 0.5 * b * qdot**2)
@@ -406,6 +417,7 @@ def test_what_trades_with_the_unknown_start_is_said():
     np.testing.assert_allclose(found.estimates["b"], 0.4, rtol=1e-6)
 
 
+@pytest.mark.slow
 def test_one_of_many_without_a_motion_is_marked():
     system = jl.System(lambda q, qdot, c: 0.5 * qdot**2 - 0.5 * c * q**2 + 0.25 * q**4)
     good = jl.Experiment(osc.TIMES, np.cos(osc.TIMES), 0.5, 0.0, observe=lambda q: q)
@@ -459,6 +471,7 @@ def test_an_unknown_start_is_found_within_its_bounds():
     np.testing.assert_allclose(found.estimates["b"], by_scipy(osc.noisy(0)).x[1], rtol=1e-4)
 
 
+@pytest.mark.slow
 def test_ratios_are_named_in_single_precision(single_precision):
     found = fit(osc.record(0), osc.START | {"m": 1.3}, free=("b", "c", "m"))
     assert found.remarks == ["only b/m and c/m are determined; their common factor is not"]

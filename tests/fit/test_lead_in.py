@@ -19,6 +19,7 @@ def led_in(record, params, **more):
     return jl.fit(osc.SYSTEM, record, osc.TRUE | params, free=FREE, start=jl.Regress(), **more)
 
 
+@pytest.mark.slow
 def test_one_call_leads_in_from_far_away():
     record = jl.Experiment(LONG, osc.noisy(0, LONG, b=0.02), 1.0, 0.0)
     poor = jl.fit(osc.SYSTEM, record, osc.TRUE | {"c": 9.0, "b": 0.02}, free=FREE)

@@ -33,6 +33,7 @@ def missing():
     return fit_without_drag()
 
 
+@pytest.mark.slow
 def test_a_missing_cubic_drag_is_said_with_and_without_sigma(missing):
     """The damping b = 0.1 comes out near 0.18, and that with a small error: but the halves of the record contradict each other."""
     assert missing.estimates["b"] > 0.1 + 20 * missing.standard_errors["b"] and missing.converged

@@ -120,6 +120,7 @@ def test_gaps_that_the_integration_leaves_end_the_rounds():
             assert abs(found.estimates[name] - value) < 3 * found.standard_errors[name], name
 
 
+@pytest.mark.slow
 def test_gaps_that_do_not_close_are_reported(monkeypatch):
     """An iteration that goes nowhere."""
 

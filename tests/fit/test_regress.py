@@ -209,3 +209,16 @@ def test_a_regression_does_not_depend_on_units(held):
         assert (other.windows, other.width) == (plain.windows, plain.width)
         np.testing.assert_allclose(*(jax.tree.leaves(of.estimates) for of in (other, plain)), rtol=1e-6)
         np.testing.assert_allclose(*(jax.tree.leaves(of.standard_errors) for of in (other, plain)), rtol=1e-4)
+
+
+def test_standard_errors_are_at_least_the_scatter_of_the_estimates():
+    """Of forty recordings with white noise, which tell their standard deviation to 11 %. With a few dozen windows that overlap, errors are
+    on the wide side: 2.2 to 2.8 times as large, since each window is judged without its neighbours, as by the jackknife.
+    """
+    ts = np.linspace(0.0, 10.0, 400)
+    unknown = {"m": 1.0, "c": np.nan, "b": np.nan}
+    found = [jl.regress(osc.SYSTEM, osc.record(seed, ts), unknown, free=("c", "b")) for seed in range(40)]
+    for name in ("c", "b"):
+        scatter = np.std([one.estimates[name] for one in found])
+        error = np.sqrt(np.mean([float(one.standard_errors[name]) ** 2 for one in found]))
+        assert 1.0 < error / scatter < 3.2, name

@@ -323,6 +323,7 @@ def test_a_speed_stays_as_given_or_as_a_motor_has_it(kind, per_time):
     np.testing.assert_allclose(slope, 2 / (np.tan(expected) * speed), rtol=1e-9)
 
 
+@pytest.mark.slow
 def test_speeds_that_the_equations_decide_are_a_guess():
     """A body falls through air at m g/b, and spins as it was spun; a coordinate that t pushes ever harder has no steady motion."""
     falling = jl.System(
@@ -344,6 +345,7 @@ def test_derivatives_of_a_steady_motion():
     np.testing.assert_allclose(jax.grad(angle, argnums=(0, 1))(0.5, 6.0), jax.grad(closed, argnums=(0, 1))(0.5, 6.0), rtol=1e-9)
 
 
+@pytest.mark.slow
 def test_the_conical_pendulum_sways_about_its_steady_motion():
     """θ: ω² = φ̇² (1 + 3 cos²θ), by Routh's function."""
     l = 0.5
@@ -385,6 +387,7 @@ def test_a_load_beyond_the_strongest_spring_force_has_no_equilibrium():
         jl.equilibrium(soft, {"x": 0.3}, {"F": 1.01})
 
 
+@pytest.mark.slow
 def test_rods_that_do_not_reach_are_refused():
     with pytest.raises(ValueError, match="`q` must be near an equilibrium, but none was found"):
         jl.equilibrium(CHAIN, {"x": np.array([0.5]), "y": np.array([-0.2])}, {"l": 0.4})

@@ -55,6 +55,7 @@ def test_along_a_trajectory_all_arrays_have_its_samples():
     np.testing.assert_allclose(middle.A, expected[0], rtol=1e-12, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_along_a_trajectory_in_discrete_time_and_one_by_one_for_others():
     """A pendulum at its samples: exp(A T), with ω² = g cos φ/l of either sign; another package takes one of the systems."""
     angles = jl.System(lambda q, qdot, l: 0.5 * (l * qdot["phi"]) ** 2 + g * l * jnp.cos(q["phi"]))
@@ -208,6 +209,7 @@ def test_a_controller_that_samples():
     np.testing.assert_allclose(np.asarray(modes.angular_frequency)[shaking], [abs(s)], rtol=1e-9)
 
 
+@pytest.mark.slow
 def test_a_controller_with_too_large_a_gain_is_unstable():
     """A pole on the circle at −1: where det(Ad − Bd K + 1) = 0, by SciPy."""
     Ad, Bd = held_plant(**PLANT, period=GAINS["period"])

@@ -215,6 +215,7 @@ def test_in_single_precision(single_precision):
     np.testing.assert_allclose(modes.angular_frequency, 4 * np.sin(np.arange(1, 4) * np.pi / 202), rtol=1e-4)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("b", [0.0, 0.05])
 def test_constraints_that_follow_from_others(b):
     """Of a chain whose first two masses are held, one of them by three rows of several units; the forces on these are of least norm."""

@@ -53,6 +53,7 @@ def hanging(kind, N):
     return jl.linearise(*HANGING[kind](N), params=SINGLE).modes()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("N", SIZES)
 @pytest.mark.parametrize("kind", HANGING)
 def test_pendulums_below_each_other(kind, N):
@@ -138,6 +139,7 @@ def test_each_free_body_has_one_mode_of_zero_with_damping_too(per_time, sample_t
     np.testing.assert_allclose(rigid[:, ::2], rigid[:, 1::2], rtol=0, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_derivatives_of_a_damped_shape_that_stays_where_it_is_put():
     """A gear, q₀ = r q₁: (1, 1/r), and (r, 1)/√(1 + r²) of unit mass."""
     gear = jl.System(
@@ -423,6 +425,7 @@ def test_derivatives_of_shapes(params, normalise):
         np.testing.assert_allclose(found[i], expected, rtol=1e-6, atol=1e-8)
 
 
+@pytest.mark.slow
 def test_second_derivatives_of_eigenvalues():
     """Of √(g/l), by g and l."""
     at = lambda x: {"m": 1.0, "g": x[0], "l": x[1]}
@@ -445,6 +448,7 @@ def test_derivatives_beside_a_mode_that_moves_freely():
     np.testing.assert_allclose(found[-2:], central(roots, l, 1e-3), rtol=1e-7)
 
 
+@pytest.mark.slow
 def test_repeated_eigenvalues_have_no_nan_in_their_derivatives():
     """Three equal oscillators: where all of them change together, each ±i√(k/m) changes by itself."""
     params = {"M": np.eye(3), "K": 4 * np.eye(3), **{name: by_hand.NONE for name in "CGN"}, "u": REST}
@@ -459,6 +463,7 @@ def test_repeated_eigenvalues_have_no_nan_in_their_derivatives():
     np.testing.assert_allclose(shapes @ shapes.T, np.eye(3), atol=1e-12)
 
 
+@pytest.mark.slow
 def test_many_systems_at_once():
     stiffnesses = np.stack([UNDAMPED["K"] * s for s in (1.0, 2.0, 5.0)])
     found = jax.vmap(lambda K: by_hand.linearised(FULL | {"K": K}).eigenvalues)(stiffnesses)
@@ -470,6 +475,7 @@ def test_many_systems_at_once():
         np.testing.assert_allclose(frequencies, expected, rtol=1e-9)
 
 
+@pytest.mark.slow
 def test_many_pendulums_on_rods():
     lengths = np.array([0.3, 0.4, 0.9])
     at = lambda l: jl.linearise(pendulum.cartesian, {"x": 0.0, "y": -l}, params=pendulum.params | {"l": l}).eigenvalues
@@ -477,6 +483,7 @@ def test_many_pendulums_on_rods():
     np.testing.assert_allclose(np.abs(found), np.sqrt(9.81 / lengths)[:, None] * np.ones(2), rtol=1e-10)
 
 
+@pytest.mark.slow
 def test_under_jit_with_the_choice_of_coordinates():
     """What jit hides is taken from a linearisation before it."""
     down = lambda l: {"x": 0.0 * l, "y": -l}
@@ -512,6 +519,7 @@ def turned(**changed):
     return jl.linearise(TURNED, np.zeros(2), params=NEITHER | changed).modes()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("derivative", [jax.jacfwd, jax.jacrev])
 def test_damping_ratios_where_there_is_no_damping(derivative):
     """ζ = b/2mω."""
@@ -540,6 +548,7 @@ def test_derivatives_of_an_undamped_system_that_is_free_to_move():
     assert jax.grad(lambda c: frequency(c)[1])(2.0) == pytest.approx(0.5, rel=1e-12)
 
 
+@pytest.mark.slow
 def test_a_fit_of_damping_that_starts_without():
     """ζ = 0.05 measured: b = 2 m ω ζ = 0.4."""
     system = jl.System(lambda q, qdot: qdot**2 - 4 * q**2, dissipation=lambda qdot, b: 0.5 * b * qdot**2)
@@ -556,6 +565,7 @@ def test_modes_are_a_sequence():
         modes[2]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("transformed", [jax.jacfwd, jax.jacrev, lambda f: jax.jit(jax.jacfwd(f))])
 def test_a_state_in_numbers_moves_with_its_constraints(transformed):
     """ω = √(g/l) of a pendulum that hangs at (0, −2): by the length of its rod."""
@@ -566,3 +576,12 @@ def test_a_state_in_numbers_moves_with_its_constraints(transformed):
         return jnp.max(jnp.abs(linear.eigenvalues))
 
     np.testing.assert_allclose(transformed(frequency)(2.0), -0.5 * np.sqrt(9.81 / 2.0) / 2.0, rtol=1e-9)
+
+
+def test_modes_come_by_their_size_whether_they_swing_or_fall():
+    """λ = ±2 of what falls stands behind λ = ±i of what swings, each with its shape."""
+    system = jl.System(lambda q, qdot: 0.5 * qdot @ qdot - 0.5 * q[0] ** 2 + 2.0 * q[1] ** 2)
+    modes = jl.linearise(system, jnp.zeros(2)).modes()
+    np.testing.assert_allclose(modes.angular_frequency, [1.0, 2.0], rtol=1e-12)
+    np.testing.assert_allclose(np.abs(modes.shapes), np.eye(2), atol=1e-12)
+    np.testing.assert_array_equal(modes.stable, [True, False])

@@ -49,22 +49,36 @@ def test_derivatives_of_a_cycle():
     np.testing.assert_allclose(forward, fine, rtol=1e-6, atol=1e-8)
 
 
-forced = jl.System(lambda q, qdot: 0.5 * qdot**2 - 0.5 * q**2, dissipation=lambda qdot: 0.05 * qdot**2, force=lambda t, w: jnp.cos(w * t))
+forced = jl.System(lambda q, qdot: 0.5 * qdot**2 - 0.5 * q**2, dissipation=lambda qdot, d: d * qdot**2, force=lambda t, w: jnp.cos(w * t))
+once_a_period = jl.Every(lambda w: 2 * jnp.pi / w)
 
 
-def test_forced_vibration():
-    """q = Re A exp(iωt) with A = 1/(1 − ω² + 2iδω); multipliers exp((−δ ± i√(1 − δ²))T)."""
-    w, d = 1.3, 0.05
-    A, T = 1 / (1 - w**2 + 2j * d * w), 2 * np.pi / w
-    orbit = jl.periodic(forced, 1.0, 0.0, {"w": w}, section=jl.Every(lambda w: 2 * jnp.pi / w))
+def driven(w, d):
+    """q = Re A exp(iωt) with A = 1/(1 − ω² + 2iδω)."""
+    return 1 / (1 - w**2 + 2j * d * w)
+
+
+@pytest.mark.parametrize(("w", "d"), [(1.3, 0.05), (2.1, -0.05)])
+def test_forced_vibration(w, d):
+    """Multipliers exp((−δ ± i√(1 − δ²))T): where damping is negative, the vibration is left."""
+    A, T = driven(w, d), 2 * np.pi / w
+    orbit = jl.periodic(forced, 1.0, 0.0, {"w": w, "d": d}, section=once_a_period)
     np.testing.assert_allclose([orbit.q, orbit.qdot, orbit.period], [A.real, (1j * w * A).real, T], rtol=1e-8)
     expected = np.exp((-d + 1j * np.sqrt(1 - d**2)) * T)
     np.testing.assert_allclose(sorted(orbit.multipliers, key=np.imag), sorted([expected, expected.conj()], key=np.imag), rtol=1e-8)
-    for late in (1e9, 1.7e9):  # clocks that tell the phase to 3e-7
-        orbit = jl.periodic(forced, 1.0, 0.0, {"w": w}, section=jl.Every(lambda w: 2 * jnp.pi / w), t=late)
+    assert expected.real < 1 and orbit.is_stable == (d > 0)
+
+
+@pytest.mark.slow
+def test_forced_vibration_at_a_late_time():
+    """Clocks tell the phase to 3e-7."""
+    w, d = 1.3, 0.05
+    A, T, params = driven(w, d), 2 * np.pi / w, {"w": w, "d": d}
+    for late in (1e9, 1.7e9):
+        orbit = jl.periodic(forced, 1.0, 0.0, params, section=once_a_period, t=late)
         turned = A * np.exp(1j * w * late)
         np.testing.assert_allclose([orbit.q, orbit.qdot], [turned.real, (1j * w * turned).real], atol=2e-6)
-        motion = jl.simulate(forced, turned.real, (1j * w * turned).real, late + np.linspace(0, T, 9), {"w": w}, rtol=1e-11)
+        motion = jl.simulate(forced, turned.real, (1j * w * turned).real, late + np.linspace(0, T, 9), params, rtol=1e-11)
         np.testing.assert_allclose(motion.q, (A * np.exp(1j * w * np.asarray(motion.ts))).real, atol=2e-6)
 
 

@@ -43,6 +43,7 @@ def test_a_rod_under_its_weight():
     np.testing.assert_array_equal(found.kind, np.where(slow, np.where(values.imag > 0, "flutter", "divergence"), "stable"))
 
 
+@pytest.mark.slow
 def test_zieglers_column():
     """Flutter beyond P = 7/2 − √2 without damping and 41/28 + b²/2 with it; and eigenvalues of the matrices by hand."""
     b, P = np.array([0.0, 1e-3, 0.1, 0.5]), np.array([1.4, 1.47, 1.6, 2.08, 2.09, 3.0])
@@ -57,6 +58,7 @@ def test_zieglers_column():
         np.testing.assert_allclose(found.growth[i, j], growth if growth > 1e-9 or b[i] else 0.0, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_where_there_is_no_steady_state():
     """A spring that is stretched beyond its strongest pull: q of F = sin q, for F ≤ 1."""
     spring = jl.System(lambda q, qdot, F, m: 0.5 * m * qdot**2 + jnp.cos(q) + F * q)

@@ -159,6 +159,7 @@ def crossings():
     return locus().crossings
 
 
+@pytest.mark.slow
 def test_weave_and_capsize_speed():
     weave, capsize = crossings()
     np.testing.assert_allclose([weave.value, capsize.value], [WEAVE, CAPSIZE], rtol=0, atol=1e-8)
@@ -169,6 +170,7 @@ def test_weave_and_capsize_speed():
     assert capsize.frequency == 0
 
 
+@pytest.mark.slow
 def test_the_locus_from_rest_to_a_fast_ride():
     """All eigenvalues at each speed; from 1 to 10 m/s weave, capsize and castering are each one branch."""
     values = np.linspace(0.0, 10.0, 21)

@@ -100,6 +100,7 @@ def test_the_critical_load_by_the_damping_the_mass_and_the_spring():
         np.testing.assert_allclose(found[name], expected[name], rtol=1e-7, err_msg=name)
 
 
+@pytest.mark.slow
 def test_the_critical_load_without_damping_by_mass_and_spring():
     """P = (7/2 − √2) k/l."""
     m, l, k = COLUMN["m"], COLUMN["l"], COLUMN["k"]
@@ -140,6 +141,7 @@ def pair(q, qdot, k1, k2):
     return 0.5 * (qdot["a"] ** 2 + qdot["b"] ** 2) - 0.5 * k1 * q["a"] ** 2 - 0.5 * k2 * q["b"] ** 2
 
 
+@pytest.mark.slow
 def test_branches_keep_their_column_where_frequencies_pass_each_other():
     """Two oscillators that know nothing of each other."""
     values = np.linspace(1.0, 9.0, 15)
@@ -159,6 +161,7 @@ def test_free_masses_have_no_branch_that_crosses():
     assert found.crossings == ()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("per_time", [1.0, 1e6, 1e-6])
 @pytest.mark.parametrize("k2", [1.0, 4.0])
 def test_branches_that_cross_in_opposite_directions_are_both_seen(k2, per_time):

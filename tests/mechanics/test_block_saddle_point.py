@@ -116,6 +116,7 @@ def by_hand(name, x, m, f, a):
     return found[: x.size], found[x.size :] / scale
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", SYSTEMS)
 def test_as_by_dense_matrices(name):
     given = problem(name)
@@ -173,12 +174,14 @@ def of(name, x, m):
     return structured_inertia(T, x), jacobian(rows, x)[1]
 
 
+@pytest.mark.slow
 def test_contradictions_are_said():
     x, m, f, _ = problem("repeated")
     M, G = jax.jit(lambda x, m: of("repeated", x, m))(x, m)
     assert not saddle_point(M, G, f, jnp.zeros(G.shape[0]).at[-1].set(1.0)).sound.satisfied
 
 
+@pytest.mark.slow
 def test_inertia_that_is_missing_or_negative_is_said():
     x, m, f, a = problem("chain")
     for mass in (0.0, -1.0):
@@ -197,6 +200,7 @@ def test_many_at_once():
         np.testing.assert_allclose(together.x[k], one(s).x, rtol=0, atol=1e-11 * float(jnp.abs(one(s).x).max()))
 
 
+@pytest.mark.slow
 def test_another_right_hand_side():
     x, m, f, a = problem("tree")
     M, G = jax.jit(lambda x, m: of("tree", x, m))(x, m)
@@ -205,6 +209,7 @@ def test_another_right_hand_side():
     np.testing.assert_allclose(found[0], expected.x, rtol=0, atol=1e-12 * float(jnp.abs(expected.x).max()))
 
 
+@pytest.mark.slow
 def test_in_single_precision(single_precision):
     jax.clear_caches()  # which know places as 64-bit integers
     given = [y.astype("float32") for y in problem("tree")]

@@ -227,6 +227,7 @@ def with_a_function_of_its_own(q, qdot, m, l, g):
 OTHERS = [of_neighbours, of_neighbours_by_scan, counted, in_the_complex_plane, one_or_the_other, with_a_function_of_its_own]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("written", OTHERS)
 def test_other_sums_and_other_numbers(written):
     """Whatever is seen in them."""
@@ -238,6 +239,7 @@ SCANS = {function: True for function in (by_scan, from_rows, backwards, by_numbe
 SCANS |= {function: False for function in (dying_away, on_one_another, doubled, ending_in, with_a_random_key)}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("written", SCANS)
 def test_what_a_scan_adds_up_is_a_running_sum(written):
     """And what it makes otherwise of the turn before is not: compared with JAX's own second derivatives of L."""
@@ -367,6 +369,7 @@ def rods(q, qdot, m, l):
     return 0.5 * m * jnp.sum(x**2 + y**2 + l**2 * rate**2 / 12) + 2.0 * qdot["x"] ** 2
 
 
+@pytest.mark.slow
 def test_rods_on_a_sledge_turned_against_one_another():
     """M = JᵀJ of velocities by hand. Relative angles make it badly conditioned, so M q̈ is compared with the force, to rounding."""
     n = 70
@@ -385,6 +388,7 @@ def test_rods_on_a_sledge_turned_against_one_another():
     assert np.max(np.abs(M @ qddot - pull) / (np.abs(M) @ np.abs(qddot))) < 1e-14
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("pins, lightest", [(1, 1.0), (20, 1.0), (20, 0.0)])
 def test_a_chain_held_at_some_links(pins, lightest):
     """Two rows of all angles before it for each; M, G and the forces by hand. Among many pins, two links are held that have no mass."""
@@ -420,6 +424,7 @@ def test_a_bar_of_finite_elements(n):
     close(jl.acceleration(jl.System(energy), q, v, {"m": m}).qddot, np.linalg.solve(M, force), 1e-12)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("n", [80, 5000])
 def test_a_mass_below_zero_is_refused(n):
     """Of thousands, too: there XLA's minimum on a CPU leaves out NaN."""
@@ -429,6 +434,7 @@ def test_a_mass_below_zero_is_refused(n):
         jl.acceleration(CHAIN, q, v, given)
 
 
+@pytest.mark.slow
 def test_a_chain_without_mass_at_its_end_is_refused():
     q, v, given = state(80)
     with pytest.raises(ValueError, match="must give every direction inertia"):

@@ -65,6 +65,7 @@ def test_a_sledge_stops_on_a_slope_that_holds_it():
     assert motion.stats["transitions"][-1] == 1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("dtype", [jnp.float64, jnp.float32])
 @pytest.mark.filterwarnings("ignore:jaxlag runs in single precision")
 def test_a_block_crosses_a_table_in_space(dtype):
@@ -83,6 +84,7 @@ def test_a_block_crosses_a_table_in_space(dtype):
     assert motion.q.dtype == dtype and motion.stats["transitions"][-1] == 1 and not np.any(motion.qdot[-1])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("dtype", [jnp.float64, jnp.float32])
 @pytest.mark.filterwarnings("ignore:jaxlag runs in single precision")
 def test_a_block_on_a_moving_belt_slides_sticks_and_slides(dtype):
@@ -251,6 +253,7 @@ def test_the_drive_torque_of_a_crank_with_friction_at_its_slider():
     assert motion.stats["num_steps"] < 100
 
 
+@pytest.mark.slow
 def test_the_projector_onto_the_range_of_a_matrix_of_any_rank():
     rng = np.random.default_rng(0)
     for size in (1, 2, 3, 4):

@@ -52,6 +52,7 @@ def test_what_contradicts_itself_is_seen(length):
         jl.consistent_state(system, 0.5 * length, 0.9 * length, {"s": length}, t=0.5)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("n", [3, 80])
 def test_a_row_is_held_in_any_unit_or_refused(n):
     """q₁ = q₂ = … under forces 1, 2, …: all move with their mean. A row 1e-16 of others had no effect, without a word."""

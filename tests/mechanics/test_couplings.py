@@ -1,6 +1,7 @@
 """What `examine` says of systems of many coordinates: which term leaves no zeros to a solve."""
 
 import jax.numpy as jnp
+import pytest
 
 import jaxlag as jl
 
@@ -17,6 +18,7 @@ def moving(q, qdot):
     return 0.5 * jnp.sum(qdot**2) - 0.5 * jnp.sum(jnp.diff(q) ** 2)
 
 
+@pytest.mark.slow
 def test_neighbours_alone_are_sparse():
     """Entries by hand: a diagonal, three diagonals twice, and two in each row that joins neighbours."""
     found = examined(
@@ -34,6 +36,7 @@ def test_neighbours_alone_are_sparse():
     assert f"  G                   {N} of {N**2 // 2} numbers, pairs\n" in repr(found)
 
 
+@pytest.mark.slow
 def test_terms_that_couple_all_are_named_with_the_cure():
     found = examined(
         {"alone": moving, "together": lambda q, qdot: 0.5 * jnp.mean(qdot) ** 2 - jnp.sum(q) ** 2},

@@ -5,6 +5,7 @@ import pytest
 import jaxlag as jl
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("unit", [1.0, 1e-9, 1e6, 1e9])
 def test_rows_and_inertias_in_any_unit(unit):
     """x ± 1e-6 y are two rows, as the solver has them, in whatever unit; a rotor of 1e-9 beside a mass of 1e5 is not without inertia."""

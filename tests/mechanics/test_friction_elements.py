@@ -260,6 +260,7 @@ def test_friction_in_a_force_is_named_in_the_check_up():
     assert [finding.split("'")[1] for finding in named] == list(JUMPING)
 
 
+@pytest.mark.slow
 def test_failures_name_friction_that_was_not_read():
     run = lambda **terms: jl.simulate(jl.System(spring, **terms), 1.0, 0.0, [0.0, 20.0], {"F": 0.3, "p": 1.0}, max_steps=1000)
     with pytest.raises(RuntimeError, match=r"`force` jumps with a velocity.*write it as `dissipation`, D = F \* jnp.abs\(v\)"):
@@ -308,3 +309,10 @@ def test_dry_friction_in_complex_numbers_is_named():
     system = jl.System(lambda q, qdot: 0.5 * qdot**2 - 2 * q**2, dissipation=lambda qdot: 0.3 * jnp.abs(qdot + 0j))
     with pytest.raises(RuntimeError, match="is not recognised as dry friction: if it is, write"):
         jl.simulate(system, 1.0, 0.0, [0.0, 20.0], max_steps=3000)
+
+
+@pytest.mark.parametrize("q", [0.3, -5e-3, 1e-9])
+def test_a_bound_in_proportion_to_a_distance_however_small(q):
+    wedge = jl.System(lambda qdot: 0.5 * 2.0 * qdot @ qdot, dissipation=lambda q, qdot: 3.0 * jnp.abs(q[0]) * jnp.abs(qdot[1]))
+    found = jl.acceleration(wedge, jnp.array([q, 0.0]), jnp.array([0.0, -0.7])).qddot
+    np.testing.assert_allclose(found, [0.0, 1.5 * abs(q)], rtol=1e-14)

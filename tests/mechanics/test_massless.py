@@ -76,6 +76,7 @@ def test_random_networks_with_constraints_of_every_kind():
         assert abs(powers["both"][i]) < 1e-9 * scale**2  # a constraint at rest does no work
 
 
+@pytest.mark.slow
 def test_a_state_is_completed_by_the_velocities_that_dissipation_decides():
     p, q, v = drawn(), jnp.zeros(6), RANDOM.normal(size=6)
     v[HEAVY] -= p["c"][HEAVY] * (p["c"][HEAVY] @ v[HEAVY]) / (p["c"][HEAVY] @ p["c"][HEAVY])
@@ -100,6 +101,7 @@ def test_powers_of_the_velocity_from_any_guess(p):
     np.testing.assert_allclose(power(F, guess), -np.abs(F) * (np.abs(F) / 0.7) ** (1 / (p - 1)), rtol=1e-9)
 
 
+@pytest.mark.slow
 def test_rest_under_no_force_and_its_derivative():
     rate = lambda F, p: jl.consistent_state(POWER, 0.0, 0.0, {"F": F, "k": 0.7, "p": p})[1]
     assert rate(0.0, 3.0) == 0 and rate(0.0, 1.5) == 0
@@ -118,6 +120,7 @@ PIECEWISE = {  # force, and the rate at which D balances it
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", PIECEWISE)
 def test_quadratic_pieces(name):
     """Of which the slope of the force is a number here and another there: they were taken for linear, with the number at rest."""
@@ -251,6 +254,7 @@ def test_dissipation_by_differences_of_velocities(units, linear):
         np.testing.assert_allclose(found * np.array(units), [1, 1 + root], rtol=1e-14)
 
 
+@pytest.mark.slow
 def test_flat_pieces_are_seen_in_any_unit():
     """Inside a dead zone of 0.5, in units from 1e-9 to 1e9, nothing decides the velocity of what nothing pushes."""
     zone = jl.System(lambda q, F: F * q, dissipation=lambda qdot, u: jnp.maximum(jnp.abs(u * qdot) - 0.5, 0) ** 2)
@@ -266,3 +270,19 @@ def test_long_chains_of_equations_that_determine_each_other():
     n = 3000
     pairs = np.eye(n, n + 1, dtype=bool) | np.eye(n, n + 1, 1, dtype=bool)
     assert np.all(underdetermined(pairs)) and not np.any(underdetermined(pairs[:, 1:]))
+
+
+def test_two_nodes_that_are_moved_together_pull_by_their_dashpots():
+    """Nodes without mass, b + c = sin 2t, b behind a dashpot d on a mass and c behind e on a wall: λ = d (ḃ − ȧ) = e ċ, m ä = λ."""
+    system = jl.System(
+        lambda qdot: 0.5 * 3.0 * qdot["a"] ** 2,
+        dissipation=lambda qdot, d, e: 0.5 * d * (qdot["a"] - qdot["b"]) ** 2 + 0.5 * e * qdot["c"] ** 2,
+        holonomic={"hand": lambda t, q: q["b"] + q["c"] - jnp.sin(2 * t)},
+    )
+    t, rate, d, e = 0.3, 2 * np.cos(0.6), 1.5, 0.4
+    q, params = {"a": 0.0, "b": np.sin(0.6), "c": 0.0}, {"d": d, "e": e}
+    force = (rate - 0.5) / (1 / d + 1 / e)
+    state = jl.consistent_state(system, q, {"a": 0.5, "b": 0.0, "c": 0.0}, params, t=t)
+    np.testing.assert_allclose([state[1]["b"], state[1]["c"]], [0.5 + force / d, force / e], rtol=1e-12)
+    found = jl.acceleration(system, *state, params, t=t)
+    np.testing.assert_allclose([found.multipliers["hand"], found.qddot["a"]], [force, force / 3.0], rtol=1e-12)

@@ -63,6 +63,7 @@ def test_works_that_were_not_asked_for():
     np.testing.assert_allclose(motion.energy(), -9.81 * np.cos(1.0), rtol=1e-7)
 
 
+@pytest.mark.slow
 def test_gradient_of_a_work():
     """Work of a damper on a decaying oscillator, against finite differences, forward and reverse."""
     system = jl.System(lambda q, qdot: 0.5 * qdot**2 - 2 * q**2, dissipation={"oil": lambda qdot, b: 0.5 * b * qdot**2})
@@ -85,6 +86,7 @@ def test_a_check_up_that_finds_nothing():
     assert "no issues found" in repr(found) and "phi, r" in repr(found)
 
 
+@pytest.mark.slow
 def test_a_check_up_that_finds_everything():
     rod = pendulum.cartesian_rod
     sick = jl.System(
@@ -107,6 +109,7 @@ def test_a_check_up_that_finds_everything():
         assert finding in said, finding
 
 
+@pytest.mark.slow
 def test_a_check_up_without_inertia_and_without_freedom():
     massless = jl.System(lambda q, qdot: 0.5 * qdot["x"] ** 2 - q["y"] ** 2)
     found = jl.examine(massless, {"x": 0.0, "y": 0.0}, {"x": 0.0, "y": 0.0})

@@ -14,6 +14,7 @@ from scipy.optimize import brentq
 
 import jaxlag as jl
 from jaxlag._mechanics import constrained_acceleration
+from jaxlag._model.flat import bind
 from jaxlag.examples import pendulum, vehicle
 
 g = 9.81
@@ -360,6 +361,7 @@ def test_constraint_forces_are_orthogonal_to_every_allowed_velocity(name):
             assert np.max(np.abs(allowed @ force[i]), initial=0.0) <= 1e-13 * largest
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", [pytest.param(name, marks=pytest.mark.slow if name in TO_COMPILE else ()) for name in CONSTRAINED])
 def test_constraints_at_rest_do_no_work_and_moving_ones_do(name):
     x, found, motion = EXAMPLES[name], seen(name), motion_of(name)
@@ -392,6 +394,7 @@ def test_balance_sees_a_wrong_gradient_of_the_dissipation(error, monkeypatch):
 # Closed mechanisms and rolling
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("N", [2, 5])
 def test_bars_pass_their_singular_positions(N):
     """Ten turns, through two flat positions each, against θ'' = (m g/I) sin θ of the one degree of freedom."""
@@ -409,12 +412,14 @@ def reduced(rates, y0, ts):
     return solve_ivp(rates, (0, ts[-1]), y0, method="DOP853", rtol=1e-13, atol=1e-13, t_eval=np.asarray(ts)).y
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["disc", "sleigh"])
 def test_rolling_keeps_its_energy_for_100_seconds(name):
     energy = seen(name)["energy"]
     np.testing.assert_allclose(energy, energy[0], rtol=10 * RTOL)
 
 
+@pytest.mark.slow
 def test_ball_on_a_turntable_goes_in_a_circle():
     """r̈ = (2/7) Ω e_z × ṙ, whatever radius and mass; its energy in the lab is that of this motion."""
     x, motion = EXAMPLES["ball"], motion_of("ball")
@@ -523,6 +528,7 @@ def test_chain_slides_off_a_table():
     np.testing.assert_allclose(motion.multipliers["length"], edge, rtol=SHORT, atol=SHORT * np.max(np.abs(edge)))
 
 
+@pytest.mark.slow
 def test_ladder_leaves_the_wall():
     """At sin θ = ⅔ sin θ₀ from rest at θ₀: there the wall would have to pull."""
     th0, m, b = 1.2, LADDER["m"], LADDER["b"]
@@ -571,6 +577,7 @@ def test_bead_on_a_rotating_hoop():
     np.testing.assert_allclose(slightly.qddot["th"], -g / 2 * 1e-12, rtol=1e-2)
 
 
+@pytest.mark.slow
 def test_drive_of_a_cart_is_that_of_newton_and_euler():
     """F = mc Ẍ + m ẍ + b ẋ, with ẍ from the angle's own equation: m l φ̈ = −m g sin φ − m Ẍ cos φ − b (l φ̇ + Ẋ cos φ)."""
     motion, p = motion_of("cart"), CART
@@ -612,6 +619,7 @@ def test_tension_of_a_spherical_pendulum():
 squared = jl.System(lambda q, qdot, m, g: 0.5 * m * qdot @ qdot - m * g * q[1], holonomic={"rod": lambda q, l: q @ q - l**2})
 
 
+@pytest.mark.slow
 def test_simple_pendulum_of_iftomm():
     """IFToMM benchmark A01 (González et al. 2006): its rows, six digits, and the exact elliptic solution at these times."""
     ts = jnp.array([0, 0.5, 1, 10, 100, 1000, 2000])
@@ -729,3 +737,16 @@ def test_derivatives_of_a_consistent_state_of_every_order(x):
     for order in range(4):
         np.testing.assert_allclose(found(x), exact(x), rtol=1e-9, atol=1e-9, err_msg=f"order {order}")
         found, exact = jax.jacfwd(found), jax.jacfwd(exact)
+
+
+def test_baumgartes_feedback_is_a_damped_oscillator():
+    """What is off a constraint obeys g̈ + 2α ġ + β² g = 0, and ȧ + 2α a = 0 where velocities alone are held."""
+    system = jl.System(
+        lambda qdot: 0.5 * qdot @ qdot,
+        holonomic={"wall": lambda t, q: 3.0 * q[0] - jnp.sin(2.0 * t)},
+        nonholonomic={"edge": lambda t, qdot: qdot[1] - 5.0 * t},
+    )
+    q, v, t = jnp.array([0.4, 0.0]), jnp.array([0.7, -0.3]), 0.5
+    feedback = jl.Baumgarte(alpha=3.0, beta=7.0).feedback()(bind(system, q, None), t, q, v)
+    off, rate, a = 3.0 * 0.4 - np.sin(1.0), 3.0 * 0.7 - 2.0 * np.cos(1.0), -0.3 - 2.5
+    np.testing.assert_allclose(feedback, [6.0 * rate + 49.0 * off, 6.0 * a], rtol=1e-14)

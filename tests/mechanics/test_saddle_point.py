@@ -63,6 +63,7 @@ def test_rows_stated_twice_whose_units_are_far_apart(seed):
     assert found.sound.determined and found.sound.satisfied
 
 
+@pytest.mark.slow
 def test_pseudo_inverse_derivatives_at_constant_rank():
     """Directions within the matrices of rank 2, against central differences of NumPy's pinv; second order too."""
     rng = np.random.default_rng(4)
@@ -459,3 +460,35 @@ def test_the_rank_of_rows_in_any_units(s):
     for e, rank in ((1e-6, 2), (1e-12, 1)):
         assert jl.examine(crossing, at, at, {"s": s, "e": e}).rank == rank
     np.testing.assert_allclose(s * jl.acceleration(crossing, at, at, {"s": s, "e": 1e-6}).qddot["y"], 0, atol=1e-9)
+
+
+def test_derivatives_where_rows_turn():
+    """A block on a slope that a parameter tilts: q̈ = −g sin α (cos α, sin α), λ = −g cos α."""
+    slope = jl.System(
+        lambda q, qdot: 0.5 * qdot @ qdot - 9.81 * q[1], holonomic={"slope": lambda q, a: jnp.sin(a) * q[0] - jnp.cos(a) * q[1]}
+    )
+
+    def found(a):
+        motion = jl.acceleration(slope, jnp.zeros(2), jnp.zeros(2), {"a": a})
+        return jnp.append(motion.qddot, motion.multipliers["slope"])
+
+    by_hand = lambda a: -9.81 * jnp.stack([jnp.sin(a) * jnp.cos(a), jnp.sin(a) ** 2, jnp.cos(a)])
+    for derivative in (jax.jacfwd, jax.jacrev):
+        np.testing.assert_allclose(derivative(found)(0.4), jax.jacfwd(by_hand)(0.4), rtol=1e-13)
+
+
+ROWS = jl.System(lambda qdot, M: 0.5 * jnp.sum(M * qdot**2), force=lambda f: f, holonomic={"rows": lambda t, q, G, w: G @ q - w * t**2 / 2})
+
+
+@pytest.mark.parametrize("d", [1e-1, 1e-2, 1e-3, 5e-5])
+def test_rows_that_are_almost_parallel(d):
+    """(1, 0, a) and (1, d, a): what the second has beside the first holds f₂, and both together hold f₁ and f₃. Moved, the second takes
+    q₂ along by w/d, far as that may be.
+    """
+    a, M, f, w = 0.3, np.array([1.0, 2.0, 3.0]), np.array([0.7, -0.2, 1.1]), np.array([0.0, 5.0])
+    params = {"G": np.array([[1.0, 0.0, a], [1.0, d, a]]), "M": M, "f": f}
+    held = jl.acceleration(ROWS, np.zeros(3), np.zeros(3), params | {"w": 0 * w}).multipliers["rows"]
+    both = -(f[0] / M[0] + a * f[2] / M[2]) / (1 / M[0] + a**2 / M[2])
+    np.testing.assert_allclose(held, [both + f[1] / d, -f[1] / d], rtol=5e-16 / d)
+    moved = jl.acceleration(ROWS, np.zeros(3), np.zeros(3), params | {"w": w, "f": 0 * f}).qddot
+    np.testing.assert_allclose(moved, [0.0, 5.0 / d, 0.0], rtol=1e-13 / d, atol=1e-13 / d**2)

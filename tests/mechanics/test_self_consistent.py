@@ -50,6 +50,7 @@ def test_its_derivatives(derivative):
     np.testing.assert_allclose(jax.jacfwd(slope)(-1.0), second, rtol=1e-5)
 
 
+@pytest.mark.slow
 def test_a_square_has_two_multipliers_or_none():
     """b λ² − 2 λ + 10 = 0: the root that grows out of that at b = 0; beyond b = 0.1 none, which is said."""
     for b in (-0.05, 0.05, 0.0999):

@@ -228,6 +228,7 @@ drawer = jl.System(
 )
 
 
+@pytest.mark.slow
 def test_a_drawer_jams():
     """Pulled so far beside its middle that 2 μ e > l, whatever the force: it stays, and stops where it was in motion. In millimetres."""
     mu, m, rate, long, begin, end = 0.3, 4.0, 5.0, 500.0, 1e6, 3.0
@@ -282,6 +283,7 @@ def test_a_block_in_a_trough():
     np.testing.assert_allclose(slope_of, jax.grad(exact)(mu), rtol=1e-7)
 
 
+@pytest.mark.slow
 def test_grasps_of_a_batch_are_those_of_each():
     """A thousand loads at a time: on a CPU one after the other, on threads that do not wait for each other."""
     normal, tangential, _, mu = grasp(np.random.default_rng(3))

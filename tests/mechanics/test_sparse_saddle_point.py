@@ -144,6 +144,7 @@ def test_many_at_once():
         np.testing.assert_allclose(together.x[k], one(s).x, rtol=0, atol=1e-11 * float(jnp.abs(one(s).x).max()))
 
 
+@pytest.mark.slow
 def test_another_right_hand_side():
     function, x, masses, f, a = problem("tree")
     _, G = jacobian(function, x)
@@ -179,6 +180,7 @@ def test_rods_stated_twice_whose_units_are_far_apart(decades):
             np.testing.assert_allclose(found.x, expected, rtol=0, atol=1e-7 * np.abs(expected).max())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("links", [1000, 10_000])
 def test_a_straight_chain_of_many_links_with_some_stated_twice(links):
     """S of a straight chain is all but singular itself. Of a thousand links, each of two equal rods has half the force of one stated once;
@@ -201,6 +203,7 @@ def test_a_straight_chain_of_many_links_with_some_stated_twice(links):
     np.testing.assert_allclose(shared, plain.multipliers, rtol=0, atol=1e-8 * size)
 
 
+@pytest.mark.slow
 def test_in_single_precision(single_precision):
     jax.clear_caches()  # which know places as 64-bit integers
     function, x, masses, f, a = (y if callable(y) else y.astype("float32") for y in problem("tree"))

@@ -111,6 +111,7 @@ def test_at_one_state():
         assert jl.examine(ball, q, 0.0).contacts == {"floor": q == 0}
 
 
+@pytest.mark.slow
 def test_a_system_with_contacts_is_pickled():
     again = pickle.loads(pickle.dumps(ball))
     motion = jl.simulate(again, 1.0, 0.0, jnp.array([0.0, 2.0]))

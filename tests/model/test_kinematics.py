@@ -165,6 +165,7 @@ def pickled_map(q):
     return q
 
 
+@pytest.mark.slow
 def test_a_reaction_as_a_force_on_a_point():
     """A rod hinged at its end: the hinge force by Newton, F = m(a − g), for a rigid body in x, y of the centre and φ."""
     hinge = lambda q, L: jnp.stack([q["x"] - L / 2 * jnp.cos(q["phi"]), q["y"] - L / 2 * jnp.sin(q["phi"])])

@@ -166,6 +166,7 @@ def test_other_solvers_step_on_jumps(solver):
     assert motion.stats["num_rejected_steps"] < 24
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("interpolation", [Linear(), Cubic()], ids=repr)
 def test_an_oscillator_under_a_smooth_force(interpolation):
     samples, u = np.linspace(0, 5, 21), OF_SCIPY[interpolation](TS, FORCE)
@@ -176,6 +177,7 @@ def test_an_oscillator_under_a_smooth_force(interpolation):
     np.testing.assert_allclose(driven(Signal(TS, FORCE, interpolation), samples, **SHARP).qdot, exact[1], atol=1e-8)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("derivative, count", [(jax.jacrev, 12), (jax.jacfwd, 40), (jax.jacrev, 40)])
 def test_the_derivative_by_held_values(derivative, count):
     """Against the closed form, by as many values as make one Jacobian and by more."""
@@ -267,6 +269,7 @@ def test_the_derivative_of_a_ride_by_more_values_than_make_one_jacobian():
     check_derivative_of_a_ride({name: (times[name], rng.uniform(*scale, 20)) for name, scale in scales.items()}, jax.grad)
 
 
+@pytest.mark.slow
 def test_a_prescribed_speed_that_jumps_is_an_impulse():
     """Two carriages, the distance of which a winch changes at a speed that jumps: their momentum stays, their speeds jump."""
     speeds, m = np.array([0.0, 0.6, -0.4, 0.2]), np.array([1.0, 3.0])
@@ -304,6 +307,7 @@ def test_a_prescribed_position_is_followed_and_its_force_measured():
 # --- composition with JAX
 
 
+@pytest.mark.slow
 @every_interpolation
 def test_vmap_over_signals_with_times_of_their_own_equals_the_loop(interpolation):
     rng = np.random.default_rng(4)
@@ -338,6 +342,7 @@ def test_new_values_trace_nothing(monkeypatch):
     assert len(traces) == 1
 
 
+@pytest.mark.slow
 def test_neither_samples_nor_a_smooth_signal_end_steps():
     """u = 6 t through 101 points, sampled as often: x = t³."""
     ts = np.linspace(0, 1, 101)
@@ -347,6 +352,7 @@ def test_neither_samples_nor_a_smooth_signal_end_steps():
     assert motion.stats["num_steps"] < 20
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:jaxlag runs in single precision")
 @every_interpolation
 def test_single_precision_coordinates_and_double_precision_signals(interpolation):
@@ -424,3 +430,9 @@ def test_the_old_kinds_still_work_and_name_the_new_objects(kind, new):
         assert old.kind == kind
     with pytest.warns(DeprecationWarning, match=r"`Signal.bends` is now called `Signal.second_derivatives`"):
         assert old.bends is None
+
+
+def test_a_delay_is_later():
+    late = jl.Signal([0.0, 1.0, 3.0], [0.0, 1.0, 5.0], jl.Linear(), delay=0.25)
+    np.testing.assert_allclose(jax.vmap(late)(jnp.array([0.0, 0.25, 0.75, 2.25])), [0.0, 0.0, 0.5, 3.0], rtol=1e-15)
+    np.testing.assert_allclose(late.times, [0.25, 1.25, 3.25], rtol=1e-15)

@@ -313,6 +313,7 @@ def test_a_motion_that_runs_away():
         jl.simulate(blown, 1.0, 1.0, np.linspace(0, 2, 5), max_steps=2000)
 
 
+@pytest.mark.slow
 def test_under_jit_a_failure_is_a_result():
     motion = jax.jit(lambda c: run(params={"c": c}))(jnp.nan)
     assert motion.result == jl.RESULTS.not_finite and np.all(np.isnan(motion.q))

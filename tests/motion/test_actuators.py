@@ -2,6 +2,7 @@
 
 import jax.numpy as jnp
 import numpy as np
+import pytest
 
 import jaxlag as jl
 
@@ -39,6 +40,7 @@ def test_a_dead_zone_and_saturation_in_the_command():
     np.testing.assert_allclose((motion.q, motion.qdot), moved(TIMES, forces, TIMES), atol=1e-11)
 
 
+@pytest.mark.slow
 def test_backlash_between_a_machine_and_its_sensor():
     """The play operator: the sensor follows only where the machine pushes it; observed, and identified with its width."""
     play = jl.Sampled(lambda q, x, w: jnp.clip(x, q - w, q + w), every=TICK)
@@ -60,6 +62,7 @@ def test_backlash_between_a_machine_and_its_sensor():
         assert abs(found.estimates[name] - params[name]) < 3 * found.standard_errors[name] < 0.02 * params[name]
 
 
+@pytest.mark.slow
 def test_a_delay_and_a_scale_of_an_input_beside_the_mechanics():
     """Found together with the damping, from noisy positions; the delay is no multiple of the samples."""
     late, scale = 0.0237, 1.3

@@ -18,9 +18,10 @@ def oscillator(q, qdot, c):
 TIMES = np.linspace(0, 10, 21)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
-    ("direction", "first"), [(jl.Falling(), 0), (jl.Rising(), 1), (jl.Either(), None)], ids=["falling", "rising", "either"]
+    ("direction", "first"),
+    [(jl.Falling(), 0), pytest.param(jl.Rising(), 1, marks=pytest.mark.slow), pytest.param(jl.Either(), None, marks=pytest.mark.slow)],
+    ids=["falling", "rising", "either"],
 )
 def test_turning_points_are_counted(direction, first):
     """q̇ = cos 2t is zero at π/4 + kπ/2, falling and rising in turn."""
@@ -132,6 +133,7 @@ def test_given_times():
     np.testing.assert_allclose(motion.events["below"].ts[:2], [0.0, np.nan])
 
 
+@pytest.mark.slow
 def test_many_members():
     """Members of a batch have their events at different times."""
     c = np.linspace(1, 9, 17)

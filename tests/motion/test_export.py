@@ -530,6 +530,7 @@ def fit():
     return jl.fit(SYSTEM, record(1, unknown=("q0",)), START | {"b": TRUE["b"]}, free=("c",))
 
 
+@pytest.mark.slow
 def test_a_fit_is_ready_for_json(fit):
     said = json.loads(json.dumps(fit.to_dict(level=0.9), allow_nan=False))
     first, start = said["parameters"]
@@ -579,6 +580,7 @@ def slid():
     return jl.simulate(dome(), {"r": 1.0, "phi": 0.01}, {"r": 0.0, "phi": 0.0}, jnp.linspace(0.0, 2.1, 211))
 
 
+@pytest.mark.slow
 def test_where_a_stone_would_leave_the_dome(slid):
     """λ = m g (3 cos φ − 2 cos φ₀)."""
     pulls = slid.pulling()["dome"]

@@ -91,6 +91,7 @@ def test_second_variations_give_what_the_integrator_would_differentiated_twice(m
     np.testing.assert_allclose(varied, jax.hessian(motion)(x), rtol=1e-9, atol=1e-8)
 
 
+@pytest.mark.slow
 def test_vehicle_gradient_in_closed_form():
     """Heave without drag is a linear oscillator: y(t) = l − Mg/2c + A(t)(y₀ − l + Mg/2c), so dy(t)/dM₀ = 0 and dy(t)/dy₀ = A(t)."""
     p = vehicle.params
@@ -154,6 +155,7 @@ def test_second_derivatives_of_every_mode(derivative):
     np.testing.assert_allclose(derivative(oscillator_end, every)(*AT), derivative(oscillator_exact, every)(*AT), rtol=1e-6, atol=1e-7)
 
 
+@pytest.mark.slow
 def test_third_derivative():
     third = lambda f: jax.grad(jax.grad(jax.grad(lambda c: f(1.2, 0.4, c, 2.5))))(5.0)
     np.testing.assert_allclose(third(oscillator_end), third(oscillator_exact), rtol=1e-5)
@@ -216,6 +218,7 @@ def test_gradients_in_many_numbers_are_compiled_once(lowered):
     np.testing.assert_allclose(along, 100 * expected, rtol=1e-7)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("solver", [diffrax.ReversibleHeun(), diffrax.Kvaerno3()], ids=["ReversibleHeun", "Kvaerno3"])
 def test_what_a_solver_keeps_from_the_start_is_differentiated(solver):
     """Rates at the start, or none of them."""

@@ -59,6 +59,7 @@ def test_derivatives_are_those_of_diffrax(system):
     assert off(jax.jacrev(end)(x)) < min(2e-8, off(of_diffrax()))
 
 
+@pytest.mark.slow
 def test_samples_beyond_the_end_of_a_motion_are_not_made_up():
     """Three steps do not reach the end: samples within them are there, the others are not."""
     found = jl.simulate(SMOOTH, *START, TS, PARAMS, max_steps=7, throw=False)

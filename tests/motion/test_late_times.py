@@ -139,6 +139,7 @@ def driven(t, start):
     return jnp.sin(4 * (t - start))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("dissipation", [None, pytest.param(dry, marks=pytest.mark.slow)])
 def test_functions_of_time(dissipation):
     """They see the time to its rounding, 2.4e-7 s, which is all that is lost: of a force that changes by 4 a second, 1e-6."""

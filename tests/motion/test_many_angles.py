@@ -46,6 +46,7 @@ def test_motion_is_that_of_scipy(motion):
     np.testing.assert_allclose(motion.qddot[-1], by_hand(*np.split(expected.y[:, -1], 2), PARAMS), atol=1e-4)
 
 
+@pytest.mark.slow
 def test_energy_is_accounted_for(motion):
     assert np.max(np.abs(motion.balance())) < 1e-8
 

@@ -66,6 +66,7 @@ def motion():
     return by_joints()
 
 
+@pytest.mark.slow
 def test_the_motion_is_that_of_its_angles(motion):
     expected = by_angles()
     np.testing.assert_allclose(motion.q["phi"], expected.q["phi"], rtol=0, atol=1e-6)
@@ -74,6 +75,7 @@ def test_the_motion_is_that_of_its_angles(motion):
     assert np.abs(motion.balance()).max() < 1e-7
 
 
+@pytest.mark.slow
 def test_the_force_at_the_top_carries_the_chain(motion):
     """λ of the first joint is the force on all bodies together: their momentum changes by it and by their weights."""
     center = lambda q, a, v: a["r"] + OFFSET * (a["phi"][:, None] * across(q["phi"]) - v["phi"][:, None] ** 2 * along(q["phi"]))

@@ -75,6 +75,7 @@ def test_motion_is_that_of_scipy(motion):
     np.testing.assert_allclose(np.asarray(motion.q), expected.y.T[:, : 2 * LINKS].reshape(-1, LINKS, 2), atol=2e-7)
 
 
+@pytest.mark.slow
 def test_energy_is_accounted_for_and_rods_keep_their_length(motion):
     lengths = np.linalg.norm(np.diff(np.concatenate([np.zeros((TS.size, 1, 2)), motion.q], axis=1), axis=1), axis=2)
     np.testing.assert_allclose(lengths, np.broadcast_to(PARAMS["l"], lengths.shape), rtol=1e-12)
@@ -106,6 +107,7 @@ def test_derivatives_in_each_link_and_in_all():
     np.testing.assert_allclose([forward, reverse], differences, rtol=1e-5)
 
 
+@pytest.mark.slow
 def test_a_start_beside_its_rods_is_put_on_them():
     q, v = jl.consistent_state(CHAIN, Q0 + 0.002 * RNG.normal(size=Q0.shape), RNG.normal(size=Q0.shape), PARAMS)
     s, w = np.diff(np.vstack([np.zeros(2), q]), axis=0), np.diff(np.vstack([np.zeros(2), v]), axis=0)
@@ -239,6 +241,7 @@ def test_a_hanging_rope_swings_as_laguerre_says():
     np.testing.assert_allclose(frequencies, np.sqrt(GRAVITY * roots_laguerre(LINKS)[0]), rtol=1e-8)
 
 
+@pytest.mark.slow
 def test_a_chain_between_two_hooks():
     """Of each link the slope is the weight that it carries beside the lowest point over the horizontal force, which SciPy finds."""
     hook = np.array([30.0, 0.0])

@@ -69,6 +69,7 @@ def simulated(system, ts, params, **options):
 SAMPLES = {"coarse": np.linspace(0, 1.6, 12), "fine": np.linspace(0, 1.6, 1500), "at the jumps": TIMES[1:300]}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("ts", SAMPLES.values(), ids=SAMPLES)
 def test_a_held_force_against_the_exact_motion(ts):
     found, motion = simulated(CART, ts, PARAMS | {"u": HELD})
@@ -86,6 +87,7 @@ def test_dry_friction_under_a_held_force_against_the_exact_motion(solver):
     assert motion.stats["transitions"][-1] > 10
 
 
+@pytest.mark.slow
 def test_a_linear_force_against_the_exact_motion():
     """Without damping q̇ is the sum of the trapezia."""
     ts = SAMPLES["at the jumps"]
@@ -120,6 +122,7 @@ def test_the_gradient_in_all_values_of_the_signal():
     np.testing.assert_allclose(gradient[150], end(PARAMS | {"u": jl.Signal(TIMES, VALUES + bump)}) - end(PARAMS | {"u": HELD}), rtol=1e-8)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("derivative", [jax.jacfwd, jax.jacrev])
 def test_a_delay_and_its_derivative(derivative):
     """Of a zero-order hold, whose jumps move along with it."""
@@ -131,6 +134,7 @@ def test_a_delay_and_its_derivative(derivative):
     np.testing.assert_allclose(derivative(late)(delay), expected, rtol=1e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("solver", [None, diffrax.Tsit5()], ids=["Dop853", "Tsit5"])
 @pytest.mark.parametrize("derivative", [jax.jacfwd, jax.jacrev])
 def test_a_delay_where_every_sample_is_at_a_jump(derivative, solver):
@@ -159,6 +163,7 @@ def test_a_delay_and_the_start_among_more_inputs_than_a_forward_pass_takes():
     assert slopes[2].shape == VALUES.shape
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("derivative", [jax.jacfwd, jax.jacrev])
 def test_the_derivative_by_the_times_of_jumps(derivative):
     """q(1) = Σ (uᵢ − uᵢ₋₁) (1 − tᵢ)²/2."""
@@ -168,6 +173,7 @@ def test_the_derivative_by_the_times_of_jumps(derivative):
     np.testing.assert_allclose(found, [0.0, 3 * 0.69, -5 * 0.3], atol=1e-12)
 
 
+@pytest.mark.slow
 def test_a_force_that_asks_for_another_time():
     """A signal that a function delays by itself is looked up, and right."""
     system = jl.System(lambda qdot, m: 0.5 * m * qdot**2, force=lambda t, u, late: u(t - late))
@@ -179,6 +185,7 @@ def test_a_force_that_asks_for_another_time():
         jl.simulate(system, 0.0, 0.0, ts, {"m": M, "u": HELD, "late": 0.01})
 
 
+@pytest.mark.slow
 def test_two_signals_at_times_of_their_own_before_and_behind_their_samples():
     system = jl.System(lambda qdot: 0.5 * qdot**2, force={"a": lambda t, a: a(t), "b": lambda t, b: b(t)})
     a, b = jl.Signal([0.5, 1.0], [1.0, 2.0]), jl.Signal([0.2, 0.7, 0.9], [0.0, -1.0, 3.0], jl.Linear())
@@ -187,6 +194,7 @@ def test_two_signals_at_times_of_their_own_before_and_behind_their_samples():
     np.testing.assert_allclose(motion.qdot, np.add(of_a, of_b), atol=1e-12)
 
 
+@pytest.mark.slow
 def test_within_jit_and_in_batches_the_motion_is_the_same():
     expected = end(PARAMS | {"u": HELD})
     every = jax.jit(lambda: end(PARAMS | {"u": HELD}))  # all of it constant
@@ -201,6 +209,7 @@ def test_within_jit_and_in_batches_the_motion_is_the_same():
     np.testing.assert_allclose(many.q[:, -1], values, rtol=1e-10)
 
 
+@pytest.mark.slow
 def test_what_is_not_asked_for_does_not_matter():
     """Parts of the result that nobody uses, and a signal that no function names."""
     ts, idle = SAMPLES["coarse"], jl.System(lambda qdot, m: 0.5 * m * qdot**2)
@@ -211,6 +220,7 @@ def test_what_is_not_asked_for_does_not_matter():
     np.testing.assert_allclose(value, 0.1 + 0.5 * 1.6, rtol=1e-13)
 
 
+@pytest.mark.slow
 def test_a_held_speed_of_a_belt_takes_the_mass_along():
     """A nonholonomic constraint that jumps is an impulse, which does work."""
     belt = jl.System(lambda qdot, m: 0.5 * m * qdot**2, nonholonomic={"belt": lambda t, qdot, u: qdot - u(t)})
@@ -270,6 +280,7 @@ def test_single_precision():
     np.testing.assert_allclose(dry_found, dry(SAMPLES["coarse"])[:, 0], atol=2e-4)
 
 
+@pytest.mark.slow
 def test_other_entries_of_params_stay_what_they_are():
     """Integers, truth values, text and a cubic signal beside the held one."""
     system = jl.System(lambda qdot, n: 0.5 * n * qdot**2, force=lambda t, u, w, on, name: u(t) + w(t) * on if name == "both" else u(t))
@@ -281,6 +292,7 @@ def test_other_entries_of_params_stay_what_they_are():
     assert jax.grad(slope)(1.0) == 0
 
 
+@pytest.mark.slow
 def test_a_failure_has_its_reason():
     motion = jl.simulate(CART, 0.0, 0.0, SAMPLES["coarse"], PARAMS | {"u": HELD}, max_steps=50, throw=False)
     assert motion.result == jl.RESULTS.max_steps_reached
@@ -289,6 +301,7 @@ def test_a_failure_has_its_reason():
     assert jl.simulate(fading, 0.0, 0.0, SAMPLES["coarse"], {"m": M, "u": HELD}, throw=False).result != jl.RESULTS.successful
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("system", [CART, DRY], ids=["smooth", "dry"])
 def test_the_loop_is_one_kernel(monkeypatch, system):
     allowed = []

@@ -44,6 +44,7 @@ def test_a_motion_is_that_without_padding(interpolation):
     np.testing.assert_allclose(padded.balance(), 0, atol=3e-7 if over_knots else 1e-7)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("derivative, tolerance", [(jax.grad, 1e-8), (jax.jacfwd, 1e-8), (jax.hessian, 1e-12)])
 def test_its_derivatives_are_those_without_padding(derivative, tolerance):
     """The second at a tolerance for which the kinks of the input do not show."""

@@ -138,3 +138,11 @@ def test_the_law_is_kept_and_checked():
     assert dict(moved.laws) == {"floor": jl.Poisson()}
     with pytest.raises(TypeError, match="`law` must be `Newton\\(\\)` or `Poisson\\(\\)`"):
         jl.Contact(height, 0.5, "poisson")
+
+
+def test_one_ball_comes_back_as_by_newtons_law():
+    system = jl.System(lambda q, qdot: 0.5 * qdot**2 - 9.81 * q, unilateral={"floor": jl.Contact(lambda q: q, restitution, jl.Poisson())})
+    motion = jl.simulate(system, 1.0, 0.0, jnp.array([0.0, 0.6]), {"e": 0.7})
+    fall = np.sqrt(2 / 9.81)
+    since, back = 0.6 - fall, 0.7 * 9.81 * fall
+    np.testing.assert_allclose([motion.q[-1], motion.qdot[-1]], [back * since - 9.81 * since**2 / 2, back - 9.81 * since], rtol=1e-10)

@@ -76,6 +76,7 @@ def test_fast_steps_are_not_all_written(monkeypatch, clock):
     assert said[2].rstrip() == "step 201   cost 0.00497512   at most 1 s more" and said[-1].rstrip() == "step 1000   cost 0.001   1.0 s"
 
 
+@pytest.mark.slow
 def test_a_motion_shows_its_bar(monkeypatch):
     monkeypatch.setattr(sys, "stderr", Terminal())
     oscillator = jl.System(lambda q, qdot: 0.5 * qdot**2 - 2.0 * q**2)

@@ -41,6 +41,7 @@ def solved(solver, steps, ts, end=2.0):
     return diffrax.diffeqsolve(diffrax.ODETerm(pendulum), solver, 0.0, end, end / steps, jnp.array([1.0, 0.5]), **how).ys
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("solver, order, steps", [(jl.Dopri5(), 5, 8), (jl.Dop853(), 8, 4)], ids=NAMES)
 def test_orders(solver, order, steps):
     """Halving the step divides the error at its end by 2^p, and within it by 2^p too, as the dense output is one order below."""

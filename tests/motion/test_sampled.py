@@ -178,6 +178,7 @@ def test_no_tick_is_lost_or_counted_twice(start, every):
     np.testing.assert_allclose(motion.q, ts - start, rtol=1e-12, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_a_controller_sees_the_sample_of_its_reference_that_comes_at_its_tick():
     """A table at 1 kHz, with times as a file has them, and a controller at 1 kHz: k·0.001 is not always the number printed as 0.00k."""
     times = np.array([float(f"{k / 1000:.3f}") for k in range(400)])
@@ -189,6 +190,7 @@ def test_a_controller_sees_the_sample_of_its_reference_that_comes_at_its_tick():
     np.testing.assert_allclose(motion.qdot[1:], 1e-3 * np.cumsum(values[:-1]), rtol=0, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_a_slow_actuator_under_a_controller():
     """A first-order state and a sampled one: linear from tick to tick, so a power of two matrices."""
     m, b, tau, every = 2.0, 3.0, 4e-3, 1e-2
@@ -222,6 +224,7 @@ def test_the_gradient_in_a_table_of_commands():
     np.testing.assert_allclose(jax.grad(end)(jnp.asarray(table)), each, rtol=1e-9)
 
 
+@pytest.mark.slow
 def test_a_spring_whose_end_a_controller_moves():
     """L depends on the sampled state, and explicit time does the work of its steps."""
     move = jl.Sampled(lambda t: jnp.sin(9 * t), every=0.25, start=0.5)
@@ -239,6 +242,7 @@ def test_a_spring_whose_end_a_controller_moves():
     np.testing.assert_allclose(motion.work()["time"], energy - energy[0], rtol=0, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_a_controller_that_sets_a_speed():
     """A velocity constraint that jumps at each tick, also at the first: an impulse, which counts from the start."""
     states = {"u": jl.Sampled(lambda t: jnp.cos(9 * t), every=0.25)}
@@ -262,6 +266,7 @@ def test_many_machines_with_gains_and_periods_of_their_own():
     np.testing.assert_allclose(jax.jit(jax.vmap(one))(kp, period), expected, rtol=0, atol=1e-10)
 
 
+@pytest.mark.slow
 def test_single_precision():
     with jax.enable_x64(False):
         motion = jl.simulate(FREE, *map(np.float32, START), SAMPLES["some at ticks"], PARAMS)

@@ -1,5 +1,6 @@
 """Motions and their derivatives do not depend on the units of their coordinates and of their clock."""
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -18,6 +19,7 @@ AGAIN = {"again": lambda q, l: (2 + jnp.cos(q[0] / l)) * (q @ q - l**2) / l}
 ONCE, TWICE = (jl.System(lambda q, qdot, g: 0.5 * qdot @ qdot - g * q[1], holonomic=rows) for rows in (AROUND, AROUND | AGAIN))
 
 
+@pytest.mark.slow
 def test_a_circuit_of_small_charges():
     """q = V C (1 − exp(−t/RC)), of 1e-10 C: with an absolute tolerance of 1e-10 it was 87 % off."""
     ts = np.linspace(0, 5e-4, 51)
@@ -50,6 +52,7 @@ def test_a_bouncing_ball(length, time):
     np.testing.assert_allclose(motion.contacts["floor"].changed[-1] / time, 3 * np.sqrt(0.2), rtol=1e-7)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("length, time", UNITS)
 def test_a_rod_stated_twice_by_different_equations(length, time):
     """Off the rod, as within a step, they ask for two things: q̇ was off by up to a tenth, and some twenty times the steps were taken."""
@@ -63,6 +66,7 @@ def test_a_rod_stated_twice_by_different_equations(length, time):
     assert motion.stats["num_steps"] <= 1.1 * once.stats["num_steps"]
 
 
+@pytest.mark.slow
 def test_a_chain_named_mass_by_mass():
     """The last of twelve masses moves by coupling alone, at first like t²⁴: it has no scale then, and is compared with none."""
 
@@ -86,6 +90,7 @@ CHAIN = jl.System(
 )
 
 
+@pytest.mark.slow
 def test_a_chain_that_is_shaken_at_one_end():
     """From rest at zero: the motion of its masses grows like t³, t⁵, …, t⁸¹. What is yet to be moved does not set the steps."""
     run = lambda **given: jl.simulate(CHAIN, np.zeros(40), np.zeros(40), [0.0, 20.0, 60.0], **given)
@@ -109,6 +114,7 @@ NET = jl.System(
 )
 
 
+@pytest.mark.slow
 def test_a_net_that_begins_to_hang():
     """Springs of 0.1 m cancel but for rounding in coordinates that are zero, or held by a hook: it does not matter where the origin is."""
     flat = 0.1 * np.stack(np.meshgrid(np.arange(3), np.arange(3), [0.0], indexing="ij"), axis=-1)[:, :, 0]
@@ -122,6 +128,7 @@ def test_a_net_that_begins_to_hang():
     np.testing.assert_allclose(here, there, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_a_slow_slider_beside_a_fast_rotor():
     """Each is compared with its own scale: 1e-6 beside 1e4."""
     system = jl.System(lambda q, qdot: 0.5 * qdot["x"] ** 2 - 0.5 * q["x"] ** 2 + 0.5 * qdot["phi"] ** 2)
@@ -129,6 +136,7 @@ def test_a_slow_slider_beside_a_fast_rotor():
     np.testing.assert_allclose(motion.q["x"][-1], 1e-6 * np.cos(10.0), rtol=1e-6)
 
 
+@pytest.mark.slow
 def test_a_given_absolute_tolerance_is_taken_as_given():
     steps = lambda **given: int(jl.simulate(OSCILLATOR, 1e-9, 0.0, [0.0, 20.0], {"w": 2.0}, **given).stats["num_steps"])
     assert steps(atol=1e-10) < steps(atol=1e-18) <= steps(atol=1e-19)
@@ -137,6 +145,7 @@ def test_a_given_absolute_tolerance_is_taken_as_given():
     assert run({"x": 1e-3, "y": 1e-18}) > run({"x": 1e-3, "y": 1e-3})
 
 
+@pytest.mark.slow
 def test_a_circuit_that_is_fitted():
     """RC from charges of 1e-10 C: 1.31 in place of 1.023 before."""
     ts, noise = np.linspace(0, 5e-4, 51), np.random.default_rng(0).normal(size=51)
@@ -149,8 +158,26 @@ def test_a_circuit_that_is_fitted():
     np.testing.assert_allclose(fit.standard_errors["R"], sigma, rtol=0.05)
 
 
+@pytest.mark.slow
 def test_single_precision(single_precision):
     ts = np.linspace(0, 20, 11)
     for length in (1.0, 1e-9):
         motion = jl.simulate(OSCILLATOR, length, 0.0, ts, {"w": 2.0})
         np.testing.assert_allclose(np.asarray(motion.q) / length, np.cos(2 * ts), atol=2e-3)
+
+
+LED = jl.System(
+    lambda q, qdot, L: 0.5 * jnp.sum((qdot / L) ** 2) - 2.0 * ((q[1] - q[0]) / L) ** 2,
+    holonomic=lambda t, q, a, L, t0: q[0] - a * L * jnp.sin(t - t0) ** 2,
+)
+
+
+@pytest.mark.parametrize(("L", "t0", "atol"), [(1.0, 0.0, 1e-7), (1e-9, 1e6, 1e-7), (1e9, 1e9, 1e-5)])
+@pytest.mark.parametrize("a", [1.0, 0.0])
+def test_a_mass_that_is_led_from_rest_in_resonance(L, t0, atol, a):
+    """x = a/2 (1 − cos 2t − t sin 2t) behind a spring whose end is led as a sin² t; and its derivative by a."""
+    ts = np.linspace(0.0, 5.0, 6)
+    run = lambda a: jl.simulate(LED, jnp.zeros(2), jnp.zeros(2), t0 + ts, {"a": a, "L": L, "t0": t0}, throw=False).q[:, 1] / L
+    by_hand = (1 - np.cos(2 * ts) - ts * np.sin(2 * ts)) / 2
+    np.testing.assert_allclose(run(a), a * by_hand, atol=atol)
+    np.testing.assert_allclose(jax.jacfwd(run)(a), by_hand, atol=atol)

@@ -95,6 +95,7 @@ def test_derivatives_of_a_start_that_is_not_searched_for(searched):
         assert searched[-1] == "all"
 
 
+@pytest.mark.slow
 def test_a_batch_is_put_on_the_constraints_member_by_member(searched):
     """The first of an eager batch lies on the circle, the second beside it."""
     pendulum = jl.System(lambda qdot: 0.5 * qdot @ qdot, holonomic=lambda q: q @ q - 1)
@@ -119,6 +120,7 @@ def test_a_constraint_that_closes_over_what_is_differentiated_or_a_batch(searche
     np.testing.assert_allclose(jax.vmap(closed_over)(jnp.array([1.0, 1.2])), [stated(1.0), stated(1.2)], rtol=1e-8)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("rate, search", [(0.7, "nothing"), (0.0, "all")])
 def test_a_support_that_moves_takes_a_start_at_rest_along(rate, search, searched):
     lift = jl.System(lambda qdot: 0.5 * qdot @ qdot, holonomic=lambda t, q: q[1] - 0.7 * t)
@@ -127,6 +129,7 @@ def test_a_support_that_moves_takes_a_start_at_rest_along(rate, search, searched
     np.testing.assert_allclose([motion.q[-1], motion.qdot[0]], [[0.2, 0.7]] * 2, rtol=1e-12)
 
 
+@pytest.mark.slow
 def test_a_support_that_begins_to_move_at_the_start(searched):
     """Recorded from before: what rests has to move along with what follows."""
     lift = jl.System(lambda qdot: 0.5 * qdot @ qdot, holonomic=lambda t, q, way: q[1] - way(t))
@@ -136,6 +139,7 @@ def test_a_support_that_begins_to_move_at_the_start(searched):
     np.testing.assert_allclose([motion.q[-1], motion.qdot[0]], [[0.2, 0.7]] * 2, rtol=1e-12)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("scale", [1e-9, 1.0, 1e9])
 def test_units_do_not_matter(scale, searched):
     """A start that is a millionth off its length is put right, however long the length is."""
@@ -150,6 +154,7 @@ half_massless = jl.System(lambda qdot, m: 0.5 * qdot[0] ** 2 + 0.5 * m * qdot[1]
 undefined = jl.System(lambda q, qdot: 0.5 * jnp.sqrt(q[1]) * (qdot @ qdot), holonomic=lambda q: q[0] - 1)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "system, q0, params, reason",
     [

@@ -57,6 +57,7 @@ def test_spherical_pendulum_stays_on_its_sphere_for_1000_seconds():
     assert np.max(np.abs(energy / energy[0] - 1)) <= 1e-7
 
 
+@pytest.mark.slow
 def test_spherical_pendulum_turns_where_the_closed_form_says():
     """Period of z and apsidal advance by elliptic integrals: z from −0.5 down to −0.8875973996079699 and back."""
     p = {"m": 1.0, "g": 9.81, "l": 1.0}
@@ -100,6 +101,7 @@ def test_car_axis_problem():
     np.testing.assert_allclose(motion.multipliers["axis"][-1], [-0.473688659084893324729e-2, -0.110468033125734368808e-2], atol=1e-6)
 
 
+@pytest.mark.slow
 def test_chaplygin_sleigh():
     """Bloch, Nonholonomic Mechanics, section 1.7: v = C tanh k(t + t₀), ω = √(m/J) C sech k(t + t₀)."""
 
@@ -119,6 +121,7 @@ def test_chaplygin_sleigh():
     assert np.max(np.abs(jax.vmap(edge)(motion.q, motion.qdot))) < 1e-13
 
 
+@pytest.mark.slow
 def test_knife_edge_on_an_incline():
     """Bloch 2015, section 1.6: a cycloid; λ = −2 m g sin α sin Ωt."""
     system = jl.System(
@@ -151,7 +154,6 @@ def drift_and_error(stabilisation):
     return drift, np.max(np.abs(motion.q - np.stack([-np.sin(theta), -np.cos(theta)], axis=1)))
 
 
-@pytest.mark.fast
 def test_projection_holds_what_drifts_without_it():
     projected, fed_back, nothing = map(drift_and_error, (jl.Projection(), jl.Baumgarte(20.0, 20.0), jl.NoStabilisation()))
     assert projected[0] < 1e-15 and projected[1] < 2e-3
@@ -159,6 +161,7 @@ def test_projection_holds_what_drifts_without_it():
     assert fed_back[0] < 1e-3 * nothing[0] and fed_back[1] < 0.3 * nothing[1]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("solver", [diffrax.Dopri5(), diffrax.Bosh3(), diffrax.Heun(), diffrax.Kvaerno5(), diffrax.Kvaerno3()])
 def test_other_solvers(solver):
     ts, p = jnp.linspace(0, 1, 11), pendulum.params
@@ -169,6 +172,7 @@ def test_other_solvers(solver):
     np.testing.assert_allclose(np.hypot(motion.q["x"], motion.q["y"]), 1, atol=1e-14)
 
 
+@pytest.mark.slow
 def test_start_is_put_on_the_constraints_and_the_card_says_so():
     ts, p = jnp.linspace(0, 1, 11), pendulum.params
     motion = jl.simulate(pendulum.cartesian, {"x": 0.0, "y": -1.1}, {"x": 0.5, "y": 0.3}, ts, p)
@@ -220,6 +224,7 @@ def test_a_second_motion_traces_nothing(monkeypatch):
     np.testing.assert_allclose([first.q[-1], second.q[-1]], [np.cos(2), 2 * np.cos(np.sqrt(5))], atol=1e-7)
 
 
+@pytest.mark.slow
 def test_vmap_equals_the_loop():
     rng = np.random.default_rng(5)
     b = jnp.asarray(rng.uniform(1000, 6000, 100))
@@ -230,12 +235,14 @@ def test_vmap_equals_the_loop():
         np.testing.assert_allclose(together[name], [each[name] for each in one_by_one], rtol=1e-10, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_a_batch_is_printed_as_one():
     ts = jnp.linspace(0, 1, 5)
     run = lambda x: jl.simulate(pendulum.cartesian, *pendulum.cartesian_state(x, 0.0, 1.0), ts, pendulum.params)
     assert "3 motions of 5 samples" in repr(jax.vmap(run)(jnp.array([0.1, 0.2, 0.3])))
 
 
+@pytest.mark.slow
 def test_single_precision_works_and_warns_once(single_precision):
     scales._warn_of_single_precision.cache_clear()
     ts, p = jnp.linspace(0, 2, 21), pendulum.params
@@ -304,6 +311,7 @@ def test_functions_of_every_kind_get_what_they_name():
     np.testing.assert_allclose(doubled, -4.5, rtol=1e-14)
 
 
+@pytest.mark.slow
 def test_a_network_in_params():
     import equinox as eqx
 
@@ -326,6 +334,7 @@ def test_systems_are_compared_by_their_functions():
     assert repr(pendulum.polar) == "System(lagrangian; holonomic: rod)"
 
 
+@pytest.mark.slow
 def test_old_spellings_work_and_say_the_new_ones():
     spring = jl.System(lambda q, qdot: 0.5 * qdot**2 - 0.5 * q**2)
     with pytest.warns(DeprecationWarning, match="`audit` is now called `works`. Write `works`."):

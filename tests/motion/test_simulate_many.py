@@ -32,6 +32,12 @@ def test_parameters_and_starts_that_differ():
     np.testing.assert_allclose(found.q, exact(np.asarray(TS), x0[:, None], 2.0, c[:, None], b[:, None]), atol=1e-7)
 
 
+def test_derivatives_in_the_times_are_velocities():
+    c, x0 = jnp.array([1.0, 4.0, 9.0]), jnp.array([1.0, -0.5, 2.0])
+    run = lambda longer: jl.simulate_many(OSCILLATOR, x0, 0 * x0, longer * TS, {"m": 2.0, "c": c, "b": 0.3}, over=("q0", "qdot0", "c"))
+    np.testing.assert_allclose(jax.jacfwd(lambda longer: run(longer).q)(1.0), run(1.0).qdot * TS[None], atol=1e-10)
+
+
 CARTESIAN = {"x": 1.0, "y": 0.0}, {"x": 0.0, "y": 0.0}
 
 
@@ -107,6 +113,7 @@ def test_the_old_spelling_of_common_steps():
         _choice_of_steps("both", None)  # under the hook of these tests `simulate_many` is refused before
 
 
+@pytest.mark.slow
 def test_a_failure_is_raised_with_its_reason():
     with pytest.raises(ValueError, match="must be finite"):
         jl.simulate_many(OSCILLATOR, 1.0, 0.0, TS, {"m": 2.0, "c": jnp.array([3.0, np.nan]), "b": 0.1}, over=("c",))

@@ -46,6 +46,7 @@ def driven(ts=TS, m=2.0, b=3.0, tau=0.2, z0=0.5, **_):
     return np.transpose(found)
 
 
+@pytest.mark.slow
 def test_a_motor_with_a_lag_under_a_held_command():
     motion = jl.simulate(MOTOR, 0.0, 0.0, TS, PARAMS)
     q, v, z = driven()
@@ -55,6 +56,7 @@ def test_a_motor_with_a_lag_under_a_held_command():
     np.testing.assert_allclose(motion.qddot, (z - 3 * v) / 2, rtol=0, atol=1e-8)
 
 
+@pytest.mark.slow
 def test_a_motor_with_a_lag_under_a_smooth_command():
     """At the default tolerances."""
     rate = lambda t, z, tau: (jnp.sin(20 * t) - z) / tau
@@ -65,6 +67,7 @@ def test_a_motor_with_a_lag_under_a_smooth_command():
     np.testing.assert_allclose((motion.q, motion.qdot, motion.states["z"]), expected, rtol=0, atol=1e-7)
 
 
+@pytest.mark.slow
 def test_a_motion_goes_on_from_one_of_its_samples():
     q, v, z = driven()
     rest = jl.simulate(MOTOR, q[12], v[12], TS[12:], PARAMS, states={"z": z[12]})
@@ -81,6 +84,7 @@ def differences(value, p, h=1e-5):
     return {name: (value(p | {name: x + h}) - value(p | {name: x - h})) / (2 * h) for name, x in p.items()}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("derivative", [jax.jacfwd, jax.grad])
 def test_derivatives_in_the_lag_its_start_and_the_mass(derivative):
     found = derivative(end)(AT)
@@ -98,6 +102,7 @@ def test_second_derivatives_in_the_lag_and_the_mass():
         np.testing.assert_allclose(found[row], np.array(expected) / (2 * h), rtol=1e-4, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_many_motors():
     taus = jnp.array([0.05, 0.2, 0.8])
     expected = np.array([driven(tau=tau) for tau in taus])
@@ -108,6 +113,7 @@ def test_many_motors():
     np.testing.assert_allclose(every.states["z"], expected[:, 2], rtol=0, atol=1e-8)
 
 
+@pytest.mark.slow
 def test_single_precision():
     with jax.enable_x64(False):
         single = PARAMS | {"u": jl.Signal(JUMPS, VALUES)}
@@ -117,6 +123,7 @@ def test_single_precision():
     np.testing.assert_allclose(motion.q, driven()[0], rtol=0, atol=2e-4)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("free, sees", [(("tau", "z0"), "z"), (("m", "b", "tau"), "both")])
 def test_identification_of_the_lag(free, sees):
     """From noisy measurements of the state alone, or beside the position."""
@@ -202,6 +209,7 @@ CARRIED = {"m": 2.0, "b": 3.0, "tau": 0.4, "goal": 1.5}
 follower = {"z": jl.State(lambda z, tau, goal: (goal - z) / tau, start=0.2)}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["holonomic", "nonholonomic"])
 def test_a_mass_that_is_carried_along_by_a_state(kind):
     """Its position, or its speed, is z = goal − (goal − z₀) exp(−t/τ); the multiplier is the force that this takes."""
@@ -226,6 +234,7 @@ def test_a_mass_that_is_carried_along_by_a_state(kind):
     np.testing.assert_allclose((one.qddot, one.multipliers["arm"]), expected, rtol=1e-12)
 
 
+@pytest.mark.slow
 def test_a_start_off_the_constraint_is_put_on_the_state():
     """A state is driven and does not give way: the mass goes to z(0) = 0.2 and its rate."""
     system = jl.System(mass, dissipation=oil, holonomic={"arm": lambda q, z: q - z}, states=follower)
@@ -233,6 +242,7 @@ def test_a_start_off_the_constraint_is_put_on_the_state():
     np.testing.assert_allclose((motion.q[0], motion.qdot[0], motion.states["z"][0]), (0.2, 1.3 / 0.4, 0.2), rtol=0, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_an_observer_in_the_loop():
     """Luenberger's, of an oscillator, fed back; a pytree that starts where a function of the start says; linear as a whole."""
     p = {"c": 9.0, "slow": 0.5, "l1": 12.0, "l2": 40.0, "k": 5.0}
@@ -256,6 +266,7 @@ def test_an_observer_in_the_loop():
     np.testing.assert_allclose(slope, (expm(A * 2) @ [0, 0, 0, -0.6, 0])[0], rtol=1e-6)
 
 
+@pytest.mark.slow
 def test_on_paper_an_update_without_a_formula_is_left_out():
     """It reads a table; the mechanics does not depend on that. A program would not know u."""
     states = {"u": jl.Sampled(lambda t, q, goal: goal(t) - q, every=0.1), "w": jl.Sampled(lambda q: 2 * q, every=0.1)}

@@ -23,6 +23,7 @@ def bend(qdot, z, s0, F_c, F_s, v_s, xp=jnp):
     return qdot - s0 * xp.abs(qdot) / steady(qdot, F_c, F_s, v_s, xp) * z
 
 
+@pytest.mark.slow
 def test_a_mass_on_bristles_pulled_by_a_spring():
     """Canudas de Wit, Olsson, Åström & Lischinsky, IEEE Trans. Automatic Control 40 (1995) 419, figure 3, with softer bristles."""
     p = {"s0": 1e3, "s1": 30.0, "s2": 0.4, "F_c": 1.0, "F_s": 1.5, "v_s": 0.02}
@@ -50,6 +51,7 @@ feedback = lambda q, qdot, w, kp, kd, ki: kp * (1 - q) - kd * qdot + ki * w
 integrator = {"w": jl.State(lambda q: 1 - q)}
 
 
+@pytest.mark.slow
 def test_a_cart_with_an_integrator_and_smoothed_stribeck_friction():
     def friction(qdot, F_c, F_s, v_s):
         s = jnp.sqrt(qdot**2 + 0.02**2)

@@ -115,6 +115,7 @@ def test_no_array_of_all_by_all_and_no_longer_programs():
     assert of_many[1] == of_few[1]
 
 
+@pytest.mark.slow
 def test_what_couples_everything_is_solved_as_before():
     """n points that their mean pulls back, stiffly: the mean swings, and what differs from it is free."""
     n, stiffness = 64, 1e2

@@ -24,6 +24,7 @@ def line_of(function):
     return inspect.getsourcelines(function)[1]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("derivative", [jax.jacfwd, jax.jacrev])
 @pytest.mark.parametrize("edge", EDGES)
 def test_mud_behind_an_edge(edge, derivative):
@@ -43,6 +44,7 @@ def test_mud_behind_an_edge(edge, derivative):
         np.testing.assert_allclose(derivative(last)(x, unit), exact, rtol=2e-5 if edge == "curved" else 1e-7)
 
 
+@pytest.mark.slow
 def test_a_spring_that_one_runs_into():
     """A half period of contact, and back: q(T) = a − (T − a − π/ω)."""
     system = jl.System(lambda q, qdot, a, c: FREE(qdot) + STOP(q, a, c), events={"edge": EDGES["plain"]})
@@ -51,6 +53,7 @@ def test_a_spring_that_one_runs_into():
     np.testing.assert_allclose(jax.grad(last, (0, 1))(0.5, 4.0), [2.0, -np.pi / 16], rtol=1e-6)
 
 
+@pytest.mark.slow
 def test_the_user_is_told_where():
     """Each function and its line, the table too; neither dry friction nor guards nor what is smooth."""
     told = test_the_user_is_told_where
@@ -66,6 +69,7 @@ def test_the_user_is_told_where():
     assert not any(name in finding for finding in found for name in ("well", "rubbing", "free"))
 
 
+@pytest.mark.slow
 def test_a_fit_does_not_deny_an_influence():
     """Without an event the derivative by a is 0; a parameter that stands nowhere has none indeed."""
     system, ts = jl.System(FREE, dissipation=MUD), np.linspace(0, 2, 41)

@@ -27,6 +27,7 @@ def until_it_passes(k):
     return jl.simulate(stopped, 1.0, 0.0, TS, {"k": k}, rtol=1e-10, atol=1e-10).q
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("motion", [one, two, until_it_passes])
 def test_gradients_of_what_is_not_reached(motion):
     """Neither zero, which would say that nothing can be won, nor in the way of what is known."""
@@ -44,6 +45,7 @@ def test_gradients_of_what_is_not_reached(motion):
         np.testing.assert_allclose(jax.jit(derivative(of_those_there))(k), difference, rtol=1e-5)
 
 
+@pytest.mark.slow
 def test_a_gradient_called_from_python_says_why():
     """As the motion itself does."""
     through = lambda k: jl.simulate(oscillator, 1.0, 0.0, TS, {"k": k}, max_steps=8).q[-1]
@@ -51,6 +53,7 @@ def test_a_gradient_called_from_python_says_why():
         jax.grad(through)(0.6)
 
 
+@pytest.mark.slow
 def test_a_drag_that_has_no_derivative_at_rest():
     """|v|³ as (v²)^1.5: its second derivative at rest is 0/0 to JAX, its motion is not."""
     drag = jl.System(lambda q, qdot, k: 0.5 * qdot @ qdot - 0.5 * k * q @ q, dissipation={"drag": lambda qdot: 0.05 * (qdot @ qdot) ** 1.5})

@@ -30,12 +30,14 @@ def test_an_amplitude_at_rest(derivative, A):
     np.testing.assert_allclose(derivative(driven)(A), BY_AMPLITUDE, rtol=1e-6)
 
 
+@pytest.mark.slow
 def test_an_amplitude_at_rest_in_a_batch():
     many = lambda A: jl.simulate_many(DRIVEN, 0.0, 0.0, TS, {"c": 4.0, "A": A}, over=("A",)).q[:, -1]
     found = jax.jacfwd(many)(jnp.array([0.0, 1.0, 0.0]))
     np.testing.assert_allclose(found, BY_AMPLITUDE * np.eye(3), atol=1e-6)
 
 
+@pytest.mark.slow
 def test_an_amplitude_is_fitted_from_zero():
     ts = np.linspace(0, 20, 101)
     exact = 0.7 * (np.sin(3 * ts) - 1.5 * np.sin(2 * ts)) / (4 - 9)
@@ -48,6 +50,7 @@ def test_an_amplitude_is_fitted_from_zero():
     np.testing.assert_allclose(fit.standard_errors["A"], sigma, rtol=0.05)
 
 
+@pytest.mark.slow
 def test_many_amplitudes_at_rest_in_reverse():
     """120 numbers are differentiated in reverse, whose steps fit a direction at random."""
     w = np.arange(1, 121) / 10 + 0.05
@@ -73,6 +76,7 @@ def test_a_stiffness_of_zero():
     np.testing.assert_allclose(slope, -3 * float(mpmath.quad(lambda t: (10 - t) * mpmath.sin(3 * t), np.linspace(0, 10, 11))), rtol=1e-6)
 
 
+@pytest.mark.slow
 def test_a_hanging_rod():
     """A rod pendulum in x, y, driven from rest: linear in A, with ω² = g/l."""
     system = jl.System(
@@ -95,6 +99,7 @@ RODS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("rod", RODS)
 def test_a_rod_in_polar_coordinates(rod):
     """What it holds varies by rounding of rounding alone, which once ended the derivative, in any unit: from rest, through the bottom, by
@@ -127,6 +132,7 @@ def test_a_rod_in_polar_coordinates(rod):
             assert np.all(np.isfinite(slopes[1])) and steps < 40
 
 
+@pytest.mark.slow
 def test_a_slider_that_an_amplitude_breaks_away():
     """Dry friction, then sliding: dq/dF of ½(t − t₀)² (t₀ = F) type motions, where the start is at rest."""
     system = jl.System(lambda q, qdot: 0.5 * qdot**2, dissipation=lambda qdot, F: F * jnp.abs(qdot), force=lambda t: t)

@@ -346,6 +346,8 @@ SOLVED_BY_NUMBERS = {
     "17_gyroscope.racket",
 }  # for their formulas one would wait for minutes
 
+BY_NUMBERS = {"vehicle.first_kind by numbers": "vehicle.first_kind", "pendulum.cartesian by numbers": "pendulum.cartesian"}
+
 
 def code_of(notebook):
     """The code cells of a notebook."""
@@ -381,10 +383,12 @@ def test_every_system_of_a_notebook_is_in_the_table():
     assert there <= table and {name.split(".")[0] for name in table} | FROM_EXAMPLES == set(notebooks)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("name", [*EXAMPLES, *NOTEBOOK_SYSTEMS, *MORE])
+@pytest.mark.parametrize(
+    "name", [*EXAMPLES, *BY_NUMBERS, *(pytest.param(name, marks=pytest.mark.slow) for name in (*NOTEBOOK_SYSTEMS, *MORE))]
+)
 def test_formulas_and_programs_equal_the_simulation_at_random_states(name, tmp_path, monkeypatch):
-    if name in SOLVED_BY_NUMBERS:
+    name, by_numbers = BY_NUMBERS.get(name, name), name in BY_NUMBERS or name in SOLVED_BY_NUMBERS
+    if by_numbers:
         monkeypatch.setattr(linear_solve, "MOST_TERMS", 0)
     case = (EXAMPLES | MORE)[name] if name in EXAMPLES | MORE else of_notebook(name)
     e = jl.equations(case.system, case.q, case.params, multipliers=True)
@@ -395,7 +399,7 @@ def test_formulas_and_programs_equal_the_simulation_at_random_states(name, tmp_p
     exec(e.to_python(), program)
     in_c = compiled(e.to_c(), tmp_path)
     ways = {"NumPy": program["acceleration"], "C": lambda t, q, v, _: in_c(t, q, v, numbers, qddot.shape[1], multipliers.shape[1])}
-    if name not in MORE and name not in SOLVED_BY_NUMBERS:  # all short enough to have formulas
+    if name not in MORE and not by_numbers:  # all short enough to have formulas
         parameters = [symbol for array in jax.tree.leaves(e.params) for symbol in np.ravel(array)]
         reactions = [x for name in case.system.constraints for part in jax.tree.leaves(e.multipliers[name]) for x in np.ravel(part)]
         accelerations = [x for part in jax.tree.leaves(e.accelerations) for x in np.ravel(part)]
@@ -406,6 +410,23 @@ def test_formulas_and_programs_equal_the_simulation_at_random_states(name, tmp_p
         for want, part in ((qddot, 0), (multipliers, 1)):
             have = np.array([g[part] for g in got]).reshape(want.shape)
             np.testing.assert_allclose(have, want, rtol=ROUNDING, atol=ROUNDING, err_msg=way)
+
+
+def test_programs_solve_in_any_units(tmp_path, monkeypatch):
+    """A rod pendulum of any mass and size, its rod given twice: q̈ = −g e_y − (v² − g y)/l² q, each half of the force."""
+    monkeypatch.setattr(linear_solve, "MOST_TERMS", 0)
+    rods = {name: lambda q, l: q @ q - l**2 for name in ("rod", "the same")}
+    system = jl.System(lambda q, qdot, m, g: 0.5 * m * qdot @ qdot - m * g * q[1], holonomic=rods)
+    e = jl.equations(system, np.array([0.6, -0.8]), {"g": 9.81, "l": 1.0, "m": 1.0}, multipliers=True)
+    program: dict = {}
+    exec(e.to_python(), program)
+    in_c = compiled(e.to_c(), tmp_path)
+    for m, l in ((1.0, 1.0), (1e-9, 1.0), (1e-14, 1e-3), (1e-20, 1e4), (1e12, 1e-6)):
+        q, v, numbers = l * np.array([0.6, -0.8]), l * np.array([0.8, 0.6]), [9.81, l, m]
+        pull = -(v @ v - 9.81 * q[1]) / l**2
+        expected = [*(pull * q - [0.0, 9.81]), *[m * pull / 4] * 2]
+        for found in (program["acceleration"](0.0, q, v, dict(zip("glm", numbers, strict=True))), in_c(0.0, q, v, numbers, 2, 2)):
+            np.testing.assert_allclose(np.concatenate(found), expected, rtol=1e-11)
 
 
 @pytest.mark.parametrize("name", ["vehicle.first_kind", "pendulum.polar"])

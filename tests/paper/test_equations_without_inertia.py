@@ -45,6 +45,7 @@ def test_as_in_a_textbook(system, coordinates, lines):
     assert str(jl.equations(system, coordinates, NAMES)).splitlines() == lines
 
 
+@pytest.mark.slow
 def test_velocities_and_forces_of_a_held_solid_equal_the_simulation():
     on_paper = jl.equations(HELD, {"x", "z"}, NAMES, multipliers=True)
     (rate,) = (v for v in on_paper.qdot if v.name == "zdot")

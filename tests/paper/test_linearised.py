@@ -462,6 +462,7 @@ def test_a_state_is_given_in_many_ways(q, at):
     assert [e.at[x] for x in e.at][:2] == [1, 1] and e.stiffness == e.params["c"] * sympy.eye(2)
 
 
+@pytest.mark.slow
 def test_what_is_left_out_keeps_its_symbol_or_follows_from_constraints():
     e = jl.equations(vehicle.first_kind, ALL_PARTS, vehicle.params, linearised_at=STILL)
     p, by_name = e.params, {symbol.name: formula for symbol, formula in e.at.items()}

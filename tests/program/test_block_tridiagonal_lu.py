@@ -28,8 +28,7 @@ def sparse(A, dtype=float):
     return SparseMatrix(jnp.asarray(A[places.rows, places.columns], dtype), places)
 
 
-@pytest.mark.fast
-@pytest.mark.parametrize(("n", "width"), [(50, 2), (64, 7), (41, 12), (4, 1)])
+@pytest.mark.parametrize(("n", "width"), [pytest.param(50, 2, marks=pytest.mark.fast), (64, 7), (41, 12), (4, 1)])
 def test_solution_and_that_of_the_transpose(n, width):
     A, b = banded(n, width), RNG.normal(size=n)
     matrix = sparse(A)

@@ -73,6 +73,7 @@ EXACT = {"broadcast_in_dim", "concatenate", "convert_element_type", "dynamic_sli
 EXACT |= {"abs", "neg", "reduce_min", "reshape", "select_n", "slice", "split", "squeeze", "stop_gradient", "transpose"}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("function", [hoop, ball, stiff_chain, rest, rest_of_many, held])
 def test_what_ends_a_loop_is_compared_not_computed(function):
     """XLA compiles the condition of a loop of a batch twice, with roundings of their own: one may say that it goes on, the other that no

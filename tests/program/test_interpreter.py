@@ -207,12 +207,12 @@ def test_functions_of_two_arrays():
     close(scalarised(every, limit=100_000)(x[:1], y[:1]), every(x[:1], y[:1]))
 
 
+@pytest.mark.slow
 def test_linear_algebra():
     every = lambda a: [function(a) for function in SOLVING]
     close(scalarised(every, limit=100_000)(spd), every(spd), 1e-11)
 
 
-@pytest.mark.fast
 @pytest.mark.parametrize("function", [*UNARY, *MOVING, *REDUCING, *CALLING])
 def test_numbers_are_folded_as_jax_computes_them(function):
     closed, shape = jax.make_jaxpr(function, return_shape=True)(x)

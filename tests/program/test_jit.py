@@ -79,6 +79,7 @@ def test_the_options_reach_the_compiler_only_in_calls_from_python(monkeypatch):
     assert jax.jit(program)(1.0) == 2.0
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(jax.default_backend() != "cpu", reason="the option is for CPUs")
 @pytest.mark.parametrize("derivative", [jax.grad, jax.jacfwd, jax.hessian, jax.vmap])
 def test_derivatives_from_python_have_the_options(derivative, monkeypatch):
@@ -117,6 +118,7 @@ def test_within_the_users_own_jit_a_motion_ends():
     np.testing.assert_allclose(within, alone, rtol=1e-9)
 
 
+@pytest.mark.slow
 def test_within_the_users_own_jit_everything_may_be_known():
     """A motion of nothing but constants."""
     motion = lambda: jl.simulate(vehicle.system, vehicle.q0, vehicle.qdot0, TS, vehicle.params).q["y"]

@@ -166,6 +166,7 @@ class Stiff:
         return -self.c * q
 
 
+@pytest.mark.slow
 def test_derivatives_and_functions_of_other_kinds(compilation_cache, tmp_path, lowered):
     """d cos(√c t)/dc = −t sin(√c t)/(2√c); functions are callable objects, partial ones and methods."""
     jl.keep_compiled(tmp_path)
@@ -235,6 +236,7 @@ def test_what_outlives_its_functions_is_not_found(compilation_cache, tmp_path, l
     assert lowered["jit(_trajectory)"] == before + 1
 
 
+@pytest.mark.slow
 def test_what_a_function_returned_has_to_be_what_it_returns(compilation_cache, tmp_path):
     """A gradient within a program was traced with the old number, and JAX still has parts of it: that is not handed on."""
     jl.keep_compiled(tmp_path)

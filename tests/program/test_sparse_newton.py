@@ -26,6 +26,7 @@ def saddle(kind, rng):
     return np.block([[A, -G.T], [H, np.zeros((len(G), len(G)))]])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["plain", "units", "nothing in place of A", "rows twice"])
 def test_solution_and_its_transpose(kind):
     rng = np.random.default_rng(4)

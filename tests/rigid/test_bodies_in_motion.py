@@ -86,6 +86,7 @@ def test_the_card_says_where_angles_come_near_their_singularity():
     assert not any("singularity" in finding for finding in far)
 
 
+@pytest.mark.slow
 def test_a_spinning_wing_nut_turns_over_and_over():
     """Dzhanibekov's flips: ω in the axes of the body by Jacobi's functions (Landau & Lifshitz, Mechanics, section 37), I₁ < I₂ < I₃."""
     I = np.array([1.0, 2.0, 2.5])

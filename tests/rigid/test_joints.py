@@ -26,6 +26,7 @@ def body(q):
     return rigid.frame(q["x"], rigid.rotation_vector(q["r"]))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", JOINTS)
 def test_forces_of_a_joint_on_a_body_at_rest(name):
     """External force F at the centre and moment N:  f + F = 0,  μ + N + a × f = 0,  with a from the centre to the joint."""

@@ -9,7 +9,6 @@ from scipy.spatial.transform import Rotation
 import jaxlag as jl
 from jaxlag import rigid
 
-pytestmark = pytest.mark.fast
 SEQUENCES = [a + b + c for a in "xyz" for b in "xyz" for c in "xyz" if a != b != c]
 
 
@@ -21,6 +20,7 @@ def test_euler_angles(sequence):
     np.testing.assert_allclose(jax.vmap(rigid.euler(sequence))(angles), expected, atol=1e-14)
 
 
+@pytest.mark.fast
 def test_other_rotations():
     rng = np.random.default_rng(2)
     q, r = rng.normal(size=(20, 4)), rng.normal(size=(20, 3)) * rng.uniform(0, 3, (20, 1))
@@ -60,6 +60,7 @@ def test_the_margin_of_euler_angles_is_the_inverse_of_the_largest_rate_they_take
             np.testing.assert_allclose(abs(np.linalg.det(J)), rotation.margin(angles), atol=1e-14)
 
 
+@pytest.mark.fast
 def test_quaternions_of_rotations_and_their_rates():
     """Also where w is next to nothing; the rate by its angular velocity."""
     rng = np.random.default_rng(7)
@@ -77,6 +78,7 @@ def test_quaternions_of_rotations_and_their_rates():
     np.testing.assert_allclose(turned, [-np.sin(0.2) / 2, np.cos(0.2) / 2, 0, 0], atol=1e-15)
 
 
+@pytest.mark.fast
 def test_single_precision_stays():
     q = jnp.array([1.0, 0.1, 0.2, 0.3], jnp.float32)
     for value in (
@@ -109,6 +111,7 @@ BAD = {
 }
 
 
+@pytest.mark.fast
 @pytest.mark.parametrize("case", BAD)
 def test_what_is_no_rotation_or_no_body_is_refused_with_the_cure(case):
     make, said = BAD[case]

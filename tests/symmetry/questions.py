@@ -83,8 +83,8 @@ def _state(i: Inputs, u: Units, found) -> dict[str, Seen]:
 END = 9  # samples of a motion that is differentiated: 2 s
 
 
-def _end(case: Case, settings: dict):
-    def end(numbers, rest, i):
+def _end(case: Case):
+    def end(numbers, rest, i, settings):
         return jl.simulate(in_units(case), i.q, i.qdot, i.ts[:END], rest | numbers, throw=False, **settings).q[-1]
 
     return end
@@ -97,10 +97,10 @@ def _free(case: Case) -> list[str]:
 DERIVATIVES: dict = {}
 
 
-def _derivative(case: Case, mode: Callable, settings: dict):
-    key = in_units(case), mode, *settings.items()
+def _derivative(case: Case, mode: Callable):
+    key = in_units(case), mode
     if key not in DERIVATIVES:
-        DERIVATIVES[key] = jax.jit(mode(_end(case, settings)))
+        DERIVATIVES[key] = jax.jit(mode(_end(case)))
     return DERIVATIVES[key]
 
 
@@ -108,7 +108,7 @@ def _gradient(case: Case, u: Units, mode: Callable, settings: dict) -> dict[str,
     i, free = inputs_of(case, u), _free(case)
     numbers = {name: jnp.asarray(i.params[name], float) for name in free}
     rest = {name: x for name, x in i.params.items() if name not in free}
-    found = _derivative(case, mode, settings)(numbers, rest, Inputs(i.q, i.qdot, i.ts, None))
+    found = _derivative(case, mode)(numbers, rest, Inputs(i.q, i.qdot, i.ts, None), {"rtol": 1e-8} | settings)
     of = lambda name: u.length.reshape(-1, *[1] * np.ndim(case.params[name])) / (1.0 if name == "restitution" else u.params[name])
     return {f"dq/d{name}": Seen(found[name], of(name)) for name in free}
 

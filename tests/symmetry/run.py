@@ -22,8 +22,6 @@ from questions import QUESTIONS  # noqa: E402
 from transform import NUMBERS, drawn_units  # noqa: E402
 from variants import VARIANTS, applies, variant  # noqa: E402
 
-SEEDS = 8  # of systems; units have seeds without end
-
 
 def case_of(kind: str, n: int, seed: int) -> Case:
     """A random system with n coordinates, or a machine, of which there is one."""
@@ -58,7 +56,7 @@ def moves_with(question: str, which: str) -> bool:
 def numbers(question, kind, n, count, args):
     """Each system in other units, as (transformation, which system, which units, what does not follow)."""
     which = [name for name in args.which if name in NUMBERS and moves_with(question, name)]
-    seeds = 1 if kind in MACHINES else min(SEEDS, -(-count // max(1, len(which))))
+    seeds = 1 if kind in MACHINES else min(args.systems, -(-count // max(1, len(which))))
     cases = [case_of(kind, n, seed) for seed in range(seeds)]
     for i in range(count if which else 0):
         name, system = which[i % len(which)], i // len(which) % len(cases)
@@ -71,7 +69,7 @@ def programs(question, kind, n, args):
     if question not in ("acceleration", "motion"):
         return
     for name in (name for name in args.which if name in VARIANTS and applies(name, kind)):
-        for system in range(1 if kind in MACHINES else args.systems):
+        for system in range(1 if kind in MACHINES else min(args.systems, 3)):
             case = case_of(kind, n, system)
             yield name, f"system {system}", variant_misses(case, variant(name, case), question)
 
@@ -83,7 +81,7 @@ def main():
     parser.add_argument("--kinds", nargs="+", default=[*KINDS, *MACHINES])
     parser.add_argument("--which", nargs="+", default=[*NUMBERS, *VARIANTS])
     parser.add_argument("--sizes", nargs="+", type=int, default=[2, 3, 5, 8])
-    parser.add_argument("--systems", type=int, default=3, help="how many of a kind are stated otherwise")
+    parser.add_argument("--systems", type=int, default=8, help="how many of a kind, each compiled; three at most are stated otherwise")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--minutes", type=float, default=np.inf, help="after which no other kind is begun")
     parser.add_argument("--verbose", action="store_true")

@@ -21,6 +21,7 @@ def posed(kind, seed=0, n=2):
     return in_units(case), inputs_of(case, plain(case)), allowed
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["smooth", "dry", pytest.param("contact", marks=pytest.mark.slow)])
 def test_a_motion_cut_and_continued(kind):
     system, i, allowed = posed(kind)
@@ -34,6 +35,7 @@ def test_a_motion_cut_and_continued(kind):
             np.testing.assert_allclose(rest.work()[name], work[CUT:] - work[CUT], rtol=0, atol=2 * allowed[f"W {name}"])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["smooth", "dry"])
 def test_a_motion_at_fewer_samples(kind):
     system, i, allowed = posed(kind)
@@ -44,6 +46,7 @@ def test_a_motion_at_fewer_samples(kind):
         np.testing.assert_array_equal(fewer.stats["transitions"], whole.stats["transitions"][np.array([0, 3, 16])])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(3))
 def test_a_motion_backwards(seed):
     """Where nothing dissipates or drives, it comes back with the opposite velocity."""
