@@ -86,7 +86,7 @@ def _number(text: str | None, where: str) -> float:
     raise ValueError(f"{where} must be a finite number, but is {text or ''!r}. Correct it or drop the sample.")
 
 
-def _table(fit: jl.Fit, true: dict[str, float] | None) -> str:
+def _table(fit: jl.results.Fit, true: dict[str, float] | None) -> str:
     """Estimates with standard errors and, where the true values are known, their errors."""
     rows = [f"{'':3}{'value':>12}{'std. error':>12}" + (f"{'true':>10}{'off by (std. errors)':>22}" if true else "") + "   unit"]
     for name, value in fit.estimates.items():

@@ -4,6 +4,7 @@ from typing import Any
 
 import numpy as np
 
+from ._draw.animate import animate
 from ._draw.axes import COLOURS as COLOURS
 from ._draw.axes import pyplot
 from ._draw.fit import convergence, fit, parameters
@@ -16,6 +17,7 @@ from ._paper.linearised_result import LinearisedEquations
 from ._paper.result import Equations
 
 __all__ = [
+    "animate",
     "balance",
     "bode",
     "convergence",

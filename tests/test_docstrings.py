@@ -24,13 +24,16 @@ import numpy as np
 import pytest
 
 import jaxlag
-from jaxlag import dissipation, learnt, plot, rigid
+from jaxlag import direction, dissipation, interpolation, learnt, plot, results, rigid
 
 
 def _public_names():
     """Functions and classes by the names that a user writes behind `jaxlag.`"""
     homes = {
         "": vars(jaxlag),
+        "results.": vars(results),
+        "direction.": vars(direction),
+        "interpolation.": vars(interpolation),
         "dissipation.": vars(dissipation),
         "learnt.": vars(learnt),
         "plot.": {n: getattr(plot, n) for n in plot.__all__},

@@ -61,7 +61,6 @@ WINGS = {  # each imports only from those above it, and each file of a wing only
     ],
     "_model": [
         "user_errors",
-        "deprecation",
         "injection",
         "pickling",
         "paths",
@@ -276,7 +275,7 @@ WINGS = {  # each imports only from those above it, and each file of a wing only
     ],
 }
 BESIDE = ["dissipation", "learnt", "rigid"]  # need nothing of the package
-ON_TOP = ["plot", "__init__", "__main__"]  # import from any wing
+ON_TOP = ["plot", "results", "direction", "interpolation", "__init__", "__main__"]  # import from any wing
 
 
 HOMES = [

@@ -41,11 +41,10 @@ def test_its_outputs_are_stored_and_small(file):
 def test_it_ends_with_what_was_learnt_and_a_link_to_the_documentation(file):
     last = nbformat.read(file, as_version=4).cells[-1]
     assert last.cell_type == "markdown" and last.source.startswith("## What was learnt\n")
-    links = re.findall(r"\]\((\S+?)#(\S+?)\)", last.source)
+    links = re.findall(r"\]\((\.\./docs/pages/\S+?)\)", last.source)
     assert links
-    for page, section in links:
-        headings = re.findall(r"^#+ (.*)$", (FOLDER / page).read_text(), re.M)
-        assert section in {re.sub(r"[^\w\- ]", "", heading).lower().replace(" ", "-") for heading in headings}, section
+    for page in links:
+        assert (FOLDER / page).exists(), page
 
 
 @pytest.mark.slow

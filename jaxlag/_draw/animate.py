@@ -73,11 +73,12 @@ def animate(
     ```python
     import jax.numpy as jnp
     import jaxlag as jl
+    from jaxlag import plot
     from jaxlag.examples import pendulum
     start = pendulum.cartesian_state(2.0, 0.0, 1.0)
     trajectory = jl.simulate(pendulum.cartesian, *start, jnp.linspace(0.0, 2.0, 101), pendulum.params)
     bob = lambda q: (q["x"], q["y"])
-    moving = jl.animate(trajectory, {"bob": bob}, [((0.0, 0.0), "bob")], forces={"rod": "bob"}, units={"x": "m", "rod": "N"})
+    moving = plot.animate(trajectory, {"bob": bob}, [((0.0, 0.0), "bob")], forces={"rod": "bob"}, units={"x": "m", "rod": "N"})
     moving.frames  # 51
     ```
     """

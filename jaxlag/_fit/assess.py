@@ -220,7 +220,7 @@ class Comparison:
 
     ```python
     import jaxlag as jl
-    table = jl.Comparison(("a", "b"), {"a": 0.0, "b": 9.0}, {"a": 0.0, "b": 7.0}, {"a": 1, "b": 2}, 0)
+    table = jl.results.Comparison(("a", "b"), {"a": 0.0, "b": 9.0}, {"a": 0.0, "b": 7.0}, {"a": 1, "b": 2}, 0)
     table.names[0]  # a
     ```
     """

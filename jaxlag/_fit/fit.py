@@ -10,7 +10,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import PyTree
 
-from .._model.deprecation import renamed
 from .._model.numbers import count
 from .._model.system import System
 from .._model.validation import without_contacts, without_events
@@ -97,7 +96,6 @@ def fit(
     jl.fit(oscillator, record, {"c": 3.0}, free=("c",)).estimates["c"]  # 4.0
     ```
     """
-    segments = renamed(segments, "segments", pieces=numerics.pop("pieces", None))
     segments = count(segments, "`segments`", cure="Use 1 for single shooting, some tens for a long or chaotic record.")
     starts = count(starts, "`starts`", cure="Use 1 for a single start, some tens for a poor initial guess.")
     if (segments > 1) + (method is not None) + (starts > 1) + (start is not None) > 1:

@@ -28,7 +28,7 @@ class Interval(NamedTuple):
 
     ```python
     import jaxlag as jl
-    interval = jl.Interval(lower=3.9, upper=4.1)
+    interval = jl.results.Interval(lower=3.9, upper=4.1)
     interval.upper  # 4.1
     ```
     """

@@ -4,9 +4,12 @@ import functools
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import lineax as lx
+import numpy as np
+from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float
 
 from .._program.conditions import halved
@@ -15,7 +18,9 @@ from .._program.size_of_terms import size_of_terms
 from .._program.sparse_matrix import SparseMatrix
 
 ITERATIONS = 100
+ROUNDING = 64  # eps, of Jacobians
 TIES = 8  # unknowns that a unit is handed on through: a state that follows a state that follows a coordinate
+NO_FORCES = np.zeros(0)
 Residual = Callable[[Any, Float[Array, " u"]], Float[Array, " r"]]  # R(args, w)
 
 
@@ -28,13 +33,20 @@ class Root(NamedTuple):
 
 
 def root_near(
-    residual: Residual, args: Any, guess: Float[Array, " u"], units: Float[Array, " u"], ease: Float[Array, " u"] | float = 1.0
+    residual: Residual,
+    args: Any,
+    guess: Float[Array, " u"],
+    units: Float[Array, " u"],
+    forces_on: Float[Array, " f"],
+    ways: int,
+    ease: Float[Array, " u"] | float = 1.0,
 ) -> Root:
     """The root that Newton's method finds from a guess; of several that nothing decides between, the nearest in these `units`, where to
-    move one unknown costs less the greater its `ease`. Those whose unit is zero take it from the others: `units_beside`.
+    move one unknown costs less the greater its `ease`. Those whose unit is zero take it from the others: `units_beside`. `forces_on`:
+    units of the coordinates whose forces the first equations are; behind the first `ways` unknowns come forces, as multipliers are.
     """
     fixed, guess = jax.lax.stop_gradient((args, guess))
-    slope = lambda w: jax.jacfwd(residual, 1)(fixed, w)
+    slope = lambda w: _felt(jax.jacfwd(residual, 1)(fixed, w), forces_on, units)
     units = jax.lax.stop_gradient(units_beside(slope(guess), units))
     of = jnp.where(units > 0, units, 1)
 
@@ -42,8 +54,31 @@ def root_near(
         J = slope(w)
         return lambda w: -least_change(J, residual(fixed, w), ease * of)
 
-    w, reach = newton(changes, guess, units)
-    return root_of_size(lambda w: residual(fixed, w), slope(w), w, reach)._replace(w=differentiable_root(residual, args, w, of))
+    w, reach = newton(changes, guess, units, ways)
+    J, terms = slope(w), _terms(residual, fixed, w)
+    reach = jnp.where(units > 0, reach, jnp.maximum(reach, _reach_of_forces(J[: forces_on.size], terms[: forces_on.size], forces_on)))
+    root = root_of_size(residual(fixed, w), J, terms, w, reach)
+    return root._replace(w=differentiable_root(residual, args, w, of, forces_on))
+
+
+def _terms(residual: Residual, args: Any, w: Float[Array, " u"]) -> Float[Array, " r"]:
+    """What cancels in the equations at w, also of what args alone decide."""
+    numbers, others = eqx.partition(args, eqx.is_inexact_array)
+    given, unravel = ravel_pytree((numbers, w))
+
+    def of_all(given):
+        numbers, w = unravel(given)
+        return residual(eqx.combine(numbers, others), w)
+
+    return size_of_terms(of_all, given)
+
+
+def _reach_of_forces(J: Float[Array, "f u"], terms: Float[Array, " f"], units: Float[Array, " f"]) -> Float[Array, " u"]:
+    """Of what is in forces alone, as multipliers are: what cancels in the forces it is in, where it weighs most."""
+    share = units[:, None] * jnp.abs(J)
+    weight = jnp.max(share, axis=0, initial=0.0)
+    cancels = jnp.max(jnp.where(share > 0, (units * terms)[:, None], 0), axis=0, initial=0.0)
+    return jnp.where(weight > 0, cancels / jnp.where(weight > 0, weight, 1), 0)
 
 
 def units_beside(J: Float[Array, "r u"], units: Float[Array, " u"]) -> Float[Array, " u"]:
@@ -61,14 +96,28 @@ def units_beside(J: Float[Array, "r u"], units: Float[Array, " u"]) -> Float[Arr
     return jax.lax.fori_loop(0, min(TIES, units.size), turn, units.astype(J.dtype))
 
 
+def _felt(J: Float[Array, "r u"], forces_on: Float[Array, " f"], units: Float[Array, " u"]) -> Float[Array, "r u"]:
+    """J `without_rounding`, where its first rows are forces."""
+    return without_rounding(J, jnp.pad(forces_on, (0, len(J) - forces_on.size))[:, None], units[None])
+
+
+def without_rounding(J: Array, of_rows: Array, of_columns: Array) -> Array:
+    """Entries of a Jacobian, in any form, but 0 where a force changes with an unknown by rounding alone, beside the largest that another
+    does: no equation follows from what is zero by symmetry. In these units of its rows and columns, all are energies.
+    """
+    energies = jnp.abs(J) * of_rows * of_columns
+    return jnp.where((energies > 0) & (energies <= ROUNDING * jnp.finfo(J.dtype).eps * jnp.max(energies, initial=0.0)), 0, J)
+
+
 def newton(
-    changes: Callable[[Array], Callable[[Array], Array]], guess: Float[Array, " u"], units: Float[Array, " u"]
+    changes: Callable[[Array], Callable[[Array], Array]], guess: Float[Array, " u"], units: Float[Array, " u"], ways: int
 ) -> tuple[Float[Array, " u"], Float[Array, " u"]]:
     """Where Newton's method comes to rest, and the reach of each unknown, of which some eps are rounding; `changes(w)` is
     w' ↦ −J(w)⁻¹ R(w').
 
     A step is halved until the step that would follow it is shorter: a test that does not depend on the units of R or w. In these `units`
-    the reach is the largest unknown, at the start or now; where a unit is 0, it is its own. What is nothing beside the start is zero.
+    the reach is the largest of the first `ways` unknowns, at the start or now, and at least that of each itself: forces, that constraints
+    which contradict each other make as large as may be, say nothing of how far a state may reach. What is nothing beside the start is zero.
 
     Source: Deuflhard, Newton Methods for Nonlinear Problems, section 3.3.2 (natural monotonicity test).
     """
@@ -76,7 +125,8 @@ def newton(
 
     def reach(w):
         largest = jnp.maximum(jnp.abs(w), jnp.abs(guess))
-        return jnp.where(known, units * jnp.max(jnp.where(known, largest / jnp.where(known, units, 1), 0), initial=0.0), largest)
+        shares = jnp.where(known, largest / jnp.where(known, units, 1), 0)
+        return jnp.maximum(largest, units * jnp.max(shares[:ways], initial=0.0))
 
     def length(step, w):
         return jnp.max(jnp.where(step == 0, 0, jnp.abs(step) / reach(w)), initial=0.0)
@@ -103,10 +153,10 @@ def newton(
     return w, reach(w)
 
 
-def root_of_size(residual: Callable[[Array], Array], J: Array | SparseMatrix, w: Array, reach: Array) -> Root:
+def root_of_size(R: Array, J: Array | SparseMatrix, terms: Array, w: Array, reach: Array) -> Root:
     """Whether w is a root: what is left is rounding beside the terms that cancel, or what a change of w by rounding brings about."""
-    size = abs(J) @ reach + size_of_terms(residual, w)
-    return Root(w, jnp.all(jnp.isfinite(w)) & is_nothing(residual(w), size), size)
+    size = abs(J) @ reach + terms
+    return Root(w, jnp.all(jnp.isfinite(w)) & is_nothing(R, size), size)
 
 
 def is_nothing(R: Float[Array, " r"], size: Float[Array, " r"]) -> Bool[Array, ""]:
@@ -114,15 +164,19 @@ def is_nothing(R: Float[Array, " r"], size: Float[Array, " r"]) -> Bool[Array, "
     return jnp.all(jnp.abs(R) <= jnp.finfo(R.dtype).eps ** 0.5 * size)
 
 
-def differentiable_root(residual: Residual, args: Any, w: Float[Array, " u"], units: Float[Array, " u"]) -> Float[Array, " u"]:
-    """w, which depends on args as R(args, w) = 0 says; of several ways to change with them, by the shortest in these units."""
+def differentiable_root(
+    residual: Residual, args: Any, w: Float[Array, " u"], units: Float[Array, " u"], forces_on: Float[Array, " f"] = NO_FORCES
+) -> Float[Array, " u"]:
+    """w, which depends on args as R(args, w) = 0 says; of several ways to change with them, by the shortest in these units. `forces_on` as
+    of `root_near`.
+    """
     in_units = lambda given, w: residual(given[0], w)
-    return implicit_root(in_units, functools.partial(_change, residual), (args, units), w)
+    return implicit_root(in_units, functools.partial(_change, residual), (args, units, forces_on), w)
 
 
 def _change(residual, given, w, R):
-    args, units = given
-    return -least_change(jax.jacfwd(residual, 1)(args, w), R, units)
+    args, units, forces_on = given
+    return -least_change(_felt(jax.jacfwd(residual, 1)(args, w), forces_on, units), R, units)
 
 
 def least_change(J: Float[Array, "r u"], R: Float[Array, " r"], scale: Any) -> Float[Array, " u"]:

@@ -125,7 +125,7 @@ def periodic(
     ```python
     import jax, jax.numpy as jnp
     import jaxlag as jl
-    top = jl.Event(lambda qdot: qdot, direction=jl.Falling())
+    top = jl.Event(lambda qdot: qdot, direction=jl.direction.Falling())
     oscillator = jl.System(  # van der Pol's
         lambda q, qdot: 0.5 * qdot**2 - 0.5 * q**2, force=lambda q, qdot, mu: mu * (1 - q**2) * qdot
     )
@@ -162,7 +162,7 @@ def _given(section, longest, t, dtype):
     if not isinstance(section, (Event, Every)) or (isinstance(section, Event) and not callable(section.when)):
         raise TypeError(
             f"`section` must be an `Event` with a function, or `Every(period)`, but is {section!r}. "
-            "Write e.g. `jl.Event(lambda qdot: qdot, direction=jl.Falling())`."
+            "Write e.g. `jl.Event(lambda qdot: qdot, direction=jl.direction.Falling())`."
         )
     t = number(t, "`t`", dtype, cure="Pass one time.")
     if isinstance(section, Every):

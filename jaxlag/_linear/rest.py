@@ -177,7 +177,7 @@ def steady_state(search: Search, system: System, t: Any, q: PyTree, qdot: PyTree
         J = jax.jacfwd(equations, 1)(jax.lax.stop_gradient(given), guess)
         given = given._replace(open=left_open(J, equations.sizes[0] + np.arange(len(search.running))))
     known = jnp.zeros_like(ease).at[: equations.moving.size].set(units[equations.moving])
-    return _described(equations, given, root_near(equations, given, guess, known, ease))
+    return _described(equations, given, root_near(equations, given, guess, known, units, int(equations.sizes[2]), ease))
 
 
 def _units(M: Float[Array, "n n"]) -> Float[Array, " n"]:

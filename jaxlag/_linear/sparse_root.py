@@ -13,10 +13,11 @@ from .._program.array_dependence import dependence
 from .._program.expressions import TooLong
 from .._program.implicit import implicit_root
 from .._program.shifted_factors import GROWTH
+from .._program.size_of_terms import size_of_terms
 from .._program.sparse_jacobian import entries
 from .._program.sparse_matrix import Places, SparseMatrix, colors
 from .._program.sparse_newton import linear_solution, newton_factors, refined, sparse_places
-from .newton import Residual, Root, newton, root_of_size
+from .newton import Residual, Root, newton, root_of_size, without_rounding
 
 BY_VALUES = 2  # as sparse as is of use: the dense search finds singular values of all by all, at twenty times the cost of factors
 
@@ -30,6 +31,7 @@ class SparseEquations:
     residual: Residual
     places: Places
     alone: np.ndarray
+    ways: int  # how many unknowns are not multipliers
 
     @classmethod
     def of(cls, residual: Residual, args: Any, w: Float[Array, " u"], last: int) -> "SparseEquations | None":
@@ -40,7 +42,7 @@ class SparseEquations:
             return None
         coupled = (np.diff(pattern.indptr) > 0) | (np.diff(scipy.sparse.csc_matrix(pattern).indptr) > 0)
         places = sparse_places(pattern, last, BY_VALUES)
-        return None if places is None else cls(residual, places, (~coupled).astype(float))
+        return None if places is None else cls(residual, places, (~coupled).astype(float), last)
 
     def jacobian(self, args: Any, w: Float[Array, " u"]) -> SparseMatrix:
         """J, with zeros for what is alone."""
@@ -78,16 +80,18 @@ def sparse_root_near(equations: SparseEquations, args: Any, guess: Float[Array, 
         factors = newton_factors(A)
         return lambda w: refined(A.__matmul__, A.places, factors, -equations.oriented(equations.residual(fixed, w)))
 
-    w, reach = newton(changes, jax.lax.stop_gradient(guess), sparse_units_beside(equations.jacobian(fixed, guess), units))
+    units = sparse_units_beside(equations.jacobian(fixed, guess), units)
+    w, reach = newton(changes, jax.lax.stop_gradient(guess), units, equations.ways)
     J = equations.jacobian(fixed, w)
-    root = root_of_size(lambda w: equations.residual(fixed, w), J, w, reach)
+    residual = lambda w: equations.residual(fixed, w)
+    root = root_of_size(residual(w), J, size_of_terms(residual, w), w, reach)
     return root._replace(found=root.found & is_regular(equations.matrix(J)))
 
 
 def sparse_units_beside(J: SparseMatrix, units: Float[Array, " u"]) -> Float[Array, " u"]:
     """`units_beside` of a sparse matrix: multipliers have theirs from what they hold."""
     (m, n), rows, columns = J.shape, J.places.rows, J.places.columns
-    size = jnp.abs(J.values)
+    size = jnp.abs(without_rounding(J.values, units[rows], units[columns]))
     known = jnp.maximum(jax.ops.segment_max(size * units[columns], rows, m, indices_are_sorted=True), 0)[rows]
     ties = (size > 0) & (known > 0)
     found = jax.ops.segment_min(jnp.where(ties, known / jnp.where(ties, size, 1), jnp.inf), columns, n)

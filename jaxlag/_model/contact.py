@@ -9,12 +9,12 @@ from .numbers import number
 
 
 @dataclasses.dataclass(frozen=True)
-class Newton:
+class NewtonRestitution:
     """Newton's law of restitution: a contact departs e times as fast as it approached."""
 
 
 @dataclasses.dataclass(frozen=True)
-class Poisson:
+class PoissonRestitution:
     """Poisson's law of restitution: in the expansion that follows the compression, a contact gives back e times the impulse of that."""
 
 
@@ -27,9 +27,9 @@ class Contact:
 
     **Arguments:** `gap`: g(t, q), a real number, the distance to the obstacle; negative inside of it. `restitution`: e from 0 to 1, a
     number, or a function of `params`, their entries and `speed`, the rate −ġ⁻ of approach. What is beyond 0 and 1 counts as these.
-    `law`: `Newton()`, the one above, or `Poisson()`: an impact with e = 0, the compression, and then one in which the contact gives back
-    Λ ≥ e Λᶜ. They differ where impacts are coupled by friction or other contacts; Poisson's gives a contact that does not approach none
-    of the restitution of others. Any consistent units.
+    `law`: `NewtonRestitution()`, the one above, or `PoissonRestitution()`: an impact with e = 0, the compression, and then one in which the
+    contact gives back Λ ≥ e Λᶜ. They differ where impacts are coupled by friction or other contacts; Poisson's gives a contact that does
+    not approach none of the restitution of others. Any consistent units.
 
     The impacts of several contacts at one time, and the contacts that are closed already, follow Moreau's law: all at once, as one
     complementarity problem. A system takes contacts by name: `System(..., unilateral={"table": Contact(gap, restitution=0.8)})`.
@@ -53,11 +53,11 @@ class Contact:
 
     gap: Callable
     restitution: Any = 0.0
-    law: Newton | Poisson = Newton()
+    law: NewtonRestitution | PoissonRestitution = NewtonRestitution()
 
     def __post_init__(self):
-        if not isinstance(self.law, (Newton, Poisson)):
-            raise TypeError(f"`law` must be `Newton()` or `Poisson()`, but is {self.law!r}. Take one of these.")
+        if not isinstance(self.law, (NewtonRestitution, PoissonRestitution)):
+            raise TypeError(f"`law` must be `NewtonRestitution()` or `PoissonRestitution()`, but is {self.law!r}. Take one of these.")
         check_function(self.gap, "`gap`")
         if callable(self.restitution):
             check_function(self.restitution, "`restitution`")

@@ -65,7 +65,8 @@ class Event:
       leave out what stays. It receives what `when` does, but for the multipliers. Default: nothing, the event is recorded. What it is to
       change of the params is stated as a state that stays, e.g. `State(lambda: 0.0, start=1.0)`.
     - `stop`: whether the motion ends there. Samples behind are NaN, and the motion is a success.
-    - `direction`: `Falling()`, `Rising()`, `Either()`, the default, or `Negative()`, as `Falling()` and at the start, too.
+    - `direction`: one of `jaxlag.direction`: `Falling()`, `Rising()`, `Either()`, the default, or `Negative()`, as `Falling()` and at the
+      start, too.
     - `most`: how many are recorded; one more ends the motion with that reason.
 
     The time is located to rounding, and differentiated exactly, as is what `then` returns, which is put on the constraints and outside of
@@ -85,7 +86,7 @@ class Event:
     ```python
     import jax.numpy as jnp
     import jaxlag as jl
-    turning = jl.Event(lambda qdot: qdot, direction=jl.Falling())
+    turning = jl.Event(lambda qdot: qdot, direction=jl.direction.Falling())
     swing = jl.System(lambda q, qdot, c: 0.5 * qdot**2 - 0.5 * c * q**2, events={"turn": turning})
     motion = jl.simulate(swing, 0.0, 1.0, jnp.linspace(0, 10, 11), {"c": 4.0})
     motion.events["turn"].ts[:3]  # π/4 + k π = [0.785, 3.927, 7.069]
@@ -107,7 +108,7 @@ class Event:
             check_function(self.then, "`then`")
         if not isinstance(self.direction, (Falling, Rising, Either, Negative)):
             raise TypeError(
-                f"`direction` must be `Falling()`, `Rising()`, `Either()` or `Negative()`, but is {self.direction!r}. Take one of these."
+                f"`direction` must be one of `jaxlag.direction`, but is {self.direction!r}. Take `jaxlag.direction.Falling()`, say."
             )
         if self.direction != Either() and not callable(self.when):
             raise ValueError(

@@ -12,7 +12,7 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float, PyTree
 
 from .._program.sparse_jacobian import empty_rows
-from .contact import Poisson
+from .contact import PoissonRestitution
 from .event import Every, merged
 from .injection import asks_for, call, described, needs
 from .signal import at_time, origin_of
@@ -89,7 +89,7 @@ def bind(system: System, like: PyTree, params: PyTree, states: StatesAt | None =
         events_need_multipliers=any(callable(event.when) and asks_for(event.when, "multipliers") for _, event in system.events),
         holonomic_names=tuple(name for name, _ in (*system.holonomic, *system.unilateral)),
         contacts=tuple(name for name, _ in system.unilateral),
-        poisson=tuple(isinstance(law, Poisson) for _, law in system.laws),
+        poisson=tuple(isinstance(law, PoissonRestitution) for _, law in system.laws),
         terms=system.terms,
         rows=bound.rows,
         rows_of_bilateral=bound.rows_of_bilateral,

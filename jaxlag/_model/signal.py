@@ -10,12 +10,9 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Float, PyTree
 
 from .._program.jit import is_concrete
-from .deprecation import warn_renamed
 from .numbers import number, numbers
-from .signal_interpolation import AbstractInterpolation, Cubic, Linear, ZeroOrderHold, second_derivatives
+from .signal_interpolation import AbstractInterpolation, ZeroOrderHold, second_derivatives
 from .states import Flowing
-
-OLD_KINDS = {"hold": ZeroOrderHold(), "linear": Linear(), "cubic": Cubic()}
 
 
 class Signal(eqx.Module):
@@ -39,8 +36,7 @@ class Signal(eqx.Module):
     - `ts`: the sample times, increasing, at least two, shape (T,). Under `vmap` pad a shorter signal with its last time and value.
     - `values`: one scalar, vector or array for each time, shape (T, ...); u(t) has their precision. Any consistent units.
     - `delay`: a time by which u comes later than its samples, u(t) = u_i for t_i ≤ t − delay; may be free in a fit.
-    - `interpolation`: `ZeroOrderHold()`, the default, `Linear()` or `Cubic()`. Its old spelling, `kind="hold"`, `"linear"` or `"cubic"`,
-      gives a `DeprecationWarning`.
+    - `interpolation`: `jaxlag.interpolation.ZeroOrderHold()`, the default, `Linear()` or `Cubic()`.
 
     **Fields:** `ts`, `values`, `delay` and `interpolation` as given; `times`: `ts` with the delay; `second_derivatives`: u'' at the samples
     of a cubic signal, shape (T, ...), which `simulate` computes once per motion; otherwise None.
@@ -76,10 +72,9 @@ class Signal(eqx.Module):
         interpolation: Any = ZeroOrderHold(),  # an `AbstractInterpolation`: `_interpolation` checks it
         *,
         delay: Any = 0.0,
-        kind: str | None = None,
     ):
         ts, values = numbers(ts, "`ts`"), numbers(values, "`values`")
-        self.interpolation = _interpolation(interpolation if kind is None else kind)
+        self.interpolation = _interpolation(interpolation)
         _check(ts, values)
         self.ts, self.values, self.second_derivatives = jnp.asarray(ts), jnp.asarray(values), None
         self.delay = jnp.asarray(number(delay, "`delay`", ts.dtype, cure="Give one time, by which all samples are later."))
@@ -95,28 +90,12 @@ class Signal(eqx.Module):
         """When u has its values: the sample times and the delay."""
         return self.ts + self.delay
 
-    @property
-    def kind(self) -> str:
-        """The old name of the interpolation."""
-        warn_renamed("Signal.kind", "Signal.interpolation")
-        return next(kind for kind, interpolation in OLD_KINDS.items() if interpolation == self.interpolation)
-
-    @property
-    def bends(self) -> Float[Array, "T ..."] | None:
-        """The old name of `second_derivatives`."""
-        warn_renamed("Signal.bends", "Signal.second_derivatives")
-        return self.second_derivatives
-
 
 def _interpolation(given: Any) -> AbstractInterpolation:
-    """An interpolation, or what an old string stands for."""
-    if isinstance(given, str) and given in OLD_KINDS:
-        new = OLD_KINDS[given]
-        warn_renamed(f"kind={given!r}", f"interpolation=jaxlag.{new!r}")
-        return new
+    """An interpolation."""
     if not isinstance(given, AbstractInterpolation):
         raise TypeError(
-            f"`interpolation` must be `ZeroOrderHold()`, `Linear()` or `Cubic()`, but is {given!r}. Take `ZeroOrderHold()` if in doubt."
+            f"`interpolation` must be one of `jaxlag.interpolation`, but is {given!r}. If in doubt, take its `ZeroOrderHold()`."
         )
     return given
 

@@ -32,7 +32,7 @@ class ZeroOrderHold(AbstractInterpolation):
 
     ```python
     import jaxlag as jl
-    u = jl.Signal([0.0, 1.0, 2.0], [1.0, -1.0, 0.0], jl.ZeroOrderHold())
+    u = jl.Signal([0.0, 1.0, 2.0], [1.0, -1.0, 0.0], jl.interpolation.ZeroOrderHold())
     u(0.75)  # 1.0
     u(1.0)  # -1.0
     ```
@@ -57,7 +57,7 @@ class Linear(AbstractInterpolation):
 
     ```python
     import jaxlag as jl
-    u = jl.Signal([0.0, 1.0, 2.0], [1.0, -1.0, 0.0], jl.Linear())
+    u = jl.Signal([0.0, 1.0, 2.0], [1.0, -1.0, 0.0], jl.interpolation.Linear())
     u(0.75)  # -0.5
     ```
     """
@@ -82,7 +82,7 @@ class Cubic(AbstractInterpolation):
 
     ```python
     import jaxlag as jl
-    u = jl.Signal([0.0, 1.0, 2.0], [1.0, -1.0, 0.0], jl.Cubic())
+    u = jl.Signal([0.0, 1.0, 2.0], [1.0, -1.0, 0.0], jl.interpolation.Cubic())
     u(0.75)  # -0.7461
     ```
     """

@@ -4,7 +4,7 @@ import dataclasses
 from collections.abc import Callable, Collection, Mapping
 from typing import Any
 
-from .contact import Contact, Newton, Poisson
+from .contact import Contact, NewtonRestitution, PoissonRestitution
 from .event import Event, events_of
 from .injection import check_function, needs
 from .pickling import picklable, unpickled
@@ -81,7 +81,7 @@ class System:
     unilateral: Terms
     nonholonomic: Terms
     restitution: tuple[tuple[str, Any], ...]
-    laws: tuple[tuple[str, Newton | Poisson], ...]
+    laws: tuple[tuple[str, NewtonRestitution | PoissonRestitution], ...]
     one_sided: tuple[str, ...]
     states: Named
     events: tuple[tuple[str, Event], ...]
@@ -168,7 +168,8 @@ class System:
 def _unpickled(references: Any, one_sided: Any, states: Any = None, restitution: Any = None, events: Any = None, laws: Any = ()) -> System:
     slots = {slot: {name: unpickled(f) for name, f in terms.items()} for slot, terms in references.items()}
     laws = dict(laws)
-    contacts = {name: Contact(slots["unilateral"][name], unpickled(e), laws.get(name, Newton())) for name, e in (restitution or {}).items()}
+    law = lambda name: laws.get(name, NewtonRestitution())
+    contacts = {name: Contact(slots["unilateral"][name], unpickled(e), law(name)) for name, e in (restitution or {}).items()}
     return System(**slots | {"unilateral": contacts}, one_sided=one_sided, states=states, events=events)
 
 

@@ -9,7 +9,6 @@ from jaxtyping import Array, PyTree
 
 from .._mechanics.friction_treatment import Regularised, StickSlip
 from .._mechanics.projection import Baumgarte, NoStabilisation, Projection
-from .._model.deprecation import renamed
 from .._model.event import Event
 from .._model.state_values import given_states
 from .._model.system import System
@@ -47,7 +46,6 @@ def simulate(
     works: bool = False,
     progress: bool = False,
     throw: bool = True,
-    audit: bool | None = None,
 ) -> Trajectory:
     r"""The motion of a system from an initial state, at the times `ts`.
 
@@ -79,7 +77,6 @@ def simulate(
     - `works`: integrates the work of each term along with the motion, for `Trajectory.work()` and the energy balance.
     - `progress`: shows a progress bar on standard error; in a log, a line now and then. Says so where compilation takes long.
     - `throw`: whether a failure raises. If not, or under `jit`, `Trajectory.result` holds the reason, and samples not reached are NaN.
-    - `audit`: deprecated name of `works`.
 
     **Returns:** a `Trajectory`; each of its fields has the samples, T, as its first axis.
 
@@ -96,7 +93,6 @@ def simulate(
     jax.grad(lambda c: jl.simulate(oscillator, 1.0, 0.0, jnp.linspace(0, 10, 11), {"c": c}).q[-1])(4.0)  # −(10/4) sin 20 = −2.28
     ```
     """
-    works = renamed(works, "works", audit=audit)
     system = system if events is None else system.with_events(events)
     given = state_and_params(q0, qdot0, params, ("q0", "qdot0"))
     options = SolverOptions.of(solver, Formulation(stabilisation, friction, works), max_steps, adjoint, progress)

@@ -14,7 +14,6 @@ from jaxtyping import Array, PyTree
 
 from .._mechanics.friction_treatment import Regularised, StickSlip
 from .._mechanics.projection import Baumgarte, NoStabilisation, Projection
-from .._model.deprecation import renamed
 from .._model.event import Event
 from .._model.flat import StatesAt
 from .._model.paths import is_within, leaf_names, listed
@@ -58,7 +57,6 @@ def simulate_many(
     friction: StickSlip | Regularised = StickSlip(),
     max_steps: int = 100_000,
     throw: bool = True,
-    steps: str | None = None,
 ) -> Trajectory:
     r"""The motions of many machines that differ in their parameters or in their starts.
 
@@ -77,7 +75,6 @@ def simulate_many(
       axis of all arithmetic: many times as fast as one by one. False lets each member take its own. Default: True, but False where there
       is dry friction, a contact, an event or a measured input that jumps, or bends and drives a constraint: these end steps at times
       that differ. Where one of 64 cannot go on, all stop: `common_steps=False` then says which.
-    - `steps`: deprecated; "common" is now `common_steps=True`, "own" `common_steps=False`.
 
     **Returns:** a `Trajectory`; each of its fields has the B members as its first axis, the samples as its second.
 
@@ -101,7 +98,8 @@ def simulate_many(
     own, shared = eqx.partition(everything, _differing(everything, listed(over, "over")))
     dtype = jnp.result_type(*jax.tree.leaves((everything["q0"], everything["qdot0"])))
     options = SolverOptions.of(solver, Formulation(stabilisation, friction), max_steps)
-    common_steps = _choice_of_steps(common_steps, steps)
+    if common_steps not in (None, True, False):
+        raise ValueError(f"`common_steps` must be True or False, but is {common_steps!r}. Leave it out to have it chosen.")
     like = eqx.combine(jax.tree.map(lambda leaf: np.zeros(leaf.shape[1:], leaf.dtype), own["q0"]), shared["q0"])
     check_agreement(**everything, ts=ts)
     tolerances = tolerances_of(rtol, atol, like)
@@ -109,15 +107,6 @@ def simulate_many(
     if throw:
         raise_failure(trajectory)
     return trajectory
-
-
-def _choice_of_steps(common_steps, steps):
-    if steps not in (None, "common", "own"):
-        raise ValueError(f'`steps` must be "common" or "own", but is {steps!r}. Write `common_steps=True` or `common_steps=False`.')
-    common_steps = renamed(common_steps, "common_steps", steps=None if steps is None else steps == "common")
-    if common_steps not in (None, True, False):
-        raise ValueError(f"`common_steps` must be True or False, but is {common_steps!r}. Leave it out to have it chosen.")
-    return common_steps
 
 
 def _differing(everything, over):

@@ -134,7 +134,7 @@ class SparseImplicit(dfx.AbstractImplicitSolver, dfx.AbstractAdaptiveSolver):
             def changed(iteration):
                 u = iteration.u - by_factors(self.places, factors, residual(iteration.u))
                 of_both = (state(u, base) - state(iteration.u, base))[: 2 * n]
-                scale = finder.atol + finder.rtol * jnp.abs(state(u, base)[: 2 * n])
+                scale = (finder.atol + finder.rtol * jnp.abs(state(u, base)))[: 2 * n]
                 return Iteration(u, finder.norm(of_both / scale), iteration.size, iteration.count + 1)
 
             one = jnp.ones((), guess.dtype)

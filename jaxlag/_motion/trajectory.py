@@ -15,7 +15,6 @@ from jaxtyping import Array, Float, PyTree
 
 from .._mechanics.friction_elements import find_elements
 from .._mechanics.power import energy_exchange
-from .._model.deprecation import warn_renamed
 from .._model.flat import StatesAt, bind
 from .._program.jit import compiled, is_concrete
 from .card import card
@@ -230,12 +229,6 @@ class Trajectory(eqx.Module):
 
     def __repr__(self) -> str:
         return card(self)
-
-    @property
-    def stated(self) -> Provenance | Recorded:
-        """Deprecated name of `provenance`."""
-        warn_renamed("stated", "provenance")
-        return self.provenance
 
 
 @compiled  # so that parameters are unknown, as they were in the motion: a friction of 0 is one, too

@@ -7,7 +7,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from sympy import Symbol
 
-from .._model.contact import Poisson
+from .._model.contact import PoissonRestitution
 from .._model.injection import call
 from .._model.system import System
 from .._program.expressions import filled
@@ -27,7 +27,7 @@ def contact_laws(system: System, gaps: list[Any], multipliers: list[Symbol], par
             return jnp.asarray(call(given, f"`restitution` of {name!r}", values, speed=speed) if callable(given) else given, float)
 
         e = formulas(restitution, filled((), [-rate]), params.symbols)[()]
-        found.append(ContactLaw(gap, rate, formula, multiplier, e, isinstance(law, Poisson)))
+        found.append(ContactLaw(gap, rate, formula, multiplier, e, isinstance(law, PoissonRestitution)))
     return tuple(found)
 
 

@@ -6,7 +6,6 @@ from typing import Any, overload
 import jax
 from jaxtyping import PyTree
 
-from .._model.deprecation import warn_renamed
 from .._model.system import System
 from .._model.validation import without_contacts
 from .linearised_result import LinearisedEquations
@@ -24,7 +23,6 @@ def equations(
     positive: str | Collection[str] = (),
     linearised_at: None = None,
     inputs: str | Collection[str] = (),
-    style: str | None = None,
 ) -> Equations: ...
 
 
@@ -38,7 +36,6 @@ def equations(
     positive: str | Collection[str] = (),
     linearised_at: object,
     inputs: str | Collection[str] = (),
-    style: str | None = None,
 ) -> LinearisedEquations: ...
 
 
@@ -51,7 +48,6 @@ def equations(
     positive: str | Collection[str] = (),
     linearised_at: Any = None,
     inputs: str | Collection[str] = (),
-    style: str | None = None,
 ) -> Equations | LinearisedEquations:
     r"""The equations of motion of a system on paper, from the same functions that are simulated.
 
@@ -74,7 +70,6 @@ def equations(
       pair (q, q̇), a steady motion at these constant rates. In a mapping, coordinates may be left out: constraints determine them, or they
       keep their symbols; and parameters may be given beside them, such as a preload `"s": "m*g/c"`. Unknown names are new symbols.
     - `inputs`: with `linearised_at`, names of parameters u that change with time; their deviations stand on the right-hand side.
-    - `style`: the old spelling of `multipliers`: `"first kind"` is `True`, `"second kind"` is `False`.
 
     Contacts follow the equations of motion: g ≥ 0, λ ≥ 0, g λ = 0, and ġ⁺ = −e ġ⁻ in an impact; q̈ and other λ are given by theirs.
     States beside q follow the equations of motion: ż = rate, and u⁺ = update of a sampled one where that has a formula.
@@ -114,8 +109,6 @@ def equations(
     from .simplify import Simplifier
     from .symbol_tree import parameters_in_order, symbol_tree
 
-    if style is not None:
-        multipliers = _from_style(style)
     if linearised_at is not None and multipliers:
         raise ValueError("`multipliers` must be False with `linearised_at`, but is True. Linear equations are in independent coordinates.")
     positive = (positive,) if isinstance(positive, str) else tuple(positive)
@@ -161,14 +154,3 @@ def equations(
         contacts={name: contact.formula for (name, _), contact in zip(system.unilateral, full.contacts, strict=True)},
         _details=details,
     )
-
-
-STYLES = {"second kind": False, "first kind": True}
-
-
-def _from_style(style: str) -> bool:
-    """The `multipliers` of an old `style`."""
-    if style not in STYLES:
-        raise ValueError(f'`style` must be "second kind" or "first kind", but is {style!r}. Write `multipliers=True` or leave it out.')
-    warn_renamed(f'style="{style}"', f"multipliers={STYLES[style]}")
-    return STYLES[style]

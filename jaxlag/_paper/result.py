@@ -11,7 +11,6 @@ import jax
 import numpy as np
 from jaxtyping import PyTree
 
-from .._model.deprecation import warn_renamed
 from .._program.expressions import filled
 
 MOST_OPERATIONS = 150  # of a solution that is still shown
@@ -69,12 +68,6 @@ class Equations:
     eliminated: dict
     contacts: dict
     _details: "Details"
-
-    @property
-    def style(self) -> str:
-        """The old name of `with_multipliers`: "first kind" or "second kind"."""
-        warn_renamed("Equations.style", "Equations.with_multipliers")
-        return "first kind" if self.with_multipliers else "second kind"
 
     @property
     def accelerations(self) -> PyTree:

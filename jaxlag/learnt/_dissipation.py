@@ -93,6 +93,7 @@ class PassiveDissipation(eqx.Module):
 
     $$ D(\dot q) = P\,w\cdot z_K, \qquad z_1 = \mu(\beta_b(A x)), \qquad z_{k+1} = \mu(\rho_{b_k}(W_k z_k)), \qquad
        x = \dot q/\text{scale}, \quad W_k, w \ge 0 $$
+
     $$ \beta_b(\delta) = \sigma(b + \delta) - \sigma(b) - \sigma'(b)\,\delta, \qquad \rho_b(y) = \sigma(b + y) - \sigma(b), \qquad
        \mu(u) = u \text{ of one half}, \ u/\sqrt{1 + u^2} \text{ of the other} $$
 

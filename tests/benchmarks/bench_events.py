@@ -47,7 +47,7 @@ def motions():
 
 def cycles():
     """A limit cycle, and its derivative."""
-    top = jl.Event(lambda qdot: qdot, direction=jl.Falling())
+    top = jl.Event(lambda qdot: qdot, direction=jl.direction.Falling())
     system = jl.System(lambda q, qdot: 0.5 * qdot**2 - 0.5 * q**2, force=lambda q, qdot, mu: mu * (1 - q**2) * qdot)
     period = lambda mu: jl.periodic(system, 1.0, 0.0, {"mu": mu}, section=top, longest=20.0).period
     for name, run in (("limit cycle", lambda: period(1.0)), ("its derivative", lambda: jax.grad(period)(1.0))):

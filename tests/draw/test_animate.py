@@ -38,7 +38,7 @@ def whirl():
     stone = jl.System(lambda qdot, m: 0.5 * m * (qdot["x"] ** 2 + qdot["y"] ** 2), holonomic={"rod": pendulum.cartesian_rod})
     provenance = Provenance.of(stone, {"l": jnp.asarray(l), "m": jnp.asarray(m)})
     multipliers = {"rod": jnp.full(TS.shape, -m * l * omega**2)}
-    return jl.Trajectory(jnp.asarray(TS), q, qdot, qddot, multipliers, jl.RESULTS.successful, {}, None, {}, provenance)
+    return jl.results.Trajectory(jnp.asarray(TS), q, qdot, qddot, multipliers, jl.results.RESULTS.successful, {}, None, {}, provenance)
 
 
 def bob(q):
@@ -50,7 +50,7 @@ def half(q, l):
 
 
 def whirling(**options):
-    return jl.animate(
+    return jl.plot.animate(
         whirl(), {"bob": bob, "half": half}, [((0.0, 0.0), "half"), ("half", "bob")], **({"units": UNITS, "fps": 10} | options)
     )
 
@@ -98,9 +98,9 @@ def test_a_rod_between_two_bodies_pulls_at_both():
     dumb_bell = jl.System(energy, holonomic={"rod": lambda q, l: jnp.linalg.norm(q["a"] - q["b"]) - l})
     provenance = Provenance.of(dumb_bell, {"l": jnp.asarray(l), "m": jnp.asarray(m)})
     motion = ends(out), ends(aside), ends(-(omega**2) * out), {"rod": jnp.full(TS.shape, -m * l / 2 * omega**2)}
-    turning = jl.Trajectory(jnp.asarray(TS), *motion, jl.RESULTS.successful, {}, None, {}, provenance)
+    turning = jl.results.Trajectory(jnp.asarray(TS), *motion, jl.results.RESULTS.successful, {}, None, {}, provenance)
     points = {"a": lambda q: q["a"], "b": lambda q: q["b"]}
-    moving = jl.animate(turning, points, [("a", "b")], forces={"rod": ("a", "b")}, fps=10)
+    moving = jl.plot.animate(turning, points, [("a", "b")], forces={"rod": ("a", "b")}, fps=10)
     one, other = moving.ax.collections
     moving.draw(4)
     np.testing.assert_allclose([one.U[0], one.V[0]], -out[20] * np.hypot(one.U[0], one.V[0]) / (l / 2), atol=1e-6)
@@ -140,11 +140,11 @@ def test_it_is_drawn_on_the_axes_that_are_given(tmp_path):
 def test_a_motion_that_broke_off_is_shown_as_far_as_it_came():
     lost = lambda tree: jax.tree.map(lambda x: x.at[41:].set(jnp.nan), tree)
     parts = {name: lost(getattr(whirl(), name)) for name in ("q", "qdot", "qddot", "multipliers")}
-    moving = jl.animate(dataclasses.replace(whirl(), **parts), {"bob": bob}, forces={"rod": "bob"}, fps=50)
+    moving = jl.plot.animate(dataclasses.replace(whirl(), **parts), {"bob": bob}, forces={"rod": "bob"}, fps=50)
     assert moving.frames == 41
     parts = {name: jax.tree.map(lambda x: x * jnp.nan, part) for name, part in parts.items()}
     with pytest.raises(ValueError, match=r"`trajectory` must have at least two samples, but only 0 were computed\. Look at"):
-        jl.animate(dataclasses.replace(whirl(), **parts), {"bob": bob})
+        jl.plot.animate(dataclasses.replace(whirl(), **parts), {"bob": bob})
 
 
 def test_a_file_that_cannot_be_written_is_refused(tmp_path, monkeypatch):
@@ -179,4 +179,4 @@ def test_a_file_that_cannot_be_written_is_refused(tmp_path, monkeypatch):
 )
 def test_what_does_not_fit_is_refused(change, sentence):
     with pytest.raises(ValueError, match=re.escape(sentence)):
-        jl.animate(whirl(), **({"points": {"bob": bob}} | change))
+        jl.plot.animate(whirl(), **({"points": {"bob": bob}} | change))

@@ -16,7 +16,7 @@ FIRST, SPEED = np.sqrt(2 / G), np.sqrt(2 * G)
 ball = jl.System(
     lambda q, qdot: 0.5 * qdot**2 - G * q,
     unilateral={"floor": jl.Contact(lambda q: q, E)},
-    events={"apex": jl.Event(lambda qdot: qdot, direction=jl.Falling())},
+    events={"apex": jl.Event(lambda qdot: qdot, direction=jl.direction.Falling())},
 )
 
 
@@ -58,7 +58,7 @@ def test_motions_have_lines_at_events(bouncing):
 
 @pytest.mark.slow
 def test_a_bouncing_ball_is_animated(bouncing):
-    moving = jl.animate(bouncing, {"ball": lambda q: (0.0, q)}, fps=10)
+    moving = jl.plot.animate(bouncing, {"ball": lambda q: (0.0, q)}, fps=10)
     moving.draw(7)
     flown = 0.7 - FIRST
     np.testing.assert_allclose(moving.ax.lines[-1].get_xydata(), [[0, E * SPEED * flown - G * flown**2 / 2]], atol=1e-6)

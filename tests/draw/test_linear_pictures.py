@@ -96,7 +96,7 @@ def test_mode_shapes():
 def test_a_complex_mode_runs_along_ellipses():
     """Of a mode that is damped in one joint, the two ends are not at their extremes all at once."""
     slow = modes(1.0)[0]
-    moving = jl.animate(slow, POINTS, links=LINKS, fps=20)
+    moving = jl.plot.animate(slow, POINTS, links=LINKS, fps=20)
     (a, b) = np.asarray(slow.shapes).ravel()
     assert abs((a * np.conj(b)).imag) > 1e-3 * abs(a * b)
     tracks = []
@@ -113,7 +113,7 @@ def test_a_complex_mode_runs_along_ellipses():
 @pytest.mark.slow
 def test_what_modes_are_not_drawn():
     with pytest.raises(ValueError, match="`trajectory` must be one mode"):
-        jl.animate(modes(), POINTS, links=LINKS)
+        jl.plot.animate(modes(), POINTS, links=LINKS)
     with pytest.raises(ValueError, match="`amplitude` must be a positive length"):
         plot.mode_shapes(modes(), POINTS, LINKS, amplitude=-1.0)
     with pytest.raises(ValueError, match="`links` must join points"):

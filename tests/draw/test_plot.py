@@ -34,12 +34,12 @@ def motion(q):
     """A trajectory that was not simulated, so that the tests know every number of it."""
     samples = jax.tree.map(lambda start: jnp.stack([jnp.asarray(start + t) for t in TIMES]), q)
     provenance = Provenance.of(jl.System(lambda qdot: qdot), {})
-    return jl.Trajectory(jnp.asarray(TIMES), samples, samples, samples, {}, jl.RESULTS.successful, {}, None, {}, provenance)
+    return jl.results.Trajectory(jnp.asarray(TIMES), samples, samples, samples, {}, jl.results.RESULTS.successful, {}, None, {}, provenance)
 
 
 def fitted(*residuals, of, sigma=0.5):
     """A fit of an experiment of which only what is drawn is filled in; its predictions have the standard error 0.1."""
-    fit = object.__new__(jl.Fit)
+    fit = object.__new__(jl.results.Fit)
     predictions = [jax.tree.map(lambda z, r: np.asarray(z) - r, of.values, r) for r in residuals]
     errors = [jax.tree.map(lambda z: np.full(z.shape, 0.1), tree) for tree in predictions]
     filled = {"experiments": (of,) * len(residuals), "residuals": list(residuals), "sigma": sigma, "absolute": True}
@@ -277,7 +277,7 @@ def test_curves_that_lie_on_each_other_are_both_seen():
 def test_correlations_of_either_sign_look_different(size):
     """In colour by far, and where there is no place for numbers, by their signs."""
     rho = np.tile([[1.0, -1.0], [-1.0, 1.0]], (size // 2, size // 2))
-    fit, free = object.__new__(jl.Fit), SimpleNamespace(theta=lambda y: y)
+    fit, free = object.__new__(jl.results.Fit), SimpleNamespace(theta=lambda y: y)
     filled = {"names": tuple(f"p{i}" for i in range(size)), "x": np.ones(size), "covariance": np.eye(size), "correlation": rho}
     for name, value in (filled | {"absolute": True, "problem": SimpleNamespace(free=free)}).items():
         object.__setattr__(fit, name, value)

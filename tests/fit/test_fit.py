@@ -183,7 +183,7 @@ def test_a_step_too_small_to_be_seen_is_taken():
 def test_an_input_that_ends_before_the_record_is_remarked():
     cart = jl.System(lambda qdot, m: 0.5 * m * qdot**2, force=lambda t, u: u(t))
     ts = np.linspace(0.0, 2.0, 21)
-    short, whole = (jl.Signal(np.linspace(0.0, end, 6), np.ones(6), jl.Linear()) for end in (1.0, 1.8))
+    short, whole = (jl.Signal(np.linspace(0.0, end, 6), np.ones(6), jl.interpolation.Linear()) for end in (1.0, 1.8))
     for push, remarked in ((short, True), (whole, False)):
         fit = jl.fit(cart, jl.Experiment(ts, ts**2 / 4, 0.0, 0.0, params={"u": push}), {"m": 1.0}, free=("m",))
         np.testing.assert_allclose(fit.estimates["m"], 2.0, rtol=1e-6)

@@ -193,7 +193,7 @@ def test_predictions_of_another_test():
     np.testing.assert_allclose(found.prediction.values, response(at), rtol=1e-8)
     np.testing.assert_allclose(found.residuals, measured - response(at), rtol=1e-6)
     assert [c.name for c in found.channels] == ["q[0]/q[0]", "q[1]/q[0]", "q[2]/q[0]"] and isinstance(
-        found.prediction.motion, jl.LinearSystem
+        found.prediction.motion, jl.results.LinearSystem
     )
     lower, upper = fit.band(0)
     assert np.all(lower["frequency"] < upper["frequency"])

@@ -502,7 +502,7 @@ def test_the_delay_and_the_gain_of_an_actuator():
         force=lambda t, u, k, tau: k * u(t - tau),
     )
     truth = {"c": 4.0, "b": 0.3, "k": 1.7, "tau": 0.23}
-    start = {"c": 4.5, "b": 0.2, "k": 1.2, "tau": 0.1, "u": jl.Signal(ts, u, jl.Linear())}
+    start = {"c": 4.5, "b": 0.2, "k": 1.2, "tau": 0.1, "u": jl.Signal(ts, u, jl.interpolation.Linear())}
     found = jl.fit(system, record, start, free=tuple(truth))
     assert found.converged and found.standard_errors["tau"] < 2e-4
     for name, value in truth.items():

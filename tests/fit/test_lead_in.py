@@ -132,7 +132,7 @@ def fit_of_friction(seed):
     rng, at, ts = np.random.default_rng(seed), np.linspace(0.0, 30.0, 301), np.linspace(0.0, 30.0, 601)
     walk = np.cumsum(rng.standard_normal(301))
     walk -= np.linspace(walk[0], walk[-1], 301)
-    u = jl.Signal(at, 1.2 * walk / np.std(walk) + 0.5 * rng.standard_normal(301), jl.ZeroOrderHold())
+    u = jl.Signal(at, 1.2 * walk / np.std(walk) + 0.5 * rng.standard_normal(301), jl.interpolation.ZeroOrderHold())
     x = np.asarray(jl.simulate(TRUTH, 0.5, 0.0, ts, {"c": 1.0, "b": 0.2, "F": 0.6, "u": u}).q)
     record = jl.Experiment(ts, x + 1e-3 * rng.standard_normal(601), 0.5, 0.0)
     return jl.fit(COULOMB, record, {"m": 1.4, "c": 0.8, "b": 0.5, "F": 0.3, "u": u}, free=("m", "c", "b", "F"))

@@ -134,14 +134,6 @@ def test_gaps_that_do_not_close_are_reported(monkeypatch):
     assert not found.converged and "the segments do not join" in found.reason and found.steps < 10
 
 
-def test_the_old_name_of_segments_still_works():
-    e = osc.record(0)
-    with pytest.warns(DeprecationWarning, match="`pieces` is now called `segments`. Write `segments`."):
-        old = jl.fit(osc.SYSTEM, e, osc.START, free=("c", "b"), pieces=3)
-    new = jl.fit(osc.SYSTEM, e, osc.START, free=("c", "b"), segments=3)
-    assert old.problem.continuity is not None and old.estimates == new.estimates
-
-
 @pytest.mark.slow
 def test_a_chaotic_record_in_segments():
     """20 s with overturning: single shooting from the given start loses the motion; 40 segments find it, and the gaps close."""

@@ -102,7 +102,7 @@ def test_inputs_of_an_oscillator(name, gain):
     np.testing.assert_array_equal(linear.D_rates, np.zeros((2, 1, 1)))
 
 
-@pytest.mark.parametrize("interpolation", [jl.ZeroOrderHold(), jl.Linear(), jl.Cubic()])
+@pytest.mark.parametrize("interpolation", [jl.interpolation.ZeroOrderHold(), jl.interpolation.Linear(), jl.interpolation.Cubic()])
 def test_a_signal_as_input(interpolation):
     """Its value moves, whatever lies between its samples."""
     system = jl.System(**oscillator_terms(), force=lambda t, u: {"x": u(t)})
@@ -137,7 +137,7 @@ EXPECTED = {
 SUPPORTS = {
     "the constraint": (lambda q: q["base"], {}, "support"),
     "a number": (lambda q, h: q["base"] - h, {"h": 0.0}, "h"),
-    "a cubic signal": (lambda t, q, h: q["base"] - h(t), {"h": jl.Signal(np.arange(4.0), np.zeros(4), jl.Cubic())}, "h"),
+    "a cubic signal": (lambda t, q, h: q["base"] - h(t), {"h": jl.Signal(np.arange(4.0), np.zeros(4), jl.interpolation.Cubic())}, "h"),
 }
 
 

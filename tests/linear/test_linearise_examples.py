@@ -551,7 +551,7 @@ def driven_by_sines():
 
 
 def driven_pendulum():
-    torque = jl.Signal(np.linspace(0.0, 1.0, 11), np.sin(5 * np.linspace(0.0, 1.0, 11)), jl.Cubic())
+    torque = jl.Signal(np.linspace(0.0, 1.0, 11), np.sin(5 * np.linspace(0.0, 1.0, 11)), jl.interpolation.Cubic())
     return Moving(MEASURED, 1.0, 3.0, MEASURED_PARAMS | {"u": torque}, 0.1)
 
 

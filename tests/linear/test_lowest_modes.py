@@ -150,7 +150,7 @@ def test_pictures_take_them():
     modes = jl.lowest_modes(CHAIN, jnp.zeros(N), {"m": 1.0, "c": 4.0}, count=2)
     points = {f"{i}": lambda q, i=i: jnp.stack([jnp.full((), 1.0 * i, q.dtype), q[i]]) for i in range(0, N, 30)}
     assert len(np.ravel(jl.plot.mode_shapes(modes, points))) == 2
-    assert jl.animate(modes[1], points) is not None
+    assert jl.plot.animate(modes[1], points) is not None
 
 
 @pytest.mark.slow

@@ -228,17 +228,18 @@ def test_many_rods_given_twice():
     np.testing.assert_allclose(2 * of_half, jax.jacfwd(lambda l: rest(RODS, l).multipliers["rods"][3])(1.0), rtol=1e-7)
 
 
-@pytest.mark.slow
+WITHOUT_A_HOOK = {
+    "rods": lambda q: jnp.sum(jnp.diff(q, axis=0) ** 2, axis=1) - 1,
+    "again": lambda q: jnp.sum(jnp.diff(q, axis=0) ** 2, axis=1)[:9] - 1,
+}
+
+
 @pytest.mark.parametrize(
     "holonomic",
     [
-        {"rods": rods, "longer": lambda q, l, end: rods(q, 1.01 * l, end)[:40]},
-        {
-            "rods": lambda q: jnp.sum(jnp.diff(q, axis=0) ** 2, axis=1) - 1,
-            "again": lambda q: jnp.sum(jnp.diff(q, axis=0) ** 2, axis=1)[:9] - 1,
-        },
+        pytest.param({"rods": rods, "longer": lambda q, l, end: rods(q, 1.01 * l, end)[:40]}, id="that contradict each other"),
+        pytest.param(WITHOUT_A_HOOK, id="without a hook", marks=pytest.mark.slow),
     ],
-    ids=["that contradict each other", "without a hook"],
 )
 def test_rods_given_twice_that_find_no_rest(holonomic):
     with pytest.raises(ValueError, match="`q` must be near an equilibrium, but none was found"):

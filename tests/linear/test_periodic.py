@@ -9,7 +9,7 @@ from scipy.integrate import solve_ivp
 import jaxlag as jl
 
 G = 9.81
-top = jl.Event(lambda qdot: qdot, direction=jl.Falling())
+top = jl.Event(lambda qdot: qdot, direction=jl.direction.Falling())
 van_der_pol = jl.System(lambda q, qdot: 0.5 * qdot**2 - 0.5 * q**2, force=lambda q, qdot, mu: mu * (1 - q**2) * qdot)
 
 
@@ -161,4 +161,4 @@ def test_clear_errors(change, said):
 @pytest.mark.slow
 def test_what_depends_on_time_is_not_periodic_at_a_section():
     with pytest.raises(ValueError, match="where the system depends on t"):
-        jl.periodic(forced, 1.0, 0.0, {"w": 1.3}, section=top, longest=20.0)
+        jl.periodic(forced, 1.0, 0.0, {"w": 1.3, "d": 0.05}, section=top, longest=20.0)

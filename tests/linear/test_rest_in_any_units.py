@@ -1,5 +1,6 @@
 """What is said of rest does not change with units: what falls, what accelerates, what does not stay as it is, which kind it is."""
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -44,6 +45,34 @@ def test_a_fall_from_the_origin(length, energy, time):
     found = jl.equilibrium(WELLS, np.zeros(2), params_of(length, energy, time), stable=True)
     np.testing.assert_allclose(np.abs(found.q / s), [1, 1], rtol=1e-9)
     np.testing.assert_allclose(np.asarray(found.stiffness) * time**2, [4 - np.sqrt(10), 4 + np.sqrt(10)], rtol=1e-8)
+
+
+TURNED = np.array([[np.cos(0.3), np.sin(0.3)], [-np.sin(0.3), np.cos(0.3)]])
+SYMMETRIC = stated(lambda q, v: 0.5 * v @ v - 1.5 * q[1] ** 2 + GRAVITY * q[1] - 1.5 * jnp.sum((TURNED @ q) ** 2) + 1.5 * q @ q)
+
+
+@in_units
+def test_what_depends_on_a_coordinate_by_rounding_alone_holds_it_nowhere(length, energy, time):
+    """Two springs cancel in x, which stays as it is given; y sags by m g/c, whatever the unit of time."""
+    s = np.array(length)
+    at = lambda tau: jl.equilibrium(SYMMETRIC, s * jnp.array([0.3, 0.1]), params_of(length, energy, tau)).q / s
+    np.testing.assert_allclose(at(time), [0.3, GRAVITY / 3], rtol=1e-12)
+    np.testing.assert_allclose(jax.jacfwd(at)(time) * time, [0, 0], atol=1e-12)
+
+
+@in_units
+@pytest.mark.parametrize("given", [(), ("q[0]", "q[1]")])
+def test_a_wheel_at_its_final_speed(given, length, energy, time):
+    """Two drives and the drag cancel up to rounding, and so does the force of rolling, whether the speed is given or not."""
+    drag = lambda qdot, s, E, tau: E * 0.15 * (qdot[0] * tau / s[0]) ** 2 / tau
+    drives = lambda s, E: E * jnp.array([0.1 * 1.7 + 0.2 * 1.7, 0.0]) / s
+    rolls = lambda qdot, s, tau: (qdot[0] / s[0] - 0.5 * qdot[1] / s[1]) * tau
+    system = jl.System(
+        lambda q, qdot, s, E, tau: 0.5 * E * jnp.sum((qdot * tau / s) ** 2), dissipation=drag, force=drives, nonholonomic=rolls
+    )
+    s = np.array(length)
+    found = jl.steady(system, s * np.array([0.3, 0.0]), s * np.array([1.7, 3.4]) / time, params_of(length, energy, time), fixed_rates=given)
+    np.testing.assert_allclose(found.qdot * time / s, [1.7, 3.4], rtol=1e-9)
 
 
 @in_units

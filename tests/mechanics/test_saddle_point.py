@@ -477,7 +477,9 @@ def test_derivatives_where_rows_turn():
         np.testing.assert_allclose(derivative(found)(0.4), jax.jacfwd(by_hand)(0.4), rtol=1e-13)
 
 
-ROWS = jl.System(lambda qdot, M: 0.5 * jnp.sum(M * qdot**2), force=lambda f: f, holonomic={"rows": lambda t, q, G, w: G @ q - w * t**2 / 2})
+STATED = jl.System(
+    lambda qdot, M: 0.5 * jnp.sum(M * qdot**2), force=lambda f: f, holonomic={"rows": lambda t, q, G, w: G @ q - w * t**2 / 2}
+)
 
 
 @pytest.mark.parametrize("d", [1e-1, 1e-2, 1e-3, 5e-5])
@@ -487,8 +489,8 @@ def test_rows_that_are_almost_parallel(d):
     """
     a, M, f, w = 0.3, np.array([1.0, 2.0, 3.0]), np.array([0.7, -0.2, 1.1]), np.array([0.0, 5.0])
     params = {"G": np.array([[1.0, 0.0, a], [1.0, d, a]]), "M": M, "f": f}
-    held = jl.acceleration(ROWS, np.zeros(3), np.zeros(3), params | {"w": 0 * w}).multipliers["rows"]
+    held = jl.acceleration(STATED, np.zeros(3), np.zeros(3), params | {"w": 0 * w}).multipliers["rows"]
     both = -(f[0] / M[0] + a * f[2] / M[2]) / (1 / M[0] + a**2 / M[2])
     np.testing.assert_allclose(held, [both + f[1] / d, -f[1] / d], rtol=5e-16 / d)
-    moved = jl.acceleration(ROWS, np.zeros(3), np.zeros(3), params | {"w": w, "f": 0 * f}).qddot
+    moved = jl.acceleration(STATED, np.zeros(3), np.zeros(3), params | {"w": w, "f": 0 * f}).qddot
     np.testing.assert_allclose(moved, [0.0, 5.0 / d, 0.0], rtol=1e-13 / d, atol=1e-13 / d**2)

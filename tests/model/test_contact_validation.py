@@ -54,7 +54,7 @@ def test_walls_that_close_in():
     """What lies between them can go nowhere, which is the reason, at the time when they touch it on both sides."""
     press = jl.System(fall, unilateral={"below": floor, "above": lambda t, q: 1.5 - 2 * t - q})
     motion = jl.simulate(press, 1.0, 0.0, jnp.linspace(0, 1, 4), throw=False)
-    assert motion.result == jl.RESULTS.beyond_reach
+    assert motion.result == jl.results.RESULTS.beyond_reach
     np.testing.assert_allclose(motion.stats["reached"], 0.75, atol=1e-6)
     np.testing.assert_array_equal(np.isfinite(motion.q), [True, True, True, False])
 
@@ -71,7 +71,7 @@ def test_a_start_inside_an_obstacle_is_put_on_it():
 def test_a_start_inside_of_what_has_no_outside():
     cage = jl.System(fall, unilateral={"below": lambda q: -1 - q**2})
     motion = jl.simulate(cage, 0.1, 0.0, jnp.array([0.0, 1.0]), throw=False)
-    assert motion.result == jl.RESULTS.inside_obstacle and np.all(np.isnan(motion.q))
+    assert motion.result == jl.results.RESULTS.inside_obstacle and np.all(np.isnan(motion.q))
 
 
 @pytest.mark.slow
@@ -82,7 +82,7 @@ def test_friction_that_is_not_proportional_to_the_force():
         unilateral={"floor": lambda q: q[1]},
     )
     motion = jl.simulate(sled, jnp.array([0.0, 1.0]), jnp.array([1.0, 0.0]), jnp.array([0.0, 1.0]), throw=False)
-    assert motion.result == jl.RESULTS.not_impulsive
+    assert motion.result == jl.results.RESULTS.not_impulsive
     with pytest.raises(ValueError, match="`friction` must be `StickSlip"):
         jl.simulate(sled, jnp.array([0.0, 1.0]), jnp.array([1.0, 0.0]), jnp.array([0.0, 1.0]), friction=jl.Regularised(1e-3))
 

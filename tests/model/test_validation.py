@@ -266,9 +266,9 @@ def test_traced_times_that_decrease_are_a_result():
     oscillator = jl.System(energy)
     motion = jax.jit(lambda ts: jl.simulate(oscillator, 1.0, 0.0, ts, {"c": 4.0}))
     back = motion(jnp.array([0.0, 1.0, 0.5]))
-    assert back.result == jl.RESULTS.unordered and not back.succeeded and np.all(np.isnan(back.q))
+    assert back.result == jl.results.RESULTS.unordered and not back.succeeded and np.all(np.isnan(back.q))
     assert "`ts` must increase, but a time is smaller than the one before it" in repr(back)
-    assert motion(jnp.array([0.0, jnp.nan, 0.5])).result == jl.RESULTS.not_finite
+    assert motion(jnp.array([0.0, jnp.nan, 0.5])).result == jl.results.RESULTS.not_finite
     forth = motion(jnp.array([0.0, 0.5, 0.5]))  # as filling up makes them
     assert forth.succeeded
     np.testing.assert_allclose(forth.q, np.cos([0, 1, 1]), atol=1e-8)
@@ -297,7 +297,7 @@ def test_out_of_steps():
     ):
         run(max_steps=2)
     motion = run(max_steps=2, throw=False)
-    assert not motion.succeeded and motion.result == jl.RESULTS.max_steps_reached
+    assert not motion.succeeded and motion.result == jl.results.RESULTS.max_steps_reached
     assert motion.q[0] == 1.0 and np.all(np.isnan(motion.q[1:]))
     assert "The maximum number of solver steps was reached" in repr(motion)
     some = run(max_steps=12, throw=False, ts=np.linspace(0, 10, 101))
@@ -316,7 +316,7 @@ def test_a_motion_that_runs_away():
 @pytest.mark.slow
 def test_under_jit_a_failure_is_a_result():
     motion = jax.jit(lambda c: run(params={"c": c}))(jnp.nan)
-    assert motion.result == jl.RESULTS.not_finite and np.all(np.isnan(motion.q))
+    assert motion.result == jl.results.RESULTS.not_finite and np.all(np.isnan(motion.q))
     stopped = jax.vmap(lambda c: run(params={"c": c}, max_steps=8, ts=np.linspace(0, 3, 4)))(jnp.array([1e-3, 1e3]))
     assert list(np.asarray(stopped.succeeded)) == [True, False]
     with pytest.raises(ValueError, match="must be finite"):

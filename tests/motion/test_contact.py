@@ -331,7 +331,7 @@ def test_a_held_force_lifts_it_off():
         force=lambda t, F: F(t),
         unilateral={"floor": jl.Contact(lambda q: q, restitution=0.5)},
     )
-    F = jl.Signal(jnp.array([0.0, 1.0, 1.5]), jnp.array([0.0, 3 * 2.0 * G, 0.0]), jl.ZeroOrderHold())
+    F = jl.Signal(jnp.array([0.0, 1.0, 1.5]), jnp.array([0.0, 3 * 2.0 * G, 0.0]), jl.interpolation.ZeroOrderHold())
     ts = np.linspace(0, 4, 17)
     motion = jl.simulate(lifted, 0.0, 0.0, ts, {"m": 2.0, "F": F}, works=True)
     up, free = np.clip(ts - 1, 0, 0.5), np.clip(ts - 1.5, 0, None)

@@ -21,7 +21,7 @@ def polynomial(q, roots):
     return jnp.prod(q - roots)
 
 
-crossing = jl.System(free, events={"zero": jl.Event(polynomial), "up": jl.Event(polynomial, direction=jl.Rising())})
+crossing = jl.System(free, events={"zero": jl.Event(polynomial), "up": jl.Event(polynomial, direction=jl.direction.Rising())})
 
 
 @pytest.mark.slow
@@ -109,8 +109,8 @@ ball = jl.System(
     unilateral={"floor": jl.Contact(height, 0.8)},
     events={
         "click": jl.Event("floor"),
-        "turn": jl.Event(rising, direction=jl.Rising()),
-        "apex": jl.Event(rising, direction=jl.Falling()),
+        "turn": jl.Event(rising, direction=jl.direction.Rising()),
+        "apex": jl.Event(rising, direction=jl.direction.Falling()),
         "end": jl.Event("floor", most=64),
     },
 )
@@ -220,7 +220,7 @@ def test_single_precision_under_vmap():
 def test_clear_errors():
     for make, said in (
         (lambda: jl.Every(0.0), "`period` must be positive"),
-        (lambda: jl.Event("floor", direction=jl.Rising()), "`direction` must be left out"),
+        (lambda: jl.Event("floor", direction=jl.direction.Rising()), "`direction` must be left out"),
         (lambda: jl.System(free, events={"a": jl.Event("floor")}), "must name a contact"),
         (lambda: jl.Event(lambda q: q, stop="yes"), "`stop` must be"),
         (lambda: jl.simulate(jl.System(free), 0.0, 1.0, [0.0, 1.0], events={"a": jl.Event(lambda q: jnp.ones(2))}), "one real number"),

@@ -20,7 +20,11 @@ TIMES = np.linspace(0, 10, 21)
 
 @pytest.mark.parametrize(
     ("direction", "first"),
-    [(jl.Falling(), 0), pytest.param(jl.Rising(), 1, marks=pytest.mark.slow), pytest.param(jl.Either(), None, marks=pytest.mark.slow)],
+    [
+        (jl.direction.Falling(), 0),
+        pytest.param(jl.direction.Rising(), 1, marks=pytest.mark.slow),
+        pytest.param(jl.direction.Either(), None, marks=pytest.mark.slow),
+    ],
     ids=["falling", "rising", "either"],
 )
 def test_turning_points_are_counted(direction, first):
@@ -53,8 +57,8 @@ engaging = jl.System(  # a second spring beyond q = 0.3, which stays engaged; an
     lambda q, qdot, engaged: 0.5 * qdot**2 - 2.0 * q**2 - 0.5 * engaged * 30.0 * (q - 0.3) ** 2,
     states={"engaged": jl.State(lambda: 0.0)},
     events={
-        "in": jl.Event(lambda q: q - 0.3, lambda: {"states": {"engaged": 1.0}}, direction=jl.Rising()),
-        "out": jl.Event(lambda q: q - 0.1, lambda: {"states": {"engaged": 0.0}}, direction=jl.Falling()),
+        "in": jl.Event(lambda q: q - 0.3, lambda: {"states": {"engaged": 1.0}}, direction=jl.direction.Rising()),
+        "out": jl.Event(lambda q: q - 0.1, lambda: {"states": {"engaged": 0.0}}, direction=jl.direction.Falling()),
         "end": jl.Event(lambda t, T: t - T, stop=True, most=1),
     },
 )
@@ -121,8 +125,8 @@ def test_given_times():
         lambda q, qdot: 0.5 * qdot**2,
         events={
             "push": jl.Event([1.0, 2.5, 3.0], lambda qdot: {"qdot": qdot + 1.0}),
-            "above": jl.Event(lambda q: q - 2.0, direction=jl.Rising()),
-            "below": jl.Event(lambda q: q - 3.0, direction=jl.Negative()),
+            "above": jl.Event(lambda q: q - 2.0, direction=jl.direction.Rising()),
+            "below": jl.Event(lambda q: q - 3.0, direction=jl.direction.Negative()),
         },
     )
     motion = jl.simulate(pushed, 2.5, 0.0, np.linspace(0, 4, 9) + 1e-3 * (np.arange(9) > 0))
@@ -157,4 +161,4 @@ def test_clear_errors():
             jl.simulate(jl.System(oscillator, events={"a": jl.Event(lambda q: q, then)}), 0.0, 1.0, TIMES, {"c": 4.0})
     trapped = jl.System(oscillator, events={"a": jl.Event(lambda q: q - 0.1, lambda qdot: {"q": 0.05}, most=5)})
     motion = jl.simulate(trapped, 0.0, 1.0, TIMES, {"c": 4.0}, throw=False)
-    assert motion.result == jl.RESULTS.too_many_events
+    assert motion.result == jl.results.RESULTS.too_many_events

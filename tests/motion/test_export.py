@@ -29,7 +29,7 @@ STILL = Provenance.of(jl.System(lambda qdot: qdot), {})
 def given(ts, q, qdot, qddot):
     """A motion that was not simulated, so that the tests know every number of it."""
     states = jax.tree.map(jnp.asarray, (ts, q, qdot, qddot))
-    return jl.Trajectory(*states, {}, jl.RESULTS.successful, {}, None, {}, STILL)
+    return jl.results.Trajectory(*states, {}, jl.results.RESULTS.successful, {}, None, {}, STILL)
 
 
 def waves(ts, omega=3.0):
@@ -214,7 +214,7 @@ def rubbed():
     v = np.where(stuck, 0, -2 * side * size * np.sin(phase))
     path = np.concatenate([[0], np.cumsum(2 * (0.925 - 0.15 * np.arange(7)))])[k.astype(int)] + size * (1 - np.cos(phase))
     x, x_end = side * (0.075 + size * np.cos(phase)), side[-1] * (0.075 - size[-1])
-    rubbing = jl.FrictionState(jnp.asarray(np.where(stuck, c * x_end, -F * np.sign(v))), jnp.asarray(stuck))
+    rubbing = jl.results.FrictionState(jnp.asarray(np.where(stuck, c * x_end, -F * np.sign(v))), jnp.asarray(stuck))
     flat = lambda y: np.stack([y, 0 * y], axis=1)
     system = jl.System(
         lambda q, qdot, c: 0.5 * qdot["x"] ** 2 + 0.5 * qdot["r"] @ qdot["r"] - 0.5 * c * q["x"] ** 2,
@@ -234,7 +234,7 @@ def rubbed():
     works = {"dry": -F * path, "push": 0.5 * np.sin(ts) ** 2, "table": 0 * ts, "time": 0 * ts, "projection": 0 * ts}
     ts, states, stats, works = jax.tree.map(jnp.asarray, (ts, states, steps | counts, works))
     stated = Provenance.of(system, jax.tree.map(jnp.asarray, {"c": c, "F": F, "label": {"spring": [1.0, 2.0]}}) | {"net": jnp.sin})
-    return jl.Trajectory(ts, *states, jl.RESULTS.successful, stats, works, {"dry": rubbing}, stated)
+    return jl.results.Trajectory(ts, *states, jl.results.RESULTS.successful, stats, works, {"dry": rubbing}, stated)
 
 
 def test_a_slice_is_a_motion_that_starts_later(rubbed):
@@ -256,7 +256,7 @@ def test_the_card_of_a_late_motion_tells_its_times_apart(rubbed, start, said):
 
 def test_the_card_of_a_motion_that_failed_counts_what_was_reached(rubbed):
     unreached = lambda x: x.at[100:].set(jnp.nan) if x.shape[:1] == (141,) and x.dtype == float else x
-    failed = dataclasses.replace(jax.tree.map(unreached, rubbed), ts=rubbed.ts, result=jl.RESULTS.max_steps_reached)
+    failed = dataclasses.replace(jax.tree.map(unreached, rubbed), ts=rubbed.ts, result=jl.results.RESULTS.max_steps_reached)
     assert "6 transitions, stuck for 0" in str(failed) and "maximum number of solver steps" in str(failed)
 
 
@@ -304,7 +304,7 @@ def many():
         w = jnp.sqrt(c)
         states = jnp.cos(w * ts), -w * jnp.sin(w * ts), -c * jnp.cos(w * ts)
         stats = {"num_steps": 3, "num_rejected_steps": 0}
-        return jl.Trajectory(ts, *states, {}, jl.RESULTS.successful, stats, None, {}, Provenance.of(free, {"c": c}))
+        return jl.results.Trajectory(ts, *states, {}, jl.results.RESULTS.successful, stats, None, {}, Provenance.of(free, {"c": c}))
 
     return jax.vmap(one)(jnp.array([1.0, 4.0, 9.0]))
 
@@ -421,7 +421,7 @@ def test_a_motion_comes_back_from_its_file(rubbed, tmp_path):
     loaded.save(again)
     same(rubbed, jl.load(again))
     with pytest.raises(ValueError, match="a motion that was loaded from a file must do without its system, whose functions are not in the"):
-        jl.animate(loaded, {"r": lambda q: q["r"]}, forces={"table": "r"})
+        jl.plot.animate(loaded, {"r": lambda q: q["r"]}, forces={"table": "r"})
 
 
 def test_another_process_needs_none_of_the_functions(rubbed, tmp_path):
@@ -436,9 +436,9 @@ def test_what_many_motions_and_failed_ones_come_back_as(many, tmp_path):
     loaded = jl.load(tmp_path / "many.npz")
     same(many, loaded)
     np.testing.assert_allclose(loaded[2].energy(), 4.5, rtol=1e-6)
-    failed = dataclasses.replace(many[0], result=jl.RESULTS.no_friction)
+    failed = dataclasses.replace(many[0], result=jl.results.RESULTS.no_friction)
     failed.save(tmp_path / "failed.npz")
-    assert jl.load(tmp_path / "failed.npz").result == jl.RESULTS.no_friction
+    assert jl.load(tmp_path / "failed.npz").result == jl.results.RESULTS.no_friction
 
 
 def test_a_named_tuple_comes_back_as_the_dict_of_its_fields(tmp_path):

@@ -251,7 +251,7 @@ def test_a_sample_that_is_no_number_is_no_success():
     length = lambda t: 1.0 + jnp.where(jnp.abs(t - 0.5) < 1e-9, jnp.nan, 0.0)
     rod = jl.System(lambda q, qdot: kinetic(qdot) - 9.81 * q[1], holonomic=lambda t, q: jnp.hypot(*q) - length(t))
     swing = lambda ts: jl.simulate(rod, np.array([1.0, 0.0]), np.zeros(2), ts, throw=False)
-    assert swing(np.linspace(0, 1, 20)).result == jl.RESULTS.successful  # none of which is at the moment
+    assert swing(np.linspace(0, 1, 20)).result == jl.results.RESULTS.successful  # none of which is at the moment
     motion = swing(np.linspace(0, 1, 21))
-    assert motion.result == jl.RESULTS.undefined and motion.stats["reached"] == 0.5
+    assert motion.result == jl.results.RESULTS.undefined and motion.stats["reached"] == 0.5
     assert np.all(np.isfinite(motion.q[:10])) and np.all(np.isnan(motion.q[10:]))

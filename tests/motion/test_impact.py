@@ -134,7 +134,7 @@ def test_kanes_paradox_is_named(e, gains):
     start = jnp.array([0.0, np.cos(phi) + 1e-3, phi]), jnp.array([slip, -down, 0.0])
     motion = jl.simulate(rod, *start, jnp.array([0.0, 0.01]), {"mu": 3.0, "e": e}, throw=False)
     if gains:
-        assert motion.result == jl.RESULTS.energy_gained
+        assert motion.result == jl.results.RESULTS.energy_gained
     else:
         velocity = np.array([motion.qdot[-1, 1] + np.sin(phi) * motion.qdot[-1, 2], motion.qdot[-1, 0] + np.cos(phi) * motion.qdot[-1, 2]])
         assert motion.succeeded
@@ -191,7 +191,7 @@ def test_the_pecking_woodpecker():
 @pytest.mark.slow
 def test_derivatives_by_a_restitution_at_its_bounds():
     """From a wall at e v, by both laws and in any unit of length: dq/de = v (t − t_hit) = 2 at 0 and at 1 too, and 0 beyond them."""
-    for law in (jl.Newton(), jl.Poisson()):
+    for law in (jl.NewtonRestitution(), jl.PoissonRestitution()):
         wall = jl.System(lambda qdot: 0.5 * qdot**2, unilateral={"wall": jl.Contact(lambda q: q, restitution=lambda e: e, law=law)})
         at = jax.value_and_grad(
             lambda e, unit, wall=wall: jl.simulate(wall, unit, -2 * unit, np.linspace(0, 1.5, 4), {"e": e}).q[-1] / unit

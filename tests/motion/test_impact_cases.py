@@ -99,7 +99,7 @@ def test_the_woodpecker_against_events():
 @pytest.mark.slow
 def test_the_cycle_of_the_woodpecker():
     """Its period, how far it falls in it, and what is left of a deviation after it (a Floquet multiplier): it is stable."""
-    turns = jl.Event(lambda qdot: qdot[2], direction=jl.Rising())  # of the bird
+    turns = jl.Event(lambda qdot: qdot[2], direction=jl.direction.Rising())  # of the bird
     orbit = jl.periodic(woodpecker, *by_hand.START, section=turns, longest=0.6, cyclic=["q[0]"])
     near = orbit.period + np.linspace(-2e-4, 2e-4, 9)
 

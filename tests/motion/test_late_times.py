@@ -52,7 +52,11 @@ def test_friction_in_single_precision():
 @pytest.mark.slow
 def test_bouncing_ball():
     """Impacts and events of a ball in the closed form; h = 4.905 falls one second."""
-    events = {"top": jl.Event(lambda qdot: qdot, direction=jl.Falling()), "tick": jl.Event(jl.Every(0.5)), "hit": jl.Event("floor")}
+    events = {
+        "top": jl.Event(lambda qdot: qdot, direction=jl.direction.Falling()),
+        "tick": jl.Event(jl.Every(0.5)),
+        "hit": jl.Event("floor"),
+    }
     floor = jl.Contact(lambda q: q, restitution=0.5)
     ball = jl.System(lambda q, qdot: 0.5 * qdot**2 - 9.81 * q, unilateral={"floor": floor}, events=events)
     motion = jl.simulate(ball, 4.905, 0.0, LATE + np.array([0.0, 1.5, 2.375]))
@@ -78,9 +82,9 @@ def controlled_motion(start, delay):
     """A motion with inputs of all kinds and updates, at times that count from a start."""
     signal = lambda values, kind: jl.Signal(start + np.array([0.0, 1.0, 2.0, 3.5, 6.0]), values, kind, delay=delay)
     signals = {
-        "push": signal([0.0, 1.0, -1.0, 2.0, 0.0], jl.ZeroOrderHold()),
-        "load": signal([1.0, 0.0, 3.0, -1.0, 0.0], jl.Linear()),
-        "wave": signal([0.0, 1.0, -2.0, 1.0, 0.5], jl.Cubic()),
+        "push": signal([0.0, 1.0, -1.0, 2.0, 0.0], jl.interpolation.ZeroOrderHold()),
+        "load": signal([1.0, 0.0, 3.0, -1.0, 0.0], jl.interpolation.Linear()),
+        "wave": signal([0.0, 1.0, -2.0, 1.0, 0.5], jl.interpolation.Cubic()),
     }
     return jl.simulate(controlled, 1.0, 0.0, start + TS, {"c": 4.0, "F": 0.3, "T": 0.25} | signals)
 
@@ -128,7 +132,7 @@ def test_events_at_times(start):
 @pytest.mark.slow
 def test_events_that_ask_for_signals_at_other_times():
     """u = 2 − 1.5 (t − 1) for 1 ≤ t ≤ 3 is zero at 7/3, and u(t − 0.3) is that later."""
-    u = jl.Signal([0.0, 1.0, 3.0, 6.0], [1.0, 2.0, -1.0, -2.0], jl.Linear())
+    u = jl.Signal([0.0, 1.0, 3.0, 6.0], [1.0, 2.0, -1.0, -2.0], jl.interpolation.Linear())
     system = jl.System(lambda qdot: 0.5 * qdot**2, events={"zero": jl.Event(lambda t, u: u(t - 0.3), lambda t, u: {"qdot": u(t - 0.5)})})
     motion = jl.simulate(system, 0.0, 0.0, [0.0, 5.0], {"u": u})
     np.testing.assert_allclose(motion.events["zero"].ts[0], 7 / 3 + 0.3, rtol=1e-12)

@@ -91,7 +91,7 @@ def test_dry_friction_under_a_held_force_against_the_exact_motion(solver):
 def test_a_linear_force_against_the_exact_motion():
     """Without damping q̇ is the sum of the trapezia."""
     ts = SAMPLES["at the jumps"]
-    signal = jl.Signal(TIMES, VALUES, jl.Linear())
+    signal = jl.Signal(TIMES, VALUES, jl.interpolation.Linear())
     motion = jl.simulate(CART, 0.0, 0.0, ts, {"m": M, "b": 0.0, "u": signal})
     rises = np.diff(ts) * (VALUES[1:299] + VALUES[2:300]) / 2
     np.testing.assert_allclose(motion.qdot, np.concatenate([[0], np.cumsum(rises)]) / M, atol=1e-12)
@@ -177,9 +177,9 @@ def test_the_derivative_by_the_times_of_jumps(derivative):
 def test_a_force_that_asks_for_another_time():
     """A signal that a function delays by itself is looked up, and right."""
     system = jl.System(lambda qdot, m: 0.5 * m * qdot**2, force=lambda t, u, late: u(t - late))
-    ts, signal = SAMPLES["coarse"], jl.Signal(TIMES, VALUES, jl.Linear())
+    ts, signal = SAMPLES["coarse"], jl.Signal(TIMES, VALUES, jl.interpolation.Linear())
     by_hand = jl.simulate(system, 0.0, 0.0, ts, {"m": M, "u": signal, "late": 0.01}, rtol=1e-11, atol=1e-13).q
-    delayed = jl.simulate(CART, 0.0, 0.0, ts, {"m": M, "b": 0.0, "u": jl.Signal(TIMES, VALUES, jl.Linear(), delay=0.01)}).q
+    delayed = jl.simulate(CART, 0.0, 0.0, ts, {"m": M, "b": 0.0, "u": jl.Signal(TIMES, VALUES, jl.interpolation.Linear(), delay=0.01)}).q
     np.testing.assert_allclose(by_hand, delayed, atol=1e-9)
     with pytest.warns(UserWarning, match=r"Signal\(\.\.\., delay="):
         jl.simulate(system, 0.0, 0.0, ts, {"m": M, "u": HELD, "late": 0.01})
@@ -188,7 +188,7 @@ def test_a_force_that_asks_for_another_time():
 @pytest.mark.slow
 def test_two_signals_at_times_of_their_own_before_and_behind_their_samples():
     system = jl.System(lambda qdot: 0.5 * qdot**2, force={"a": lambda t, a: a(t), "b": lambda t, b: b(t)})
-    a, b = jl.Signal([0.5, 1.0], [1.0, 2.0]), jl.Signal([0.2, 0.7, 0.9], [0.0, -1.0, 3.0], jl.Linear())
+    a, b = jl.Signal([0.5, 1.0], [1.0, 2.0]), jl.Signal([0.2, 0.7, 0.9], [0.0, -1.0, 3.0], jl.interpolation.Linear())
     motion = jl.simulate(system, 0.0, 0.0, [0.0, 0.4, 1.0, 2.0], {"a": a, "b": b})
     of_a, of_b = [0.0, 0.4, 1.0, 3.0], [0.0, -0.04, 0.25, 3.25]  # trapezia: −0.25 from 0.2 to 0.7, 0.2 to 0.9, 0.3 to 1
     np.testing.assert_allclose(motion.qdot, np.add(of_a, of_b), atol=1e-12)
@@ -243,7 +243,7 @@ def test_a_grip_on_a_ramp_that_stops():
     at_rest = {"x": 0.0, "y": 0.0}
 
     def run(c, delay):
-        u = jl.Signal(np.array([-0.5, 0.0, 0.2, 10.0]), np.array([0.0, 0.0, 1.0, 1.0]), jl.Linear(), delay=delay)
+        u = jl.Signal(np.array([-0.5, 0.0, 0.2, 10.0]), np.array([0.0, 0.0, 1.0, 1.0]), jl.interpolation.Linear(), delay=delay)
         return jl.simulate(system, at_rest, at_rest, ts, {"c": c, "u": u}, rtol=1e-10, atol=1e-12)
 
     def exact(c, delay):
@@ -264,7 +264,7 @@ def test_a_grip_on_a_ramp_that_stops():
     np.testing.assert_allclose(slopes[1], (exact(2.0, 0.15 + h)[0] - exact(2.0, 0.15 - h)[0]) / (2 * h), atol=1e-7)
     back = jax.grad(lambda c: run(c, 0.15).q["y"][-1])(2.0)
     np.testing.assert_allclose(back, slopes[0][-1], rtol=1e-8)
-    different = {"c": np.array([2.0, 3.0]), "u": jl.Signal([0.0, 0.2, 10.0], [0.0, 1.0, 1.0], jl.Linear())}
+    different = {"c": np.array([2.0, 3.0]), "u": jl.Signal([0.0, 0.2, 10.0], [0.0, 1.0, 1.0], jl.interpolation.Linear())}
     many = jl.simulate_many(system, at_rest, at_rest, ts, different, over=("c",), rtol=1e-10, atol=1e-12)
     for of, c in zip(many.q["y"], (2.0, 3.0), strict=True):
         np.testing.assert_allclose(of, exact(c, 0.0)[0], rtol=0, atol=1e-9)
@@ -284,7 +284,7 @@ def test_single_precision():
 def test_other_entries_of_params_stay_what_they_are():
     """Integers, truth values, text and a cubic signal beside the held one."""
     system = jl.System(lambda qdot, n: 0.5 * n * qdot**2, force=lambda t, u, w, on, name: u(t) + w(t) * on if name == "both" else u(t))
-    w = jl.Signal(np.linspace(0, 2, 9), np.ones(9), jl.Cubic())
+    w = jl.Signal(np.linspace(0, 2, 9), np.ones(9), jl.interpolation.Cubic())
     params = {"n": np.array(2), "on": np.array(True), "name": "both", "w": w, "u": HELD}
     slope = lambda c: jl.simulate(system, 0.0, 0.0, SAMPLES["coarse"], params | {"c": c}).qdot[-1]
     alone = jl.simulate(CART, 0.0, 0.0, SAMPLES["coarse"], {"m": M, "b": 0.0, "u": HELD}).qdot[-1]
@@ -295,10 +295,10 @@ def test_other_entries_of_params_stay_what_they_are():
 @pytest.mark.slow
 def test_a_failure_has_its_reason():
     motion = jl.simulate(CART, 0.0, 0.0, SAMPLES["coarse"], PARAMS | {"u": HELD}, max_steps=50, throw=False)
-    assert motion.result == jl.RESULTS.max_steps_reached
+    assert motion.result == jl.results.RESULTS.max_steps_reached
     assert np.isfinite(motion.q[0]) and np.isnan(motion.q[-1])
     fading = jl.System(lambda qdot, m: 0.5 * m * qdot**2, force=lambda t, u: u(t) / jnp.maximum(0.8 - t, 0.0))
-    assert jl.simulate(fading, 0.0, 0.0, SAMPLES["coarse"], {"m": M, "u": HELD}, throw=False).result != jl.RESULTS.successful
+    assert jl.simulate(fading, 0.0, 0.0, SAMPLES["coarse"], {"m": M, "u": HELD}, throw=False).result != jl.results.RESULTS.successful
 
 
 @pytest.mark.slow

@@ -29,10 +29,10 @@ def test_sizes():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("interpolation", [jl.ZeroOrderHold(), jl.Linear(), jl.Cubic()])
+@pytest.mark.parametrize("interpolation", [jl.interpolation.ZeroOrderHold(), jl.interpolation.Linear(), jl.interpolation.Cubic()])
 def test_a_motion_is_that_without_padding(interpolation):
     """Compared with the program that is compiled for its own length within `jit`, in all that a motion shows."""
-    over_knots = isinstance(interpolation, jl.Cubic)  # u‴ jumps within steps, whose error rounding moves
+    over_knots = isinstance(interpolation, jl.interpolation.Cubic)  # u‴ jumps within steps, whose error rounding moves
     exactly = 1e-11 if over_knots else 1e-12
     padded = motion(37, interpolation, works=True)
     plain = jax.jit(lambda b: motion(37, interpolation, b, works=True))(0.3)
@@ -48,14 +48,14 @@ def test_a_motion_is_that_without_padding(interpolation):
 @pytest.mark.parametrize("derivative, tolerance", [(jax.grad, 1e-8), (jax.jacfwd, 1e-8), (jax.hessian, 1e-12)])
 def test_its_derivatives_are_those_without_padding(derivative, tolerance):
     """The second at a tolerance for which the kinks of the input do not show."""
-    work = lambda b: jnp.sum(motion(37, jl.Linear(), b, rtol=tolerance).qddot ** 2)
+    work = lambda b: jnp.sum(motion(37, jl.interpolation.Linear(), b, rtol=tolerance).qddot ** 2)
     np.testing.assert_allclose(derivative(work)(0.3), jax.jit(derivative(work))(0.3), rtol=1e-8)
 
 
 @pytest.mark.slow
 def test_many_lengths_compile_few_programs(lowered):
     """The motions of a loop over recordings; what cuts them to length is compiled for each, in hundredths of a second."""
-    ends = [float(motion(length, jl.Linear()).q[-1]) for length in range(101, 129)]
+    ends = [float(motion(length, jl.interpolation.Linear()).q[-1]) for length in range(101, 129)]
     sizes = {(padded_size(length), padded_size(length - 3)) for length in range(101, 129)}  # of the samples, and of the input
     assert 1 <= sum(count for name, count in lowered.items() if "_trajectory" in str(name)) <= len(sizes) <= 8
     np.testing.assert_allclose(ends, ends[0], rtol=1e-2)

@@ -60,7 +60,7 @@ def test_pulses_of_any_kind(load):
 
 @pytest.mark.slow
 def test_pulses_of_signals_and_of_constraints_and_of_states():
-    signal = jl.Signal(TABLE, pulse(TABLE), jl.Cubic())
+    signal = jl.Signal(TABLE, pulse(TABLE), jl.interpolation.Cubic())
     motion = jl.simulate(jl.System(T, force=lambda t, u: u(t)), 0.0, 0.0, TS, {"u": signal})
     np.testing.assert_allclose(motion.q[-1], MOVED, rtol=2e-5)
     guided = jl.System(

@@ -133,7 +133,7 @@ def test_a_support_that_moves_takes_a_start_at_rest_along(rate, search, searched
 def test_a_support_that_begins_to_move_at_the_start(searched):
     """Recorded from before: what rests has to move along with what follows."""
     lift = jl.System(lambda qdot: 0.5 * qdot @ qdot, holonomic=lambda t, q, way: q[1] - way(t))
-    way = jl.Signal(np.array([-1.0, 0.0, 2.0]), np.array([0.0, 0.0, 1.4]), jl.Linear())
+    way = jl.Signal(np.array([-1.0, 0.0, 2.0]), np.array([0.0, 0.0, 1.4]), jl.interpolation.Linear())
     motion = jl.simulate(lift, np.zeros(2), np.array([0.2, 0.0]), [0.0, 1.0], {"way": way})
     assert searched == ["all"]
     np.testing.assert_allclose([motion.q[-1], motion.qdot[0]], [[0.2, 0.7]] * 2, rtol=1e-12)

@@ -334,20 +334,6 @@ def test_systems_are_compared_by_their_functions():
     assert repr(pendulum.polar) == "System(lagrangian; holonomic: rod)"
 
 
-@pytest.mark.slow
-def test_old_spellings_work_and_say_the_new_ones():
-    spring = jl.System(lambda q, qdot: 0.5 * qdot**2 - 0.5 * q**2)
-    with pytest.warns(DeprecationWarning, match="`audit` is now called `works`. Write `works`."):
-        motion = jl.simulate(spring, 1.0, 0.0, jnp.linspace(0, 1, 3), audit=True)
-    assert motion.works is not None
-    with pytest.warns(DeprecationWarning, match="`stated` is now called `provenance`"):
-        assert motion.stated is motion.provenance
-    with pytest.warns(DeprecationWarning, match="`Rubbing` is now called `FrictionState`"):
-        assert jl.Rubbing is jl.FrictionState
-    with pytest.raises(AttributeError, match="has no attribute 'Rubber'"):
-        jl.Rubber  # noqa: B018
-
-
 def test_reasons_of_failure_travel_through_diffrax():
     """Its own reasons have the same numbers in both enumerations, ours are beyond them."""
     for name in diffrax.RESULTS._name_to_item:

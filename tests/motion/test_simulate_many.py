@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 
 import jaxlag as jl
-from jaxlag._motion.simulate_many import _choice_of_steps
 from jaxlag.examples import pendulum
 
 OSCILLATOR = jl.System(lambda q, qdot, m, c: 0.5 * m * qdot**2 - 0.5 * c * q**2, dissipation={"damper": lambda qdot, b: 0.5 * b * qdot**2})
@@ -102,17 +101,6 @@ def test_bad_input(over, common_steps, message):
         jl.simulate_many(OSCILLATOR, 1.0, 0.0, TS, {"m": 2.0, "c": 3.0, "b": jnp.ones(3)}, over=over, common_steps=common_steps)
 
 
-def test_the_old_spelling_of_common_steps():
-    one = lambda **how: jl.simulate_many(OSCILLATOR, 1.0, 0.0, TS, {"m": 2.0, "c": 3.0, "b": jnp.ones(3)}, over=("b",), **how).q
-    with pytest.warns(DeprecationWarning, match="`steps` is now called `common_steps`. Write `common_steps`."):
-        old = one(steps="own")
-    np.testing.assert_array_equal(old, one(common_steps=False))
-    with pytest.raises(ValueError, match='`steps` must be "common" or "own", but is \'both\''):
-        one(steps="both")
-    with pytest.raises(ValueError, match="`common_steps` must be True or False, but is 'both'"):
-        _choice_of_steps("both", None)  # under the hook of these tests `simulate_many` is refused before
-
-
 @pytest.mark.slow
 def test_a_failure_is_raised_with_its_reason():
     with pytest.raises(ValueError, match="must be finite"):
@@ -124,7 +112,6 @@ import jax
 jax.config.update("jax_enable_x64", True)
 import jax.numpy as jnp
 import jaxlag as jl
-from jaxlag._motion.simulate_many import _choice_of_steps
 oscillator = jl.System(lambda q, qdot, c: 0.5 * qdot**2 - 0.5 * c * q**2)
 c = jnp.linspace(1, 4, 13)
 end = lambda c: jl.simulate_many(oscillator, 1.0, 0.0, jnp.linspace(0, 3, 4), {"c": c}, over=("c",)).q[:, -1]

@@ -148,3 +148,18 @@ def test_many_free_points_of_unlike_masses():
     m[3] = 0.0
     with pytest.raises(ValueError, match="mass matrix is singular"):
         jl.acceleration(system, q, 0 * q, {"m": m})
+
+
+def test_works_beside_the_usual_tolerances():
+    """Overdamped oscillators, each alone: by the two rates of each; the heat is the energy that is lost."""
+    k, c, t = np.geomspace(1.0, 100.0, 64), 1e3, 1.0
+    energy = lambda q, qdot, k: 0.5 * jnp.sum(qdot**2) - 0.5 * jnp.sum(k * q**2)
+    system = jl.System(energy, dissipation={"oil": lambda qdot, c: 0.5 * c * jnp.sum(qdot**2)})
+    found = jl.simulate(system, np.ones(64), np.zeros(64), [0.0, t], {"k": k, "c": c}, solver=STIFF, works=True)
+    fast = -(c + np.sqrt(c**2 - 4 * k)) / 2
+    slow = k / fast
+    expected = (fast * np.exp(slow * t) - slow * np.exp(fast * t)) / (fast - slow)
+    speed = fast * slow * (np.exp(slow * t) - np.exp(fast * t)) / (fast - slow)
+    np.testing.assert_allclose(found.q[-1], expected, rtol=1e-7)
+    np.testing.assert_allclose(found.work()["oil"][-1], 0.5 * np.sum(speed**2 + k * (expected**2 - 1)), rtol=1e-6)
+    assert np.max(np.abs(found.balance())) < 1e-6

@@ -15,7 +15,7 @@ MUD = lambda q, qdot, a, b: 0.5 * jnp.where(q > a, b, 0.0) * qdot**2  # thick be
 STOP = lambda q, a, c: -0.5 * c * jnp.maximum(q - a, 0.0) ** 2
 EDGES = {
     "plain": jl.Event(lambda q, a: q - a),
-    "rising": jl.Event(lambda q, a: 1e3 * (q - a), direction=jl.Rising()),
+    "rising": jl.Event(lambda q, a: 1e3 * (q - a), direction=jl.direction.Rising()),
     "curved": jl.Event(lambda q, a: (a - q) * (3 * a**2 + q**2)),
 }
 

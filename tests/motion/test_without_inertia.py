@@ -375,8 +375,8 @@ def test_a_slider_under_steps_and_ramps_of_its_load():
             found.append(z)
         return np.array(found)
 
-    np.testing.assert_allclose(run(jl.ZeroOrderHold())[4::8], exact(load)[:5], rtol=0, atol=1e-12)
-    np.testing.assert_allclose(run(jl.Linear()), exact(np.interp(ts, nodes, load)), rtol=0, atol=1e-12)
+    np.testing.assert_allclose(run(jl.interpolation.ZeroOrderHold())[4::8], exact(load)[:5], rtol=0, atol=1e-12)
+    np.testing.assert_allclose(run(jl.interpolation.Linear()), exact(np.interp(ts, nodes, load)), rtol=0, atol=1e-12)
 
 
 # Beside contact, events and states

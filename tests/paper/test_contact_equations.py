@@ -16,7 +16,7 @@ def rub(qdot, multipliers, mu):
 
 
 floor = jl.Contact(lambda q, r: q["y"] - r, restitution=lambda e: e)
-wall = jl.Contact(lambda q: q["x"], 0.5, jl.Poisson())
+wall = jl.Contact(lambda q: q["x"], 0.5, jl.PoissonRestitution())
 in_a_corner = jl.System(ball, dissipation=rub, unilateral={"floor": floor, "wall": wall})
 
 

@@ -110,19 +110,6 @@ def test_the_pendulum_has_the_lectures_acceleration_and_rod_force():
     assert "m r̈ − m r φ̇² − m g cos φ = λ" in str(full)
 
 
-@pytest.mark.parametrize("style, multipliers", [("second kind", False), ("first kind", True)])
-def test_the_old_style_is_deprecated(style, multipliers):
-    system = pendulum.polar, {"r", "phi"}, {"m", "l", "g"}
-    with pytest.warns(DeprecationWarning, match=f'`style="{style}"` is now called `multipliers={multipliers}`. Write `multipliers='):
-        old = jl.equations(*system, style=style)
-    new = jl.equations(*system, multipliers=multipliers)
-    assert str(old) == str(new) and old.with_multipliers is new.with_multipliers is multipliers
-    with pytest.warns(DeprecationWarning, match="`Equations.style` is now called `Equations.with_multipliers`"):
-        assert new.style == style
-    with pytest.raises(ValueError, match='`style` must be "second kind" or "first kind", but is \'third\'. Write `multipliers=True`'):
-        jl.equations(*system, style="third")
-
-
 def test_friction_that_depends_on_a_multiplier():
     rub = lambda qdot, multipliers, mu: mu * jnp.abs(multipliers["floor"]) * jnp.abs(qdot["x"])
     energy = lambda q, qdot, m, g: 0.5 * m * (qdot["x"] ** 2 + qdot["y"] ** 2) - m * g * q["y"]

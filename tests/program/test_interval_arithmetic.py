@@ -5,8 +5,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxlag import Cubic, Linear, Signal, ZeroOrderHold
+from jaxlag import Signal
 from jaxlag._program.time_bounds import time_dependence
+from jaxlag.interpolation import Cubic, Linear, ZeroOrderHold
 
 rng = np.random.default_rng(5)
 TS = np.sort(rng.uniform(-3, 3, 40))

@@ -195,7 +195,7 @@ def test_signals_errors_and_closed_over_numbers(compilation_cache, tmp_path, low
     """A signal is asked for the present time by the very number t; a wrong call before, and numbers that are traced, spoil nothing."""
     jl.keep_compiled(tmp_path)
     driven = lambda: jl.System(lambda q, qdot: 0.5 * qdot**2, force=lambda t, u: u(t))
-    signal = {"u": jl.Signal(TS, 2 * TS, jl.Linear())}
+    signal = {"u": jl.Signal(TS, 2 * TS, jl.interpolation.Linear())}
     for _ in range(2):
         np.testing.assert_allclose(motion(driven(), signal), 1 + TS**3 / 3, atol=1e-7)
     assert lowered["jit(_trajectory)"] == 1

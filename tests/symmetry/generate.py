@@ -185,6 +185,6 @@ def drawn(kind: str, n: int, seed: int) -> Case:
     if kind == "controller":
         params["gain"] = draw.uniform(0.5, 1)
     if kind in ("signal", "ramp"):
-        how = jl.ZeroOrderHold() if kind == "signal" else jl.Linear()
+        how = jl.interpolation.ZeroOrderHold() if kind == "signal" else jl.interpolation.Linear()
         params["input"] = jl.Signal(np.arange(9) / 2.0, draw.normal(size=9), how)
     return Case(kind, kinds, q0, v0, params, STATES.get(kind, MappingProxyType({})), "restitution" if kind == "contact" else None)

@@ -1,0 +1,25 @@
+"""What functions of jaxlag return: for annotations and `isinstance`; none of these is made by hand."""
+
+from ._fit.assess import Comparison as Comparison, Information as Information, Validation as Validation
+from ._fit.channels import Channel as Channel
+from ._fit.regress import Regression as Regression
+from ._fit.result import Fit as Fit, Interval as Interval, Prediction as Prediction
+from ._linear.equilibrium import Equilibrium as Equilibrium
+from ._linear.linear_system import LinearSystem as LinearSystem
+from ._linear.modes import Modes as Modes
+from ._linear.periodic import PeriodicOrbit as PeriodicOrbit
+from ._linear.root_locus import Crossing as Crossing, RootLocus as RootLocus
+from ._linear.stability_map import StabilityMap as StabilityMap
+from ._mechanics.acceleration import Acceleration as Acceleration
+from ._mechanics.examine import Examination as Examination
+from ._mechanics.lagrange import Residual as Residual
+from ._motion.moments import ContactState as ContactState, EventState as EventState
+from ._motion.results import RESULTS as RESULTS
+from ._motion.trajectory import (
+    FrictionState as FrictionState,
+    Instant as Instant,
+    Interpolated as Interpolated,
+    Trajectory as Trajectory,
+)
+from ._paper.linearised_result import LinearisedEquations as LinearisedEquations
+from ._paper.result import Equations as Equations
