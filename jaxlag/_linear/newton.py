@@ -46,16 +46,16 @@ def root_near(
     units of the coordinates whose forces the first equations are; behind the first `ways` unknowns come forces, as multipliers are.
     """
     fixed, guess = jax.lax.stop_gradient((args, guess))
-    slope = lambda w: _felt(jax.jacfwd(residual, 1)(fixed, w), forces_on, units)
-    units = jax.lax.stop_gradient(units_beside(slope(guess), units))
+    slope = lambda w, units: _felt(jax.jacfwd(residual, 1)(fixed, w), forces_on, units)
+    units = jax.lax.stop_gradient(units_beside(slope(guess, units), units))
     of = jnp.where(units > 0, units, 1)
 
     def changes(w):
-        J = slope(w)
+        J = slope(w, units)
         return lambda w: -least_change(J, residual(fixed, w), ease * of)
 
     w, reach = newton(changes, guess, units, ways)
-    J, terms = slope(w), _terms(residual, fixed, w)
+    J, terms = slope(w, units), _terms(residual, fixed, w)
     reach = jnp.where(units > 0, reach, jnp.maximum(reach, _reach_of_forces(J[: forces_on.size], terms[: forces_on.size], forces_on)))
     root = root_of_size(residual(fixed, w), J, terms, w, reach)
     return root._replace(w=differentiable_root(residual, args, w, of, forces_on))

@@ -31,7 +31,6 @@ class SparseEquations:
     residual: Residual
     places: Places
     alone: np.ndarray
-    ways: int  # how many unknowns are not multipliers
 
     @classmethod
     def of(cls, residual: Residual, args: Any, w: Float[Array, " u"], last: int) -> "SparseEquations | None":
@@ -42,7 +41,7 @@ class SparseEquations:
             return None
         coupled = (np.diff(pattern.indptr) > 0) | (np.diff(scipy.sparse.csc_matrix(pattern).indptr) > 0)
         places = sparse_places(pattern, last, BY_VALUES)
-        return None if places is None else cls(residual, places, (~coupled).astype(float), last)
+        return None if places is None else cls(residual, places, (~coupled).astype(float))
 
     def jacobian(self, args: Any, w: Float[Array, " u"]) -> SparseMatrix:
         """J, with zeros for what is alone."""
@@ -81,7 +80,7 @@ def sparse_root_near(equations: SparseEquations, args: Any, guess: Float[Array, 
         return lambda w: refined(A.__matmul__, A.places, factors, -equations.oriented(equations.residual(fixed, w)))
 
     units = sparse_units_beside(equations.jacobian(fixed, guess), units)
-    w, reach = newton(changes, jax.lax.stop_gradient(guess), units, equations.ways)
+    w, reach = newton(changes, jax.lax.stop_gradient(guess), units, equations.places.last or 0)
     J = equations.jacobian(fixed, w)
     residual = lambda w: equations.residual(fixed, w)
     root = root_of_size(residual(w), J, size_of_terms(residual, w), w, reach)
