@@ -1,4 +1,8 @@
-"""Pictures of motions, fits and equations. Matplotlib is imported when the first one is drawn; no function shows or stores a figure."""
+"""Pictures of motions, fits and equations. Matplotlib is imported when the first one is drawn; no function shows or stores a figure.
+
+`motion.plot()` is short for `plot.motion(motion)`, `motion.animate(points)` for `plot.animate(motion, points)`; fits, modes, root loci,
+stability maps and equations have their `plot()`, too.
+"""
 
 from typing import Any
 
@@ -13,6 +17,11 @@ from ._draw.linear import bode, nyquist, root_locus
 from ._draw.mode_shapes import mode_shapes
 from ._draw.motion import balance, energy, motion, phase
 from ._draw.stability_map import stability_map
+from ._fit.result import Fit
+from ._linear.modes import Modes
+from ._linear.root_locus import RootLocus
+from ._linear.stability_map import StabilityMap
+from ._motion.trajectory import Trajectory
 from ._paper.linearised_result import LinearisedEquations
 from ._paper.result import Equations
 
@@ -72,3 +81,18 @@ def equations(on_paper: Equations | LinearisedEquations, *, ax: Any = None) -> A
         sizes = np.array([text.get_window_extent().size for text in texts]) / ax.figure.dpi
         ax.figure.set_size_inches(sizes[:, 0].max(), 1.4 * len(rows) * sizes[:, 1].max())
     return ax
+
+
+SHORT_WAYS: tuple[tuple[type, str, Any], ...] = (  # what is computed knows nothing of pictures; the usual one of each is a method of it
+    (Trajectory, "plot", motion),
+    (Trajectory, "animate", animate),
+    (Fit, "plot", fit),
+    (Modes, "plot", mode_shapes),
+    (Modes, "animate", animate),
+    (RootLocus, "plot", root_locus),
+    (StabilityMap, "plot", stability_map),
+    (Equations, "plot", equations),
+    (LinearisedEquations, "plot", equations),
+)
+for _of, _name, _draw in SHORT_WAYS:
+    setattr(_of, _name, _draw)

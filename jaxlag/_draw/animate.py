@@ -13,7 +13,7 @@ from .._mechanics.acceleration import constraint_force
 from .._model.injection import call
 from .._motion.trajectory import Trajectory
 from .animation import Animation
-from .axes import Units, one_motion
+from .axes import Units, one_motion, units_of
 from .mode_on_points import ModesOnPoints, as_many, draw_at_rest, said
 from .moving_picture import POINTS_PER_FRAME, MovingPicture
 
@@ -96,7 +96,7 @@ def animate(
     at = _frame_times(np.asarray(motion.ts), fps, 1.0 if speed is None else speed)
     tracks = {name: _track(motion, at, name, point) for name, point in points.items()}
     arrows = {name: _forces(motion, at, name, {point: points[point] for point in on}) for name, on in acting.items()}
-    picture = MovingPicture.of(at, tracks, links, arrows, trail, units, ax)
+    picture = MovingPicture.of(at, tracks, links, arrows, trail, units_of(motion.provenance.units, units), ax)
     return Animation(picture.ax, at.size, fps, picture.draw)
 
 

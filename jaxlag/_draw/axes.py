@@ -98,6 +98,11 @@ def zero_line(ax: Any) -> None:
     ax.axhline(0.0, color=GREY, linewidth=0.8, zorder=0.5)
 
 
+def units_of(stated: tuple[tuple[str, str], ...], given: Units) -> dict[str, str]:
+    """The units that a system states, and those given in their place."""
+    return dict(stated) | dict(given or {})
+
+
 def label(name: str, units: Units, of: str | None = None) -> str:
     """A name with its unit, or with that of another quantity."""
     unit = (units or {}).get(of or name)
@@ -114,6 +119,7 @@ def over_time(
     prefix: str = "",
 ) -> tuple[Any, dict[str, dict[str, np.ndarray]]]:
     """A panel for each requested quantity, over a common time axis; and these quantities."""
+    units = units_of(trajectory.provenance.units, units)
     shown = {name: quantities[name] for name in chosen(names, tuple(quantities), f"{what}s")}
     drawn = panels(axes, (len(shown), 1), f"one for each {what}", figsize=(6.4, 1.0 + 1.7 * len(shown)))[:, 0]
     for ax, (name, entries) in zip(drawn, shown.items(), strict=True):

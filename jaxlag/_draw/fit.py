@@ -10,7 +10,7 @@ import numpy as np
 from .._fit.experiment import Experiment
 from .._fit.result import Fit
 from .._fit.rounding import plus_minus
-from .axes import GREY, Units, canvas, channels, chosen, colour, label, legend_above, legend_beside, panels
+from .axes import GREY, Units, canvas, channels, chosen, colour, label, legend_above, legend_beside, panels, units_of
 
 MOST_PARAMETERS = 40  # in one picture
 MOST_WITH_NUMBERS = 8  # up to which correlations are written as numbers
@@ -31,7 +31,8 @@ def fit(fit: Fit, *, number: int = 0, level: float = 0.95, units: Units = None, 
     - `fit`: the result of `jaxlag.fit`.
     - `number`: the index of the experiment to draw.
     - `level`: the level of the confidence band.
-    - `units`: units by name of channel, and of `"t"`, written on the axes. A recording that is one array is named `"z"`.
+    - `units`: units by name of channel, and of `"t"`, written on the axes in place of those of the system. A recording that is one array
+      is named `"z"`.
     - `axes`: matplotlib axes to draw in, 2 × number of channels. Default: a new figure.
 
     **Returns:** the axes, an array of shape (2, channels).
@@ -52,7 +53,7 @@ def fit(fit: Fit, *, number: int = 0, level: float = 0.95, units: Units = None, 
     axes.shape  # (2, 3)
     ```
     """
-    experiment = fit.experiments[number]
+    experiment, units = fit.experiments[number], units_of(fit.units, units)
     if not isinstance(experiment, Experiment):
         what = type(experiment).__name__
         raise ValueError(

@@ -20,6 +20,7 @@ from .axes import (
     one_motion,
     over_time,
     panels,
+    units_of,
     zero_line,
 )
 
@@ -66,6 +67,7 @@ def forces(trajectory: Trajectory, names: Sequence[str] | None = None, *, units:
             "`trajectory` must be of a system with constraints, but it has none. State them with `System(..., holonomic=...)`, "
             "or draw its coordinates with `plot.motion`."
         )
+    units = units_of(trajectory.provenance.units, units)
     drawn, shown = over_time(trajectory, multipliers, names, "constraint", units, axes, prefix="λ ")
     pulling = channels(trajectory.pulling(), "λ")
     for ax, (name, entries) in zip(drawn, shown.items(), strict=True):
@@ -119,6 +121,7 @@ def friction(trajectory: Trajectory, names: Sequence[str] | None = None, *, unit
             "`trajectory` must have dry friction that sticks and slips, but has none. Write it as a nonsmooth term, e.g. "
             "`F * jnp.abs(qdot)`, and simulate with `friction=StickSlip()`, which is the default."
         )
+    units = units_of(trajectory.provenance.units, units)
     names = chosen(names, tuple(trajectory.friction), "dissipation terms with dry friction")
     slip = channels(trajectory.slip(), "")
     force = channels({name: rubbing.force for name, rubbing in trajectory.friction.items()}, "")
@@ -158,7 +161,7 @@ def _contact(ax, trajectory, name, units):
         right.plot(times, impulses[struck], "o", markersize=4, color=COLOURS[1])
         ax.plot([], [], "-o", markersize=4, color=COLOURS[1], label="impulse")
         right.set_ylim(top * min(low / high, 0) if high > 0 else 0, top)
-        unit, time = (units or {}).get(name), (units or {}).get("t")
+        unit, time = units.get(name), units.get("t")
         right.set_ylabel(label(f"Λ {name}", {f"Λ {name}": f"{unit} {time}"} if unit and time else None))
     return bool(closed) or bool(times.size)
 

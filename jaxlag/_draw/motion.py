@@ -20,6 +20,7 @@ from .axes import (
     one_motion,
     over_time,
     panels,
+    units_of,
     zero_line,
 )
 
@@ -39,7 +40,8 @@ def motion(trajectory: Trajectory, names: Sequence[str] | None = None, *, units:
     - `trajectory`: one motion, as `simulate` returns it.
     - `names`: the coordinates to draw, in this order, by their path in q (`"phi"`, `"body.x"`, `"q"` where q is one array), and states
       by their path in `trajectory.states`. Default: all.
-    - `units`: units by name of coordinate, and of `"t"`, written on the axes, e.g. `{"t": "s", "phi": "rad"}`.
+    - `units`: units by name of coordinate, and of `"t"`, written on the axes, e.g. `{"t": "s", "phi": "rad"}`; those that are not given
+      are those of the system, here and in all pictures of motions and fits.
     - `axes`: matplotlib axes to draw in, as many as there are coordinates. Default: a new figure with a common time axis.
 
     **Returns:** the axes, an array of shape (n,).
@@ -102,6 +104,7 @@ def phase(trajectory: Trajectory, names: Sequence[str] | None = None, *, units: 
     ax.get_ylabel()  # dx/dt (m/s)
     ```
     """
+    units = units_of(trajectory.provenance.units, units)
     positions, velocities = (channels(tree, "q") for tree in (one_motion(trajectory).q, trajectory.qdot))
     names = chosen(names, tuple(positions), "coordinates")
     entries = [(name, entry, x, velocities[name][entry]) for name in names for entry, x in positions[name].items()]
@@ -114,10 +117,10 @@ def phase(trajectory: Trajectory, names: Sequence[str] | None = None, *, units: 
         ax, own = panels(ax, shape, "one for each number, or one for all", sharex=False, figsize=(1.0 + 3.4 * len(entries), 3.6))[0], True
     for one, (_, entry, x, v) in zip(np.broadcast_to(ax, len(entries)), entries, strict=True):
         one.plot(x, v, color=colour(len(one.lines)), marker="o", markevery=[0], label=entry)
-    alike = {(units or {}).get(name) for name in names}
+    alike = {units.get(name) for name in names}
     named = [(name, entry) for name, entry, *_ in entries] if own else [(names[0], names[0] if len(names) == 1 else "q")]
     for one, (name, whose) in zip(np.ravel(ax), named, strict=True):
-        unit, time = (units or {}).get(name) if own or len(alike) == 1 else None, (units or {}).get("t")
+        unit, time = units.get(name) if own or len(alike) == 1 else None, units.get("t")
         one.set_xlabel(label(whose, {whose: unit} if unit else None))
         one.set_ylabel(label(f"d{whose}/dt", {f"d{whose}/dt": f"{unit}/{time}"} if unit and time else None))
     if len(entries) > 1 and not own:
@@ -164,6 +167,7 @@ def energy(trajectory: Trajectory, *, units: Units = None, ax: Any = None) -> An
             curve(ax, ts, work, color=colour(len(ax.lines)), label=f"work of {name}")
         ax.plot(ts, h[0] + sum(np.asarray(work) for work in trajectory.works.values()), "k--", label="initial energy + work")
         zero_line(ax)
+    units = units_of(trajectory.provenance.units, units)
     ax.set_xlabel(label("t", units))
     ax.set_ylabel(label("energy", units))
     legend_above(ax)
@@ -215,6 +219,7 @@ def balance(trajectory: Trajectory, *, units: Units = None, ax: Any = None) -> A
     ax.set_ylim(-height, height)
     ax.set_xlim(float(trajectory.ts[0]), float(trajectory.ts[-1]))
     ax.axhline(0.0, color="black", linewidth=0.8)
+    units = units_of(trajectory.provenance.units, units)
     ax.set_xlabel(label("t", units))
     ax.set_ylabel(f"← from    {label('energy', units)}    to →")
     legend_above(ax, 4)

@@ -1,7 +1,7 @@
 """The printed card of a fit: a table of the parameters, remarks, and a table of the channels."""
 
 import itertools
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import jax
@@ -56,18 +56,26 @@ def _heading(fit):
 def _parameter_rows(fit):
     """Estimates, errors and intervals; many numbers of one name in one row."""
     groups = list(estimates_by_name(fit))
-    named = [(name, _estimate(fit, v, e)) for _, group in groups if len(group) <= MANY for name, v, e in group]
+    units = dict(fit.units)
+    of = lambda name, whose: f" {unit}" if (unit := unit_of(name, whose, units)) else ""
+    named = [(name, _estimate(fit, v, e, of(name, whose))) for whose, group in groups if len(group) <= MANY for name, v, e in group]
     named += [(name, _counted(group)) for name, group in groups if len(group) > MANY]
     width = max((len(name) for name, _ in named[:ROWS]), default=0)
     rows = [f"  {name:<{width}}  {text}" for name, text in named[:ROWS]]
     return rows + ([f"  … and {len(named) - ROWS} more"] if len(named) > ROWS else [])
 
 
-def _estimate(fit, value, error):
+def unit_of(name: str, whose: str, units: Mapping[str, str]) -> str:
+    """The unit of one number of a name, or of that name; of a start, that of its coordinate. Empty where it is not stated."""
+    entry = name.removeprefix(whose).lstrip(".").partition("[")[0] if whose.endswith(": q0") else ""
+    return next((units[key] for key in (name, whose, entry) if key in units), "")
+
+
+def _estimate(fit, value, error, unit):
     if not np.isfinite(error):
-        return "not determined by these measurements" if np.isinf(error) else f"{value:.6g}"
+        return "not determined by these measurements" if np.isinf(error) else f"{value:.6g}{unit}"
     t = fit.quantile(0.95)
-    return f"{plus_minus(value, error):<24} 95 %: {rounded(value - t * error, error)} … {rounded(value + t * error, error)}"
+    return f"{plus_minus(value, error) + unit:<24} 95 %: {rounded(value - t * error, error)} … {rounded(value + t * error, error)}"
 
 
 def _counted(group):

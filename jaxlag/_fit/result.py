@@ -3,7 +3,7 @@
 import dataclasses
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -14,7 +14,7 @@ from .._motion.export import frame_of, jsonable, write_json
 from .channel_sigma import sigmas_of
 from .channels import Channel
 from .experiment import Experiment
-from .fit_card import card, estimates_by_name
+from .fit_card import card, estimates_by_name, unit_of
 from .linear_test import LinearTest
 from .prediction import Prediction, predicted, predicted_test
 from .problem import Problem
@@ -81,7 +81,7 @@ class Fit:
     - `led_in`: by which steps the start was found, where it was not `params` (`Regress`).
     - `problem`, `x`, `x_covariance`: the least-squares problem, all its unknowns at the minimum, and their covariance over σ̂².
 
-    Quantities have the units of the parameters and measurements, any consistent set.
+    Quantities have the units of the parameters and measurements, any consistent set. `fit.plot()` draws it, with all that `plot.fit` takes.
 
     **Source:** Ljung, System Identification, 2nd ed., sections 7.2, 9.2 to 9.4 and 16; Seber & Wild, Nonlinear Regression (1989),
     chapter 5; Newey & West, Econometrica 55 (1987) 703.
@@ -128,6 +128,14 @@ class Fit:
     correlated: int
     led_in: tuple[str, ...] = ()
     exact: int = 0
+
+    if TYPE_CHECKING:  # put here by `jaxlag.plot`
+        plot: ClassVar[Callable[..., Any]]
+
+    @property
+    def units(self) -> tuple[tuple[str, str], ...]:
+        """The units that the system states, as (name, unit)."""
+        return self.problem.model.system.units
 
     @property
     def freedom(self) -> int:
@@ -235,7 +243,8 @@ class Fit:
         """The fit as plain data for `json.dumps`. None stands for a number that does not exist, e.g. the error of an undetermined one.
 
         - `"parameters"`: a row for each number, of the parameters and then of each experiment's unknowns, with `"name"`, `"value"`,
-          `"standard_error"`, `"lower"` and `"upper"` at the confidence `level`. `"params"`: all parameters as nested dicts.
+          `"standard_error"`, `"lower"` and `"upper"` at the confidence `level`, and its `"unit"` where the system states
+          units. `"params"`: all parameters as nested dicts.
         - `"channels"`, and the fields and properties of `Fit` that are numbers or text, under their names.
         """
         copied = ("names", "correlation", "covariance", "remarks", "sigma", "absolute", "cost", "costs", "aic", "bic", "measurements")
@@ -244,7 +253,7 @@ class Fit:
         return jsonable({"parameters": rows, "level": level} | parts | {"channels": channels})
 
     def to_dataframe(self, frame: Callable | None = None, *, level: float = 0.95) -> Any:
-        """A table with a row for each number: name, value, standard_error, lower, upper.
+        """A table with a row for each number: name, value, standard_error, lower, upper, and unit where the system states units.
 
         **Arguments:** `frame`: the class of data frames, as for `Trajectory.to_dataframe`; `level`: of the intervals.
 
@@ -260,12 +269,13 @@ class Fit:
         write_json(file, "Fit", {"card": str(self)} | self.to_dict(level=level))
 
     def _rows(self, level: float) -> Iterator[dict[str, Any]]:
-        t = self.quantile(level)
-        for _, group in estimates_by_name(self):
+        t, units = self.quantile(level), dict(self.units)
+        for whose, group in estimates_by_name(self):
             for name, value, error in group:
                 lower, upper = self.interval(name, level) if name in self.names else (value - t * error, value + t * error)
                 numbers = {"value": value, "standard_error": error, "lower": lower, "upper": upper}
-                yield {"name": name} | {column: float(number) for column, number in numbers.items()}
+                unit = {"unit": unit_of(name, whose, units)} if units else {}
+                yield {"name": name} | {column: float(number) for column, number in numbers.items()} | unit
 
     def __repr__(self) -> str:
         return card(self)

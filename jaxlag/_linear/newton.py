@@ -48,7 +48,7 @@ def root_near(
     fixed, guess = jax.lax.stop_gradient((args, guess))
     slope = lambda w, units: _felt(jax.jacfwd(residual, 1)(fixed, w), forces_on, units)
     units = jax.lax.stop_gradient(units_beside(slope(guess, units), units))
-    of = jnp.where(units > 0, units, 1)
+    of = jax.lax.stop_gradient(_units_of_steps(slope(guess, units), units, forces_on))
 
     def changes(w):
         J = slope(w, units)
@@ -94,6 +94,16 @@ def units_beside(J: Float[Array, "r u"], units: Float[Array, " u"]) -> Float[Arr
         return jnp.where((units > 0) | ~jnp.isfinite(found), units, found)
 
     return jax.lax.fori_loop(0, min(TIES, units.size), turn, units.astype(J.dtype))
+
+
+def _units_of_steps(J: Float[Array, "r u"], units: Float[Array, " u"], forces_on: Float[Array, " f"]) -> Float[Array, " u"]:
+    """Units of all unknowns, for the length of a step. Those that nothing ties to a coordinate, as velocities and multipliers where forces
+    depend on no place, are measured by the forces that they make, of which one energy is taken.
+    """
+    energy = jnp.max(forces_on[:, None] * jnp.abs(J[: forces_on.size]), axis=0, initial=0.0)
+    units = jnp.where((units > 0) | (energy == 0), units, 1 / jnp.where(energy > 0, energy, 1))
+    units = units_beside(J, units)
+    return jnp.where(units > 0, units, 1)
 
 
 def _felt(J: Float[Array, "r u"], forces_on: Float[Array, " f"], units: Float[Array, " u"]) -> Float[Array, "r u"]:

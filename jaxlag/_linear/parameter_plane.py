@@ -94,7 +94,8 @@ class ParameterPlane:
             there = np.ones(count, bool)
             of = lambda x, y: (*given_state(self.q, self.qdot, self.t, self.at(x, y)), self.states)
             return [Row(*jax.vmap(of, in_axes=(None, 0))(x, self.values[1]), there, there) for x in self.values[0]]
-        q, qdot = state(coordinates(self.q, "q"), jax.tree.map(jnp.zeros_like, self.q) if self.qdot is None else self.qdot)
+        q = coordinates(self.q, "q")
+        q, qdot = state(q, jax.tree.map(jnp.zeros_like, q) if self.qdot is None else self.qdot)
         values = start_values(self.system, self.states, self.t, q, qdot, self.params)
         running = () if self.qdot is None else tuple(int(i) for i in np.flatnonzero(np.asarray(ravel_pytree(qdot)[0])))
         every = lambda tree, j: jax.tree.map(lambda x: np.broadcast_to(x[j], (count, *x.shape[1:])), tree)

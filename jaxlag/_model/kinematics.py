@@ -129,6 +129,7 @@ def substitute(system: System, coordinates: Callable) -> System:
         nonholonomic=pulled("nonholonomic", _PulledBack),
         one_sided=system.one_sided,
         states={name: _pulled_state(state, coordinates) for name, state in system.states},
+        units=dict(system.units),
     )
 
 

@@ -49,17 +49,19 @@ class System:
       sample times alone, as in a digital controller.
     - `events`: by name, `Event(when, then)`: what happens where a function of the state passes through zero, or at given times;
       `with_events(...)` gives the system with others.
+    - `units`: the units of what has a name, as text: coordinates, states, params, terms, channels of experiments, `"t"` and `"energy"`,
+      e.g. `{"t": "s", "x": "m", "b": "N s/m"}`. They are written beside what is drawn and fitted; nothing is computed with them.
 
     **Fields:** `lagrangian`, `dissipation`, `force`, `holonomic`, `unilateral` and `nonholonomic`, each a tuple of (name, function), which
     `dict(system.lagrangian)` gives to another system; `restitution` and `laws`, tuples of (name, number or function) and of (name, law);
-    `one_sided`, a tuple of names; `states` and `events`, tuples of (name, state) and of (name, event).
+    `one_sided`, a tuple of names; `states`, `events` and `units`, tuples of (name, state), (name, event) and (name, unit).
 
     Any consistent set of units. Functions may return plain numbers, integers or lists, which become floating arrays. A system is
     immutable, hashable and compared by its functions. Create it once: one created again from new functions is compiled again. What was
     compiled for it, and what its functions close over, stays in memory until `jax.clear_caches()`.
 
-    **Raises:** `TypeError` where a slot holds no function or `states` no state; `ValueError` where two terms have the same name, where
-    `one_sided` names no holonomic constraint, or where a position constraint depends on a state that q̇ drives or that jumps.
+    **Raises:** `TypeError` where a slot holds no function, `states` no state or `units` no text; `ValueError` where two terms have the same
+    name, where `one_sided` names no holonomic constraint, or where a position constraint depends on a state that q̇ drives or that jumps.
 
     **Source:** Goldstein, Classical Mechanics, 3rd ed., sections 1.5 and 2.4; sign of λ: M q̈ = f + Gᵀλ.
 
@@ -85,6 +87,7 @@ class System:
     one_sided: tuple[str, ...]
     states: Named
     events: tuple[tuple[str, Event], ...]
+    units: tuple[tuple[str, str], ...]
 
     def __init__(
         self,
@@ -98,6 +101,7 @@ class System:
         one_sided: Any = (),  # a name, or a collection of names
         states: Mapping[str, State | Sampled] | None = None,
         events: Mapping[str, Event] | None = None,
+        units: Mapping[str, str] | None = None,
     ):
         contacts = _contacts(unilateral)
         gaps = {name: contact.gap for name, contact in contacts.items()}
@@ -122,6 +126,7 @@ class System:
         object.__setattr__(self, "one_sided", tuple(name for name in known if name in given))
         object.__setattr__(self, "states", states_of(states))
         object.__setattr__(self, "events", events_of(events, contacts))
+        object.__setattr__(self, "units", _units(units))
         for slot in ("holonomic", "unilateral"):
             for name, function in getattr(self, slot):
                 _check_position(role(slot, name), function, dict(self.states))
@@ -143,7 +148,7 @@ class System:
     def __reduce__(self) -> Any:
         references = {slot: {name: picklable(f, role(slot, name)) for name, f in getattr(self, slot)} for slot in SLOTS}
         restitution = {name: picklable(e, f"`restitution` of {name!r}") if callable(e) else e for name, e in self.restitution}
-        return _unpickled, (references, self.one_sided, dict(self.states), restitution, dict(self.events), dict(self.laws))
+        return _unpickled, (references, self.one_sided, dict(self.states), restitution, dict(self.events), dict(self.laws), self.units)
 
     def __repr__(self) -> str:
         def listed(slot: str, terms: Terms) -> str:
@@ -165,12 +170,23 @@ class System:
         return (*(name for name, _ in (*self.dissipation, *self.force)), *self.constraints, EXPLICIT_TIME)
 
 
-def _unpickled(references: Any, one_sided: Any, states: Any = None, restitution: Any = None, events: Any = None, laws: Any = ()) -> System:
+def _unpickled(
+    references: Any, one_sided: Any, states: Any = None, restitution: Any = None, events: Any = None, laws: Any = (), units: Any = ()
+) -> System:
     slots = {slot: {name: unpickled(f) for name, f in terms.items()} for slot, terms in references.items()}
     laws = dict(laws)
     law = lambda name: laws.get(name, NewtonRestitution())
     contacts = {name: Contact(slots["unilateral"][name], unpickled(e), law(name)) for name, e in (restitution or {}).items()}
-    return System(**slots | {"unilateral": contacts}, one_sided=one_sided, states=states, events=events)
+    return System(**slots | {"unilateral": contacts}, one_sided=one_sided, states=states, events=events, units=dict(units))
+
+
+def _units(given: Any) -> tuple[tuple[str, str], ...]:
+    """The units by name."""
+    if given is not None and not (isinstance(given, Mapping) and all(isinstance(x, str) for x in (*given, *given.values()))):
+        raise TypeError(
+            f'`units` must be a mapping from names to units as text, but is {given!r}. Write e.g. `units={{"t": "s", "x": "m"}}`.'
+        )
+    return tuple((given or {}).items())
 
 
 def _contacts(given: Any) -> dict[str, Contact]:

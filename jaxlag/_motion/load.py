@@ -94,5 +94,12 @@ def _motion(about, arrays):
         friction={term: FrictionState(friction_states[f"{term}.force"], friction_states[f"{term}.sticking"]) for term in terms},
         contacts={name: ContactState(*(of_contacts[f"{name}.{field}"] for field in fields)) for name in contacts},
         events=events,
-        provenance=Recorded((energy["h"], energy["turned"]), part("slip"), tree("params"), tuple(about["one_sided"]), friction),
+        provenance=Recorded(
+            (energy["h"], energy["turned"]),
+            part("slip"),
+            tree("params"),
+            tuple(about["one_sided"]),
+            friction,
+            tuple(map(tuple, about.get("units", ()))),
+        ),
     )

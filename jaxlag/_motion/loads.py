@@ -53,7 +53,7 @@ def _loads(equations: Any, t, y, args: Arguments) -> dict[str, Any] | None:
         G = velocity_rows(flat, t, parts.q, parts.v)[1]
         G = SparseMatrix(jnp.abs(G.values), G.places) if isinstance(G, SparseMatrix) else jnp.abs(G)
         held = held + rate(G.T @ jnp.abs(equations.accelerated(t, parts, args, False).multipliers[: flat.rows]))
-        if equations.projection is not None:
+        if equations.projection is not None and not equations.works:  # which are integrals along what is given, too
             given = _prescribed(flat, t, parts.q)
     if elements is not None:
         slopes = jnp.abs(jax.jacfwd(lambda v: elements.slip(t, parts.q, v))(parts.v))

@@ -48,6 +48,11 @@ class Provenance(eqx.Module):
         """Names of the constraints that cannot pull."""
         return self.system.one_sided
 
+    @property
+    def units(self) -> tuple[tuple[str, str], ...]:
+        """The units of what has a name."""
+        return self.system.units
+
 
 class Recorded(eqx.Module):
     """What a motion from a file has in place of its system: what the system had computed at the samples before it was saved."""
@@ -57,6 +62,7 @@ class Recorded(eqx.Module):
     params: PyTree
     one_sided: tuple[str, ...] = eqx.field(static=True)
     friction: StickSlip | Regularised = eqx.field(static=True)
+    units: tuple[tuple[str, str], ...] = eqx.field(static=True)
 
     @property
     def system(self) -> System:

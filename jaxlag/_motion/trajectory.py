@@ -4,7 +4,7 @@ import dataclasses
 import functools
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import equinox as eqx
 import jax
@@ -32,7 +32,8 @@ class Trajectory(eqx.Module):
 
     `len(motion)` is the number of samples, `motion[-1]` the last one (an `Instant`), `motion[100:200]` and `motion[motion.ts > 1]` are
     motions again, which start at the first sample they keep: works count from there. Of many motions (`simulate_many`, `vmap`),
-    `motions[3]` is one of them. `motion.at(ts)` is the motion between the samples.
+    `motions[3]` is one of them. `motion.at(ts)` is the motion between the samples. `motion.plot()` and `motion.animate(points)` draw it,
+    with all that `plot.motion` and `plot.animate` take.
 
     - `ts`: the times; `q`, `qdot`, `qddot`: structured like q0; `multipliers`: λ by the constraint's name; `states`: by name.
     - `result`: `RESULTS.successful`, or the reason of failure; samples that were not reached are NaN.
@@ -59,6 +60,10 @@ class Trajectory(eqx.Module):
     states: dict[str, PyTree] = dataclasses.field(default_factory=dict)
     contacts: dict[str, ContactState] = dataclasses.field(default_factory=dict)
     events: dict[str, EventState] = dataclasses.field(default_factory=dict)
+
+    if TYPE_CHECKING:  # put here by `jaxlag.plot`
+        plot: ClassVar[Callable[..., Any]]
+        animate: ClassVar[Callable[..., Any]]
 
     @property
     def succeeded(self) -> Any:
@@ -199,7 +204,7 @@ class Trajectory(eqx.Module):
         """
         each = lambda function: functools.reduce(lambda f, _: jax.vmap(f), self.ts.shape[1:], function)
         of = self.provenance
-        recorded = Recorded(each(energies)(self), each(Trajectory.slip)(self), of.params, of.one_sided, of.friction)
+        recorded = Recorded(each(energies)(self), each(Trajectory.slip)(self), of.params, of.one_sided, of.friction, of.units)
         numbers = jax.tree.map(lambda leaf: leaf if eqx.is_array(leaf) else None, recorded.params)
         energy = dict(zip(("h", "turned"), recorded.energies, strict=True))
         more = arrays_of(stats=self.stats, energy=energy, slip=recorded.slip, params=numbers)
@@ -213,6 +218,7 @@ class Trajectory(eqx.Module):
             outlines={name: outline(tree, arrays_of(**{name: tree})) for name, tree in trees.items()},
             audit=self.works is not None,  # the name in files
             one_sided=recorded.one_sided,
+            units=recorded.units,
             friction={type(recorded.friction).__name__: dataclasses.asdict(recorded.friction)},
         )
 

@@ -43,6 +43,7 @@ def fitted(*residuals, of, sigma=0.5):
     predictions = [jax.tree.map(lambda z, r: np.asarray(z) - r, of.values, r) for r in residuals]
     errors = [jax.tree.map(lambda z: np.full(z.shape, 0.1), tree) for tree in predictions]
     filled = {"experiments": (of,) * len(residuals), "residuals": list(residuals), "sigma": sigma, "absolute": True}
+    filled["problem"] = SimpleNamespace(model=SimpleNamespace(system=jl.System(lambda qdot: qdot)))
     filled["sigmas"] = [jax.tree.map(lambda r: np.full(np.shape(r)[1:], sigma), one) for one in residuals]
     for name, value in (filled | {"predictions": predictions, "prediction_errors": errors}).items():
         object.__setattr__(fit, name, value)

@@ -22,14 +22,17 @@ def rod(q, l):
 
 SMOOTH = jl.System(lagrangian, dissipation={"air": lambda qdot, b: 0.5 * b * qdot @ qdot}, holonomic={"rod": rod})
 DRY = jl.System(lagrangian, dissipation={"joint": lambda q, qdot, F, l: F * jnp.abs(q[0] * qdot[1] - q[1] * qdot[0]) / l}, holonomic=rod)
+IMPLICIT = diffrax.Kvaerno5(root_finder=diffrax.VeryChord(rtol=1e-8, atol=1e-10))
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "case", [(SMOOTH, jl.Dop853()), (SMOOTH, diffrax.Kvaerno5()), (DRY, jl.Dop853())], ids=["smooth", "implicit", "dry"]
-)
+@pytest.mark.parametrize("case", [(SMOOTH, jl.Dop853()), (SMOOTH, IMPLICIT), (DRY, jl.Dop853())], ids=["smooth", "implicit", "dry"])
 def test_steps_and_samples_are_those_of_diffrax(case):
-    """The same steps, kept and refused, and what their dense output says: equal to rounding."""
+    """The same steps, kept and refused, and what their dense output says: equal to rounding.
+
+    The equations of the implicit stages are solved to tolerances that are given: ours follow the size of the motion so far, which diffrax's
+    loop does not know.
+    """
     system, solver = case
     found = jl.simulate(system, *START, TS, PARAMS, solver=solver)
     expected = jl.simulate(system, *START, TS, PARAMS, solver=solver, adjoint=diffrax.ForwardMode())

@@ -181,3 +181,33 @@ def test_a_mass_that_is_led_from_rest_in_resonance(L, t0, atol, a):
     by_hand = (1 - np.cos(2 * ts) - ts * np.sin(2 * ts)) / 2
     np.testing.assert_allclose(run(a), a * by_hand, atol=atol)
     np.testing.assert_allclose(jax.jacfwd(run)(a), by_hand, atol=atol)
+
+
+LEAD = jl.System(
+    lambda qdot: 0.5 * qdot**2,
+    dissipation=lambda qdot, b: 0.5 * b * qdot**2,
+    holonomic={"drive": lambda t, q, L, T, t0: q - L * jnp.sin((t - t0) / T)},
+)
+
+
+@pytest.mark.parametrize(("L", "T", "t0"), [(1.0, 1.0, 0.0), (1e-9, 1e6, 1e9)])
+@pytest.mark.parametrize(("a", "b"), [(1.0, 0.3), (1.0, 0.0), (0.0, 0.3)])
+def test_the_work_of_a_drive_that_gives_the_only_coordinate(L, T, t0, a, b):
+    """q = a L sin(t/T): with nothing to integrate, steps are as long as the works allow; off by 5e-3 where they followed q alone.
+
+    And the derivatives by a and b, also at zero.
+    """
+    ts, path = np.linspace(0.0, 16.0, 33), np.linspace(0.0, 8.0, 33) + np.sin(np.linspace(0.0, 32.0, 33)) / 4
+
+    def run(x):
+        params = {"L": x[0] * L, "T": T, "t0": t0, "b": x[1] / T}
+        motion = jl.simulate(LEAD, 0.0, x[0] * L / T, t0 + T * ts, params, works=True)
+        return jnp.stack([motion.work()["drive"], motion.work()["dissipation"]]) * (T / L) ** 2, motion.balance()
+
+    x, swing = jnp.array([a, b]), np.sin(ts) ** 2 / 2
+    works, balance = run(x)
+    np.testing.assert_allclose(works, a**2 * np.stack([b * path - swing, -b * path]), atol=1e-6)
+    np.testing.assert_allclose(balance, 0, atol=1e-6)
+    by_hand = [np.stack([2 * a * (b * path - swing), a**2 * path], 1), np.stack([-2 * a * b * path, -(a**2) * path], 1)]
+    for derivative in (jax.jacfwd, jax.jacrev):
+        np.testing.assert_allclose(derivative(lambda x: run(x)[0])(x), by_hand, atol=2e-6)

@@ -209,3 +209,19 @@ def test_links_that_a_motion_has_yet_to_reach(s, E, T, c, start):
         slope, steps = derivative(last, has_aux=True)(c)
         np.testing.assert_allclose(slope, exact[2 * n : 3 * n], atol=2e-8)
         assert steps < 100
+
+
+HELD = jl.System(
+    lambda qdot, m: 0.5 * m * qdot @ qdot,
+    force=lambda t, b: b * jnp.sin(2 * t) * jnp.ones(2),
+    holonomic={"pin": lambda q, k: q @ k},
+    nonholonomic={"blade": lambda qdot: qdot[0] - qdot[1]},
+)
+
+
+def test_nothing_moves_and_nothing_is_loaded_at_the_start():
+    """Constraints hold everything and the load grows from zero: no number says what rounding is. The derivative, 0, may be refused."""
+    params, rest = {"m": 2.0, "k": np.array([1.0, 0.5])}, (np.zeros(2), np.zeros(2))
+    motion = lambda b: jl.simulate(HELD, *rest, np.linspace(0, 2, 9), params | {"b": b}, throw=False)
+    found = jax.jacfwd(lambda b: motion(b).q[-1])(1.0)
+    assert motion(1.0).succeeded and np.all((np.abs(found) < 1e-12) | np.isinf(found))
