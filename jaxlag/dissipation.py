@@ -26,12 +26,12 @@ def speed(v: Velocity) -> Float[Array, ""]:
 
     For a scalar it is `jnp.abs(v)`, whose slope at 0 JAX takes from the right: 1, not 0.
 
-    **Arguments:** `v`, a scalar or a vector of shape (n,). Any consistent units. A vector counts as at rest where ‖v‖² underflows
-    (‖v‖ below 1.5e-154 in double, 1.1e-19 in single precision).
+    **Arguments:** `v`, a scalar or a vector of shape (n,). Any consistent units. A vector counts as at rest if ‖v‖² underflows (‖v‖ below
+    1.5e-154 in double, 1.1e-19 in single precision).
 
     **Returns:** a scalar.
 
-    **Raises:** `ValueError` or `TypeError` where `v` is neither a scalar nor a vector.
+    **Raises:** `ValueError` or `TypeError` if `v` is neither a scalar nor a vector.
 
     **Source:** Rockafellar, Convex Analysis, section 23: at 0 the subgradients of ‖v‖ form the unit ball; zero has the least norm.
 
@@ -96,7 +96,7 @@ def viscous(v: Velocity, b: ArrayLike) -> Float[Array, ""]:
 
     **Returns:** a scalar, half the dissipated power.
 
-    **Raises:** as `speed`; `ValueError` where `b` has another shape.
+    **Raises:** as `speed`; `ValueError` if `b` has another shape.
 
     **Source:** Goldstein, Classical Mechanics, 3rd ed., section 1.5; Rayleigh, The Theory of Sound, vol. I, section 81.
 
@@ -192,8 +192,8 @@ def stribeck(v: Velocity, F_c: Number, F_s: Number, v_s: Number, delta: Number =
     $$ D = F_c s + (F_s - F_c)\, v_s \tfrac{\sqrt\pi}{2} \operatorname{erf}(s/v_s) \quad (\delta = 2), \qquad
        D = F_c s + (F_s - F_c)\, v_s \left(1 - e^{-s/v_s}\right) \quad (\delta = 1) $$
 
-    Not homogeneous: Euler's identity does not hold, and D is no fixed fraction of the power. Where the force falls, which is everywhere if
-    F_s > F_c, D is not convex: friction grows as a body slows down, and a spring that pulls it slowly makes it stick and slip. D is
+    Not homogeneous: Euler's identity does not hold, and D is not a fixed fraction of the power. Where the force falls, which is everywhere
+    if F_s > F_c, D is not convex: friction grows as a body slows down, and a spring that pulls it slowly makes it stick and slip. D is
     nonsmooth at rest, as `sliding` is, with the bound F_s. Viscous friction is a separate term: add `viscous(v, b)`.
 
     **Arguments:**
@@ -207,7 +207,7 @@ def stribeck(v: Velocity, F_c: Number, F_s: Number, v_s: Number, delta: Number =
 
     **Returns:** a scalar, power.
 
-    **Raises:** as `speed`; `ValueError` where `delta` is neither 1 nor 2.
+    **Raises:** as `speed`; `ValueError` if `delta` is neither 1 nor 2.
 
     **Source:** Armstrong-Hélouvry, Dupont & Canudas de Wit, Automatica 30 (1994) 1083–1138 (force).
 

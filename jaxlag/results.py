@@ -1,4 +1,4 @@
-"""What functions of jaxlag return: for annotations and `isinstance`; none of these is made by hand."""
+"""The classes that functions of jaxlag return, for annotations and `isinstance`; you need not create any of them."""
 
 from ._fit.assess import Comparison as Comparison, Information as Information, Validation as Validation
 from ._fit.channels import Channel as Channel

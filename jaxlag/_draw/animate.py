@@ -14,7 +14,7 @@ from .._model.injection import call
 from .._motion.trajectory import Trajectory
 from .animation import Animation
 from .axes import Units, one_motion, units_of
-from .mode_on_points import ModesOnPoints, as_many, draw_at_rest, said
+from .mode_on_points import ModesOnPoints, as_many, draw_at_rest, titles, units_of_modes
 from .moving_picture import POINTS_PER_FRAME, MovingPicture
 
 MOST_FRAMES = 2000
@@ -39,10 +39,10 @@ def animate(
     $$ x_p(t) = x_p(t, q(t)), \qquad F_c \cdot \delta x_p = Q_c \cdot \delta q, \qquad
        x_p(t) = x_p(q_0) + \mathrm{Re}\,\Big(a\,\frac{\partial x_p}{\partial q}\,\hat q\,e^{i\,\mathrm{Im}\,\lambda\,t}\Big) $$
 
-    Between the samples q is interpolated, as by `Trajectory.at`. The limits of the axes are fixed by the whole motion; a machine that
-    travels far is best shown in a moving frame, by points without its travel. A mode is shown to first order, with the phases of its
-    shape and without its decay, over the faint mechanism at rest; one that does not oscillate goes to and fro. `plot.mode_shapes`
-    draws several, still.
+    Between the samples q is interpolated, as by `Trajectory.at`. The whole motion sets the limits of the axes; to show a machine that
+    travels far, give points relative to a frame that moves with it. A mode is shown to first order, with its phases but without its decay,
+    over a faint picture of the mechanism at rest; a mode that does not oscillate swings to and fro. `plot.mode_shapes` draws several modes
+    as still pictures.
 
     **Arguments:**
 
@@ -50,19 +50,19 @@ def animate(
     - `points`: position maps by name; each returns (x, y), two numbers, from any of the arguments `t`, `q`, `qdot`, `params` and its
       entries, which it names.
     - `links`: pairs joined by a line, each end the name of a point or a fixed position, `("bob", (0.0, 0.0))`.
-    - `forces`: constraint forces drawn as arrows: for the name of a constraint, the name of the point it acts on, or of all such points,
-      `{"rod": ("a", "b")}` for one that pulls two bodies together; the forces are `constraint_force(..., at=points)`. The largest of
-      each is written beside its name; all arrows have the same scale. Not of a mode.
-    - `amplitude`: of a mode: how far the point moves that moves most. Default: 10 % of the size of the mechanism.
+    - `forces`: constraint forces drawn as arrows: maps the name of a constraint to the point it acts on, or to all such points, e.g.
+      `{"rod": ("a", "b")}` for a rod between two bodies. The forces are `constraint_force(..., at=points)`. The largest of each is shown
+      next to its name; all arrows share one scale. Not available for a mode.
+    - `amplitude`: for a mode, the displacement of the point that moves most. Default: 10 % of the size of the mechanism.
     - `trail`: for how long the path of the points remains visible, in units of time; `math.inf` keeps all of it.
-    - `fps`: frames per second. `speed`: units of time shown per second, 1 for real time, 0.1 for ten times slower. Default: 1, and of a
-      mode what shows a period in two seconds.
+    - `fps`: frames per second. `speed`: units of time shown per second, 1 for real time, 0.1 for ten times slower. Default: 1; for a mode,
+      one period in two seconds.
     - `units`: units of `"t"`, of `"x"` for both axes, and of forces by the name of the constraint.
     - `ax`: matplotlib axes to draw in. Default: those of a new figure.
 
     **Returns:** an `Animation`, which a notebook shows with buttons; `.save("motion.gif")`, `.save("motion.mp4")` (needs ffmpeg) and
-    `.save("motion.html")` write a file; `.frames` is the number of frames, `.ax` the axes. A notebook stores each frame, some 4 kB, and
-    so shows at most 12.5 per second.
+    `.save("motion.html")` write a file; `.frames` is the number of frames, `.ax` the axes. A notebook stores every frame, about 4 kB each,
+    so it shows at most 12.5 per second.
 
     **Raises:** `ValueError` if `points`, `links` or `forces` do not match each other or the system, if `fps` and `speed` give fewer than 2
     or more than 2000 frames, if fewer than 2 samples were computed, or if it is not one motion or one mode; `ImportError` without
@@ -120,11 +120,11 @@ def _mode(
     period = 2 * np.pi / abs(turning) if turning else PERIOD
     speed = period / PERIOD if speed is None else speed
     count = _checked(round(period * fps / speed), period, speed)
-    modes = as_many(mode)
+    modes, units = as_many(mode), units_of_modes(mode, units)
     on_points = ModesOnPoints.of(modes, points, links, amplitude)
     phases = np.arange(POINTS_PER_FRAME * (count - 1) + 1) * 2 * np.pi / (POINTS_PER_FRAME * count)
     (track,) = on_points.at(phases[None] * (np.sign(turning) or 1.0))
-    (title,) = said(modes, units)
+    (title,) = titles(modes, units)
     at = np.arange(count) * period / count
     picture = MovingPicture.of(at, on_points.by_name(track), links, {}, trail, units, ax, title)
     draw_at_rest(picture.ax, on_points.by_name(on_points.rest), links)

@@ -24,7 +24,7 @@ def fit(fit: Fit, *, number: int = 0, level: float = 0.95, units: Units = None, 
 
     The band of the fit shows the uncertainty of the motion that follows from its parameters and initial states; it is often thinner than
     the line. The band of the residuals is ±2σ, with the sigma of the experiment if one was given, otherwise the estimated one. If the
-    residuals are noise, 95 % of them lie in it, without any pattern; a pattern is motion that the model lacks.
+    residuals are noise, 95 % of them lie in it, without any pattern; a pattern points to something that the model lacks.
 
     **Arguments:**
 
@@ -161,8 +161,8 @@ def convergence(fit: Fit, *, ax: Any = None) -> Any:
 
     $$ \tfrac12\sum_i \left(\frac{r_i}{\sigma_i}\right)^2 $$
 
-    The first is that of the initial guess. The cost can rise where the problem itself changes on the way: where the weight of the gaps
-    between segments (`segments=`) grows, and where the sigmas of the channels are estimated again.
+    The first value belongs to the initial guess. The cost can rise when the problem itself changes: when the weight of the gaps between
+    segments (`segments=`) is raised, and when the sigmas of the channels are estimated again.
 
     **Arguments:**
 

@@ -28,8 +28,8 @@ from .axes import (
 def forces(trajectory: Trajectory, names: Sequence[str] | None = None, *, units: Units = None, axes: Any = None) -> Any:
     r"""The multipliers λ over time, one panel for each constraint, with a ring wherever one changes sign.
 
-    For a constraint that is `one_sided` in `System`, the times at which it would have to pull are shaded; for a contact those at which it
-    is closed, and impulses of its impacts stand as stems on an axis of their own, on the right.
+    For a constraint that is `one_sided` in `System`, the times at which it would have to pull are shaded; for a contact, the times at which
+    it is closed, and the impulses of its impacts are stems on a second axis, on the right.
 
     $$ M\ddot q = f + G^T\lambda $$
 

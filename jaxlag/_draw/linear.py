@@ -6,18 +6,19 @@ import numpy as np
 
 from .._linear.linear_system import LinearSystem
 from .._linear.root_locus import RootLocus
-from .axes import COLOURS, GREY, Units, colour, panels, pyplot
+from .axes import COLOURS, GREY, Units, colour, label, panels, pyplot, units_of
 
 
 def bode(system: LinearSystem, omega: Any, *, units: Units = None, axes: Any = None) -> Any:
-    r"""Magnitude and phase of the frequency response, a line for each pair of output and input.
+    r"""Magnitude and phase of the frequency response, one line for each pair of output and input.
 
     $$ |G(i\omega)|, \qquad \arg G(i\omega) $$
 
     **Arguments:**
 
     - `system`: a `LinearSystem`. `omega`: angular frequencies, increasing and positive.
-    - `units`: of `"omega"` and `"magnitude"`, written on the axes, e.g. `{"omega": "rad/s"}`.
+    - `units`: of `"omega"` and `"magnitude"`, written on the axes, e.g. `{"omega": "rad/s"}`. Default: that of ω follows from
+      the unit of `"t"` that the system states.
     - `axes`: two matplotlib axes to draw in. Default: a new figure with a common, logarithmic frequency axis.
 
     **Returns:** the axes, an array of shape (2,).
@@ -40,12 +41,14 @@ def bode(system: LinearSystem, omega: Any, *, units: Units = None, axes: Any = N
         raise ValueError("`omega` must be positive for a logarithmic axis, but holds a zero. Begin with a small frequency.")
     upper, lower = drawn = panels(axes, (2, 1), "magnitude and phase").ravel()
     for i, (output, source) in enumerate(np.ndindex(found.magnitude.shape[1:])):
-        label = f"{system.output_names[output]} / {system.input_names[source]}"
-        upper.loglog(omega, found.magnitude[:, output, source], color=colour(i), label=label)
+        of = f"{system.output_names[output]} / {system.input_names[source]}"
+        upper.loglog(omega, found.magnitude[:, output, source], color=colour(i), label=of)
         lower.semilogx(omega, found.phase[:, output, source], color=colour(i))
-    upper.set_ylabel(_with_unit("|G|", "magnitude", units))
+    stated = {} if system.origin is None else dict(system.origin.units)
+    units = ({"omega": f"rad/{stated['t']}"} if "t" in stated else {}) | dict(units or {})
+    upper.set_ylabel(label("|G|", units, "magnitude"))
     lower.set_ylabel("phase (°)")
-    lower.set_xlabel(_with_unit("ω", "omega", units))
+    lower.set_xlabel(label("ω", units, "omega"))
     lower.yaxis.set_major_locator(_locator(45))
     upper.legend(frameon=False)
     return drawn
@@ -85,14 +88,15 @@ def nyquist(system: LinearSystem, omega: Any, *, ax: Any = None) -> Any:
 
 
 def root_locus(locus: RootLocus, *, units: Units = None, axes: Any = None) -> Any:
-    r"""Real and imaginary parts of the eigenvalues over the parameter; where a branch crosses into or out of stability, a ring.
+    r"""Real and imaginary parts of the eigenvalues over the parameter; a ring marks each change of stability.
 
     $$ \lambda(p), \qquad \mathrm{Re}\,\lambda(p^*) = 0 $$
 
     **Arguments:**
 
     - `locus`: the result of `jaxlag.root_locus`.
-    - `units`: of the parameter, by its name, and of `"eigenvalues"`, e.g. `{"v": "m/s", "eigenvalues": "1/s"}`.
+    - `units`: of the parameter, by its name, and of `"eigenvalues"`, e.g. `{"v": "m/s", "eigenvalues": "1/s"}`. Default: those that the
+      system states.
     - `axes`: two matplotlib axes. Default: a new figure.
 
     **Returns:** the axes, an array of shape (2,). **Raises:** `ImportError` without matplotlib.
@@ -121,16 +125,14 @@ def root_locus(locus: RootLocus, *, units: Units = None, axes: Any = None) -> An
         frequency.plot(at, crossing.frequency, **style)
         for ax in drawn:
             ax.axvline(at, color=COLOURS[1], linewidth=0.5)
-    growth.set_ylabel(_with_unit("Re λ", "eigenvalues", units))
-    frequency.set_ylabel(_with_unit("Im λ", "eigenvalues", units))
-    frequency.set_xlabel(_with_unit(locus.over, locus.over, units))
+    stated = dict(locus.units)
+    units = units_of(locus.units, ({"eigenvalues": f"1/{stated['t']}"} if "t" in stated else {}) | dict(units or {}))
+    growth.set_ylabel(label("Re λ", units, "eigenvalues"))
+    frequency.set_ylabel(label("Im λ", units, "eigenvalues"))
+    frequency.set_xlabel(label(locus.over, units))
     if locus.crossings:
         growth.legend(frameon=False)
     return drawn
-
-
-def _with_unit(text, name, units):
-    return f"{text} ({units[name]})" if units and name in units else text
 
 
 def _locator(step):

@@ -11,7 +11,7 @@ from jax.flatten_util import ravel_pytree
 
 from .._linear.modes import Modes
 from .._model.injection import call
-from .axes import Units
+from .axes import Units, units_of
 
 FAINT = "#C8C8C8"
 SHARE = 0.1  # of the size of the mechanism: how far the point moves that moves most
@@ -72,9 +72,14 @@ def draw_at_rest(ax: Any, rest: Mapping[str, np.ndarray], links: tuple) -> None:
         ax.plot(*x, "o", color=FAINT, markersize=5, zorder=1)
 
 
-def said(modes: Modes, units: Units) -> list[str]:
-    """What there is to say of each mode: frequency and damping, or how it grows."""
-    unit = (units or {}).get("t", "")
+def units_of_modes(modes: Modes, units: Units) -> dict[str, str]:
+    """Those that the system states, and those given in their place."""
+    return units_of(() if modes.origin is None else modes.origin.units, units)
+
+
+def titles(modes: Modes, units: Mapping[str, str]) -> list[str]:
+    """Frequency and damping of each mode, or how it grows."""
+    unit = units.get("t", "")
     per = f" 1/{unit}" if unit else ""
     lines = []
     for value, frequency, ratio in zip(*map(np.asarray, (modes.eigenvalues, modes.frequency, modes.damping_ratio)), strict=True):

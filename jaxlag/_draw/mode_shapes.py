@@ -8,7 +8,7 @@ import numpy as np
 from .._linear.modes import Modes
 from .animate import check_names
 from .axes import COLOURS, Units, label, panels
-from .mode_on_points import ModesOnPoints, as_many, draw_at_rest, said
+from .mode_on_points import ModesOnPoints, as_many, draw_at_rest, titles, units_of_modes
 from .moving_picture import MARGIN
 
 CYCLE = 72  # phases of a path; half of it is the other extreme
@@ -24,28 +24,28 @@ def mode_shapes(
     units: Units = None,
     axes: Any = None,
 ) -> Any:
-    r"""Modes on the mechanism, a panel for each: at rest, faint; at one extreme, and at the other, dashed; and the paths of the points.
+    r"""Mode shapes drawn on the mechanism, one panel each: at rest (faint), at both extremes (one dashed), and the paths of the points.
 
     $$ x_p(q_0) + \mathrm{Re}\,\Big(a\,\frac{\partial x_p}{\partial q}\,\hat q\,e^{i\varphi}\Big), \qquad 0 \le \varphi < 2\pi $$
 
-    Displacements are to first order, in which a rod that turns seems to grow; they are then the same in all coordinates.
+    Displacements are of first order, and so the same in all coordinates; a rod that turns therefore appears to stretch.
 
-    The title has the natural frequency |λ|/2π and the damping ratio, or λ where nothing oscillates. Where a shape is complex, points are
-    not at their extremes all at once: they run along their paths, and are drawn where all together are farthest from rest.
-    `animate` shows one mode in motion.
+    The title gives the natural frequency |λ|/2π and the damping ratio, or λ if the mode does not oscillate. In a complex shape the points
+    do not reach their extremes at the same time: they are drawn at the phase at which all together are farthest from rest. `animate` shows
+    one mode in motion.
 
     **Arguments:**
 
-    - `modes`: those of `linearise(...).modes()` or `lowest_modes`, some of them, `modes[:3]`, or one.
+    - `modes`: the result of `linearise(...).modes()` or `lowest_modes`, some of them, e.g. `modes[:3]`, or one.
     - `points`, `links`: as for `animate`: position maps by name, and pairs joined by a line.
-    - `amplitude`: how far the point moves that moves most, in each mode. Default: 10 % of the size of the mechanism.
+    - `amplitude`: in each mode, the displacement of the point that moves most. Default: 10 % of the size of the mechanism.
     - `units`: units of `"x"`, for both axes, and of `"t"`, for the title: with `"s"`, frequencies are in Hz.
     - `axes`: matplotlib axes, one for each mode. Default: those of a new figure.
 
     **Returns:** the axes, an array of shape (modes,).
 
-    **Raises:** `ValueError` if `points` and `links` do not match each other, if `modes` are those along a trajectory, or if `axes` are not
-    as many; `ImportError` without matplotlib.
+    **Raises:** `ValueError` if `points` and `links` do not match each other, if `modes` belong to a trajectory, or if the number of `axes`
+    differs; `ImportError` without matplotlib.
 
     **Source:** Ewins, Modal Testing, 2nd ed., section 2.4 (real and complex modes).
 
@@ -68,14 +68,14 @@ def mode_shapes(
     modes = modes if modes.eigenvalues.ndim else as_many(modes)
     if modes.eigenvalues.ndim > 1:
         raise ValueError(f"`modes` must be those of one system, but have the shape {modes.eigenvalues.shape}. Take those of one of them.")
-    on_points = ModesOnPoints.of(modes, points, links, amplitude)
+    on_points, units = ModesOnPoints.of(modes, points, links, amplitude), units_of_modes(modes, units)
     phases = on_points.extreme_phases()[:, None] + np.linspace(0.0, 2 * np.pi, CYCLE + 1)
     moves = np.any(on_points.displacements, axis=(1, 2))
     cycles, rest = on_points.at(phases), on_points.by_name(on_points.rest)
     fixed = [end for link in links for end in link if not isinstance(end, str)]
     lower, upper = _corners(np.concatenate([cycles.reshape(-1, 2), on_points.rest, np.reshape(fixed, (-1, 2))]))
     drawn, columns = _panels(axes, len(modes), upper - lower)
-    for i, (ax, cycle, title) in enumerate(zip(drawn, cycles, said(modes, units), strict=True)):
+    for i, (ax, cycle, title) in enumerate(zip(drawn, cycles, titles(modes, units), strict=True)):
         draw_at_rest(ax, rest, links)
         if moves[i]:
             _draw(ax, on_points.by_name(cycle), links)
@@ -107,7 +107,7 @@ def _corners(visible: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _panels(axes: Any, count: int, size: np.ndarray) -> tuple[Any, int | None]:
-    """A panel for each mode, and in how many columns they stand, long mechanisms above each other, high ones beside each other; None of
+    """A panel for each mode, and in how many columns they stand, long mechanisms above each other, high ones next to each other; None of
     panels that were given.
     """
     if axes is not None:

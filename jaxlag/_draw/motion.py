@@ -28,20 +28,20 @@ THIN = 1e-3  # of the largest area, below which an area is invisible
 
 
 def motion(trajectory: Trajectory, names: Sequence[str] | None = None, *, units: Units = None, axes: Any = None) -> Any:
-    r"""The coordinates of a motion over time, and the states beside them, one panel each.
+    r"""The coordinates and states of a motion over time, one panel each.
 
     $$ q_i(t), \qquad i = 1 \dots n $$
 
     A coordinate that is an array has one line for each entry, `r[0]`, `r[1]`, …. Samples that were not reached are omitted. Dotted lines
-    stand at the times of events.
+    mark events.
 
     **Arguments:**
 
     - `trajectory`: one motion, as `simulate` returns it.
     - `names`: the coordinates to draw, in this order, by their path in q (`"phi"`, `"body.x"`, `"q"` where q is one array), and states
       by their path in `trajectory.states`. Default: all.
-    - `units`: units by name of coordinate, and of `"t"`, written on the axes, e.g. `{"t": "s", "phi": "rad"}`; those that are not given
-      are those of the system, here and in all pictures of motions and fits.
+    - `units`: units by name of coordinate, and of `"t"`, written on the axes, e.g. `{"t": "s", "phi": "rad"}`; others are taken from the
+      system, as in all pictures of motions and fits.
     - `axes`: matplotlib axes to draw in, as many as there are coordinates. Default: a new figure with a common time axis.
 
     **Returns:** the axes, an array of shape (n,).
@@ -227,7 +227,7 @@ def balance(trajectory: Trajectory, *, units: Units = None, ax: Any = None) -> A
 
 
 def _shown_works(trajectory):
-    """The work of each term where it is visible beside the largest change of energy."""
+    """The work of each term where it is visible relative to the largest change of energy."""
     works = {name: np.asarray(work) for name, work in trajectory.work().items()}
     h, exchanged = map(np.asarray, energies(trajectory))
     sizes = {name: np.nanmax(np.abs(work)) for name, work in works.items()}

@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 
 from .._linear.stability_map import StabilityMap
-from .axes import GREY, Units, pyplot
+from .axes import GREY, Units, label, pyplot, units_of
 
 KINDS = {"stable": "#DCEBDD", "flutter": "#F2CDB0", "divergence": "#E3A6A1", "missing": "white"}
 
@@ -15,13 +15,13 @@ def stability_map(found: StabilityMap, *, units: Units = None, ax: Any = None) -
 
     $$ \max_i\,\mathrm{Re}\,\lambda_i(p_1, p_2) $$
 
-    Each point of the grid has a cell of its own. The thick line is where growth is zero, between points by straight lines;
-    without damping, where all stable states have the growth 0, it runs along the last stable points.
+    Each point of the grid has its own cell. The thick line marks zero growth, interpolated linearly between points; without damping, when
+    all stable states have zero growth, it follows the last stable points.
 
     **Arguments:**
 
     - `found`: the result of `jaxlag.stability_map`; the first of its parameters runs to the right.
-    - `units`: of the two parameters, by their names.
+    - `units`: of the two parameters, by their names. Default: those that the system states.
     - `ax`: matplotlib axes. Default: a new figure.
 
     **Returns:** the axes. **Raises:** `ImportError` without matplotlib.
@@ -55,13 +55,10 @@ def stability_map(found: StabilityMap, *, units: Units = None, ax: Any = None) -
             ax.contour(x, y, border, levels=[0.0], colors="black", linewidths=1.5)
     ax.set_xlim(x[0], x[-1])
     ax.set_ylim(y[0], y[-1])
-    ax.set_xlabel(_label(found.over[0], units))
-    ax.set_ylabel(_label(found.over[1], units))
+    units = units_of(found.units, units)
+    ax.set_xlabel(label(found.over[0], units))
+    ax.set_ylabel(label(found.over[1], units))
     there = [name for name in names if np.any(kinds == name)]
     handles = [Patch(facecolor=KINDS[name], edgecolor=GREY, label=name) for name in there]
     ax.legend(handles=handles, loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=len(handles), frameon=False)
     return ax
-
-
-def _label(name, units):
-    return f"{name} ({units[name]})" if units and name in units else name

@@ -27,9 +27,9 @@ from .result import Fit, Prediction
 class Information:
     """What planned experiments will reveal about the parameters, as `information` returns it; prints as a table.
 
-    - `names`: of the p numbers, in flat order; in this order `matrix` (p, p): Fisher's information JᵀJ; `covariance` (p, p): its inverse;
+    - `names`: the p numbers, in flat order, as in `matrix` (p, p), the Fisher information JᵀJ; `covariance` (p, p), its inverse; and
       `correlation` (p, p).
-    - `standard_errors`: expected of a fit, by the names of `free`; infinite for a parameter that the experiments do not determine.
+    - `standard_errors`: those to expect of a fit, by the names of `free`; infinite for a parameter that the experiments do not determine.
     - `estimates`: the values where the information was computed, by the names of `free`.
 
     ```python
@@ -68,7 +68,7 @@ def information(
     free: Sequence[str],
     **numerics: Any,
 ) -> Information:
-    r"""Fisher's information of planned experiments, and the standard errors that a fit of them will have.
+    r"""The Fisher information of planned experiments, and the standard errors that a fit of them will have.
 
     $$ F = \sum_i \frac{1}{\sigma_i^2} \left(\frac{\partial h_i}{\partial \theta}\right)^T \frac{\partial h_i}{\partial \theta},
        \qquad \mathrm{cov}\,\hat\theta \approx F^{-1} $$
@@ -77,8 +77,8 @@ def information(
 
     **Arguments:**
 
-    - `experiments`: one or several, with `sigma`. Their `values` may be None; samples that are NaN in them do not count. Also `ModalTest`s
-      and `FrequencyResponseTest`s, with expected values.
+    - `experiments`: one or several, with `sigma`. Their `values` may be None; samples that are NaN do not count. `ModalTest`s and
+      `FrequencyResponseTest`s need expected values.
     - `params`: where the information is computed, as for `fit`. `free`: names of the p numbers that will be identified.
     - `**numerics`: passed on to `simulate`.
 
@@ -86,7 +86,7 @@ def information(
 
     **Returns:** an `Information`.
 
-    **Raises:** `ValueError` where an experiment has no sigma, or the motion cannot be computed.
+    **Raises:** `ValueError` if an experiment has no sigma, or the motion cannot be computed.
 
     **Source:** Walter & Pronzato, Identification of Parametric Models (1997), section 6.1.
 
@@ -164,14 +164,14 @@ def validate(fit: Fit, experiment: Experiment | LinearTest, *, level: float = 0.
 
     $$ r_i = z_i - h(t_i, q(t_i; \hat\theta), \dots) $$
 
-    Unknowns of the experiment's own, its start for instance, are estimated from its measurements; the fitted parameters stay fixed.
+    The experiment's own unknowns, such as its start, are estimated from its measurements; the fitted parameters stay fixed.
 
     **Arguments:** `fit`: what `jaxlag.fit` returned; `experiment`: with T measured samples, or a `ModalTest` or `FrequencyResponseTest`;
-    `level`: of the confidence band, between 0 and 1. Units are any consistent set.
+    `level` of the confidence band, between 0 and 1. Units are any consistent set.
 
     **Returns:** a `Validation`.
 
-    **Raises:** `ValueError` where the experiment has no values, or its motion cannot be computed.
+    **Raises:** `ValueError` if the experiment has no values, or its motion cannot be computed.
 
     **Source:** Ljung, System Identification, 2nd ed., section 16.4 (cross validation).
 
@@ -211,11 +211,11 @@ def _with_own_estimates(system, experiment, params, numerics):
 class Comparison:
     """Models of the same data, as `compare` returns them; prints as a table.
 
-    - `names`: of the models, the best first by Schwarz's criterion.
-    - `aic`, `bic`: by name, the differences to the smallest value of each criterion; dimensionless.
+    - `names`: the models, best first by Schwarz's criterion.
+    - `aic`, `bic`: by name, the differences from the smallest value of each criterion; dimensionless.
     - `parameters`: by name, the number of unknowns.
-    - `correlated`: over how many samples the residuals of the best model are correlated, 0 where they are white. Both criteria take
-      residuals as independent, and overstate the evidence where they are not.
+    - `correlated`: the number of samples over which the residuals of the best model are correlated, 0 if they are white. Both criteria
+      assume independent residuals, and otherwise overstate the evidence.
     - `unconverged`: names of the models whose fits have not converged, which may be better than they look.
 
     ```python
@@ -260,7 +260,7 @@ def compare(fits: Mapping[str, Fit]) -> Comparison:
 
     **Arguments:** `fits`: at least two, by name, of the same measurements. **Returns:** a `Comparison`.
 
-    **Raises:** `ValueError` where there are fewer than two fits, or they are of different data.
+    **Raises:** `ValueError` if there are fewer than two fits, or they are of different data.
 
     **Source:** Burnham & Anderson, Model Selection and Multimodel Inference (2002), section 2.2; the words for ΔBIC: Kass & Raftery,
     J. Am. Stat. Assoc. 90 (1995) 773.

@@ -20,7 +20,7 @@ class Channel(NamedTuple):
     - `rms`: root mean square of the residuals, in the unit of the channel.
     - `whiteness`: the p-value of the Ljung–Box test that residuals are independent; small where the model misses something. NaN for modes
       and frequency responses.
-    - `correlated`: the number of samples over which the residuals are correlated, 0 where they are white.
+    - `correlated`: the number of samples over which the residuals are correlated, 0 if they are white.
 
     **Source:** Ljung, System Identification, 2nd ed., sections 16.4 and 16.6; Ljung & Box, Biometrika 65 (1978) 297.
 

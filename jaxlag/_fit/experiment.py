@@ -27,27 +27,27 @@ class Experiment(eqx.Module):
 
     - `ts`: (T,), the times of the samples, increasing, with any intervals; the motion starts at ts[0].
     - `values`: the measurements z, any pytree of arrays (T, ...), e.g. `{"y": ..., "phi": ...}`. NaN is a missing sample. None for an
-      experiment that is only planned (`jaxlag.information`).
+      experiment that is only planned (`jaxlag.information`), or of which only `events` were recorded.
     - `q0`, `qdot0`: the state at ts[0], structured as for `simulate`; where it is unknown, a guess.
-    - `observe`: the sensors h, which return one sample, structured like one row of `values`. The function receives the arguments it
-      names, of `t`, `q`, `qdot`, `qddot`, `multipliers`, `params`, the entries of `params` and the states beside q; so gains and offsets
-      of sensors are parameters like others. Default: the coordinates named in `values`, or q as a whole. Use one function for all
-      experiments of a kind: they then run as a batch, while each new function is compiled anew.
+    - `observe`: the sensors h: a function that returns one sample, structured like one row of `values`. It receives the arguments it names,
+      out of `t`, `q`, `qdot`, `qddot`, `multipliers`, `params`, the entries of `params` and the states of the system; gains and offsets of
+      sensors are parameters like any others. Default: the coordinates named in `values`, or q as a whole. Use one function for all
+      experiments of a kind: they then run as a batch, whereas each new function is compiled again.
     - `sigma`: σ, the standard deviation of the noise: a number, or a pytree like `values` with one for each channel or sample. By
       default, one for each channel is estimated from the residuals.
     - `params`: parameters of this experiment only, which override those of the fit: a payload, a measured input (`Signal`).
-    - `unknown`: what is to be estimated of this experiment only: `"q0"`, `"qdot0"`, coordinates of them (`"qdot0.x"`), or entries of
-      its own `params`. An unknown start moves within the constraints.
-    - `delay`: by how much the sensors lag behind the motion, a number, or a function that names parameters. Before the delay is over,
-      they show the state at ts[0].
+    - `unknown`: what is to be estimated for this experiment alone: `"q0"`, `"qdot0"`, coordinates of them (`"qdot0.x"`), or entries of its
+      own `params`. An unknown start moves within the constraints.
+    - `delay`: the time by which the sensors lag behind the motion: a number, or a function of parameters. Until it has passed, they show
+      the state at ts[0].
 
-    - `events`: by the name of an event of the system, the times at which it was seen to happen, the first, the second and so on, as clicks
-      in a recording of sound; NaN for one that was missed. Each is a channel beside those of `values`, a mapping then, with a `sigma` of
-      its own. A motion in which fewer happen does not fit.
+    - `events`: by the name of an event of the system, the times at which it was observed, in order, such as clicks in a sound recording;
+      NaN for one that was missed. Each is a further channel, with its own `sigma`; `values` must then be a mapping, or None. A motion with
+      fewer events cannot be fitted.
 
     Units are any consistent set.
 
-    **Raises:** `ValueError` or `TypeError` where times, values and sigma are not real numbers or do not fit each other, the start is not
+    **Raises:** `ValueError` or `TypeError` if times, values and sigma are not real numbers or do not fit each other, the start is not
     finite, `observe` is missing though `values` does not name coordinates, or `unknown` names something else.
 
     **Source:** Ljung, System Identification, 2nd ed., section 7.2.
@@ -91,7 +91,7 @@ class Experiment(eqx.Module):
                 raise ValueError(f"`{which}` must be finite, but has a missing value. Give a guess, and name it in `unknown`.")
         dtype = jax.tree.leaves(self.q0)[0].dtype
         self.ts = sample_times(ts, dtype)
-        values = _measured(values, self.ts, dtype)
+        values = {} if values is None and events else _measured(values, self.ts, dtype)
         self.values = _with_events(values, events, self.ts, dtype)
         self.events = tuple(events or ())
         self.sigma = None if sigma is None else _deviations(sigma, self.values)
@@ -127,12 +127,12 @@ class Experiment(eqx.Module):
 
         - `file`: its path; `delimiter`: between the cells.
         - `time`: the name of the column of times.
-        - `channels`: names of the columns to be used, or a mapping from channels to columns. Default: all others.
+        - `channels`: names of the columns to use, or a mapping from channels to columns. Default: all others.
         - `q0`, `qdot0`, `**more`: as for `Experiment`.
 
         **Returns:** an `Experiment` with `values` by channel, each of shape (T,).
 
-        **Raises:** `ValueError` where a column does not exist or a cell is not a number.
+        **Raises:** `ValueError` if a column does not exist or a cell is not a number.
         """
         with open(file, newline="", encoding="utf-8-sig") as lines:
             reader = csv.DictReader(lines, delimiter=delimiter, skipinitialspace=True)
@@ -148,7 +148,7 @@ class Experiment(eqx.Module):
         **Arguments:** `frame`: of pandas, polars, or any class with `columns` and `frame[name].to_numpy()`; `q0`, `qdot0`, `time`,
         `channels` and `**more` as for `from_csv`.
 
-        **Returns:** an `Experiment` with `values` by channel, each of shape (T,). **Raises:** `ValueError` where a column does not exist.
+        **Returns:** an `Experiment` with `values` by channel, each of shape (T,). **Raises:** `ValueError` if a column does not exist.
         """
         ts, values = _from_columns(list(frame.columns), lambda name: np.asarray(frame[name].to_numpy()), time, channels)
         return cls(ts, values, q0, qdot0, **more)
@@ -251,7 +251,7 @@ class Coordinates(eqx.Module):
     @classmethod
     def named_by(cls, values: PyTree, q0: PyTree, label: str = "values") -> "Coordinates":
         """Those of q0 that `values` is structured like."""
-        if isinstance(values, Mapping) and isinstance(q0, Mapping) and set(values) <= set(q0):
+        if isinstance(values, Mapping) and (not values or (isinstance(q0, Mapping) and set(values) <= set(q0))):
             return cls(tuple(values))
         structure: Any = jax.tree.structure(values)
         if values is None or structure == jax.tree.structure(q0):

@@ -55,34 +55,34 @@ def fit(
 
     **Arguments:**
 
-    - `experiments`: one `Experiment` or several, with T samples each; T may differ. Beside them, or alone, `ModalTest`s and
-      `FrequencyResponseTest`s, whose weighted squares are added; recordings need their `sigma` then.
+    - `experiments`: one `Experiment` or several, with T samples each; T may differ. `ModalTest`s and `FrequencyResponseTest`s may be added
+      or stand alone: their weighted squares are added, and recordings then need a `sigma`.
     - `params`: all parameters, a mapping or any pytree with named parts, of numbers and arrays of any shape. Those in `free` are starting
-      values; where one is NaN, `jaxlag.regress` finds it, and an estimate at its bound is moved inside.
+      values; `jaxlag.regress` replaces a NaN, and an estimate at its bound is moved inside.
     - `free`: names of the entries of `params` to be identified, or paths to parts of them, `"arm.length"`, `"joints[0]"`.
     - `bounds`: (lower, upper) by name, None where there is none: `{"b": (0, None)}` keeps b from being negative. Estimates and starting
       values may lie on a bound. If an estimate does, a remark says whether the measurements favour values beyond it.
     - `priors`: (mean, standard deviation) by name, for prior knowledge; the experiments need their `sigma` then.
     - `loss`: `Huber()` limits the influence of outliers.
-    - `method`: an optimiser of optax instead of Levenberg–Marquardt, for thousands of parameters; it takes `max_steps` steps, each
-      projected onto the bounds.
-    - `starts`: number of starting values, tried in one batch: the given ones, and others at random, within two bounds or otherwise
+    - `method`: an optax optimiser instead of Levenberg–Marquardt, for thousands of parameters; it takes `max_steps` steps, each projected
+      onto the bounds.
+    - `starts`: number of starting points, tried in one batch: the given one and random ones, between the bounds or, without both bounds,
       typically a factor of two away.
     - `segments`: number of segments that each record is cut into (multiple shooting), for long or chaotic records.
-    - `start`: `jaxlag.Regress()` leads the fit in from a poor start: by `regress`, and by segments where that is not enough.
+    - `start`: `jaxlag.Regress()` finds a better start from a poor one: by `regress`, and by segments if that is not enough.
     - `max_steps`: step limit, by default 100, or 1000 with `method`. `tolerance`: the iteration ends when the next step would change no
       parameter by more than this part of its standard error.
-    - `progress`: shows step, cost and remaining time on standard error, in one line on a terminal, otherwise a line now and then; and
-      what is being compiled, where that takes more than two seconds.
+    - `progress`: shows step, cost and remaining time on standard error (one line on a terminal, otherwise a line now and then), and what is
+      being compiled if that takes more than two seconds.
     - `**numerics`: passed on to `simulate`: `solver`, `rtol`, `atol`, `stabilisation`, `friction`.
 
-    Units are any consistent set. Where no sigma is given, that of each channel is estimated along with the parameters, by maximum
-    likelihood; experiments share it. Where residuals are correlated in time, the standard errors account for it, as the card says (`Fit`).
-    Interrupted with Ctrl-C, it returns the best parameters so far. Experiments of one kind run as a batch, on all devices of all processes.
+    Units are any consistent set. Without a sigma, that of each channel is estimated along with the parameters, by maximum likelihood;
+    experiments share it. Standard errors account for residuals that are correlated in time, and the card then says so (`Fit`). Interrupted
+    with Ctrl-C, it returns the best parameters so far. Experiments of one kind run as a batch, on all devices of all processes.
 
     **Returns:** a `Fit`.
 
-    **Raises:** `ValueError` where `free` names no parameter, there are fewer measurements than unknowns, `observe` does not fit the
+    **Raises:** `ValueError` if `free` names no parameter, there are fewer measurements than unknowns, `observe` does not fit the
     measurements, a start is outside its bounds, options exclude each other, or the motion at the start cannot be computed.
 
     **Source:** Ljung, System Identification, 2nd ed., sections 7.2 and 9.4; Nocedal & Wright, Numerical Optimization, section 10.3.
@@ -110,7 +110,7 @@ def fit(
     if start is not None:
         fit_from = partial(fit, system, priors=priors, loss=loss, tolerance=tolerance, progress=progress, **common, **numerics)
         return _led_in(fit_from, system, experiments, params, start, max_steps or 100, **common)
-    params, said = _without_nan(system, experiments, params, **common)
+    params, done = _without_nan(system, experiments, params, **common)
     problem, experiments = _checked_problem(system, experiments, params, free, bounds, priors, loss, method is None, numerics)
     steps = max_steps or (100 if method is None else 1000)
     line = Steps(steps) if progress else None
@@ -133,7 +133,7 @@ def fit(
         finally:
             if line:
                 line.end()
-        return dataclasses.replace(report(problem, experiments, outcome, of_segments), led_in=said)
+        return dataclasses.replace(report(problem, experiments, outcome, of_segments), led_in=done)
 
 
 def _check_options(recordings, loss, segments, start):
@@ -158,12 +158,12 @@ def _led_in(fit_from, system, experiments, params, start, max_steps, **common):
         raise ValueError(f"`start` must be a `Regress` or None, but is a {type(start).__name__}. Write `start=jl.Regress()`.")
     experiments, params = measured(experiments, params)
     found = regress(system, experiments, params, width=start.width, **common)
-    params, said = inside_bounds(found, **common)
-    return led_in(fit_from, start, experiments, params, said, max_steps)
+    params, done = inside_bounds(found, **common)
+    return led_in(fit_from, start, experiments, params, done, max_steps)
 
 
 def _without_nan(system, experiments, params, free, bounds):
-    """The parameters with those from `regress` that are free and NaN; and what was done."""
+    """The parameters, where free ones that are NaN come from `regress`; and what was done."""
     if not any(map(is_unknown, jax.tree.leaves(params))):
         return params, ()
     chosen = Free.of(params, free, bounds)
@@ -177,8 +177,8 @@ def _without_nan(system, experiments, params, free, bounds):
             "Give a guess, or take it from `regress` with the recordings."
         )
     found = regress(system, experiments, params, free=free, bounds=bounds)
-    inside, said = inside_bounds(found, free, bounds)
-    return chosen.insert(jnp.where(unknown, Free.of(inside, free).start, chosen.start)), (said,)
+    inside, done = inside_bounds(found, free, bounds)
+    return chosen.insert(jnp.where(unknown, Free.of(inside, free).start, chosen.start)), (done,)
 
 
 def fit_each(
@@ -204,7 +204,7 @@ def fit_each(
 
     **Returns:** a list of E `Fit`s, in the order of the experiments.
 
-    **Raises:** `ValueError` where the experiments are of different kinds, and as `fit`. A motion that cannot be computed is not raised
+    **Raises:** `ValueError` if the experiments are of different kinds, and as `fit`. A motion that cannot be computed raises nothing
     here: that fit has `converged` False, and its `reason` says so.
 
     ```python
@@ -219,7 +219,7 @@ def fit_each(
     experiments, params = measured(experiments, params, tests=(LinearTest,))
     if apart(experiments)[1]:
         raise ValueError("`experiments` must be recordings in time, to be fitted in a batch, but some are tests. Call `fit` for each.")
-    params, said = _without_nan(system, experiments, params, free, bounds)
+    params, done = _without_nan(system, experiments, params, free, bounds)
     problem, experiments = _checked_problem(system, experiments, params, free, bounds, priors, None, True, numerics, alone=True)
     if len(problem.batches) > 1:
         raise ValueError("`experiments` must be of one kind, but differ in sensors, unknowns or shapes. Fit each kind by itself.")
@@ -240,7 +240,7 @@ def fit_each(
                 line.end()
         ends = each_apart(problem, outcome)
         fits = [report(one, (e,), end, Segments(one, (0,), ())) for e, (one, end) in zip(experiments, ends, strict=True)]
-    return [dataclasses.replace(found, led_in=said) for found in fits]
+    return [dataclasses.replace(found, led_in=done) for found in fits]
 
 
 def _checked_problem(system, experiments, params, free, bounds, priors, loss, relative, numerics, alone=False):

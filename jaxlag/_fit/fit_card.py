@@ -23,7 +23,7 @@ def card(fit: Any) -> str:
     """The card of a `Fit`, a line for each element."""
     rows = [
         _heading(fit),
-        *([f"  led in by {', then '.join(fit.led_in)}"] if fit.led_in else []),
+        *([f"  start found by {', then '.join(fit.led_in)}"] if fit.led_in else []),
         *_parameter_rows(fit),
         *_correlation_rows(fit),
         *_inflation_rows(fit),
@@ -35,7 +35,10 @@ def card(fit: Any) -> str:
 
 
 def estimates_by_name(fit: Any) -> Iterator[tuple[str, list[tuple[str, float, float]]]]:
-    """A name, and each of its numbers as (name, value, standard error): of the free parameters, then of each experiment's unknowns."""
+    """A name, and each of its numbers as (name, value, standard error): of the free parameters, then of each experiment's unknowns.
+
+    Numbers of a start of which only others are unknown are left out, unless constraints move them.
+    """
     theta = np.concatenate([np.ravel(x) for x in jax.tree.leaves(list(fit.estimates.values()))])
     triples = list(zip(fit.names, theta, np.sqrt(np.diag(fit.covariance)), strict=True))
     yield from ((name, [triple for triple in triples if is_within(triple[0], name)]) for name in fit.estimates)
@@ -44,7 +47,8 @@ def estimates_by_name(fit: Any) -> Iterator[tuple[str, list[tuple[str, float, fl
             label = f"experiment {k}: {which}"
             entries = [f"{label}{'.' if name[:1].isalpha() else ''}{name}" for name in entry_names(tree)]
             values, errors = (np.asarray(ravel_pytree(x)[0]) for x in (tree, fit.unknown_errors[k][which]))
-            yield label, list(zip(entries, values, errors, strict=True))
+            is_named = lambda entry, unknown=fit.experiments[k].unknown: any(is_within(entry.partition(": ")[2], name) for name in unknown)
+            yield label, [each for each in zip(entries, values, errors, strict=True) if each[2] != 0 or is_named(each[0])]
 
 
 def _heading(fit):
@@ -61,7 +65,8 @@ def _parameter_rows(fit):
     named = [(name, _estimate(fit, v, e, of(name, whose))) for whose, group in groups if len(group) <= MANY for name, v, e in group]
     named += [(name, _counted(group)) for name, group in groups if len(group) > MANY]
     width = max((len(name) for name, _ in named[:ROWS]), default=0)
-    rows = [f"  {name:<{width}}  {text}" for name, text in named[:ROWS]]
+    wide = max((len(value) for _, (value, interval) in named[:ROWS] if interval), default=0)
+    rows = [f"  {name:<{width}}  {value:<{wide if interval else 0}}{interval}" for name, (value, interval) in named[:ROWS]]
     return rows + ([f"  … and {len(named) - ROWS} more"] if len(named) > ROWS else [])
 
 
@@ -72,16 +77,17 @@ def unit_of(name: str, whose: str, units: Mapping[str, str]) -> str:
 
 
 def _estimate(fit, value, error, unit):
+    """The estimate with its error, and its interval."""
     if not np.isfinite(error):
-        return "not determined by these measurements" if np.isinf(error) else f"{value:.6g}{unit}"
+        return "not determined by these measurements" if np.isinf(error) else f"{value:.6g}{unit}", ""
     t = fit.quantile(0.95)
-    return f"{plus_minus(value, error) + unit:<24} 95 %: {rounded(value - t * error, error)} … {rounded(value + t * error, error)}"
+    return f"{plus_minus(value, error) + unit:<24}", f" 95 %: {rounded(value - t * error, error)} … {rounded(value + t * error, error)}"
 
 
 def _counted(group):
     errors = np.array([error for _, _, error in group])
     known = "" if np.all(np.isnan(errors)) else f", {np.count_nonzero(np.isfinite(errors))} of them determined individually"
-    return f"{len(group)} numbers{known}"
+    return f"{len(group)} numbers{known}", ""
 
 
 def _correlation_rows(fit):

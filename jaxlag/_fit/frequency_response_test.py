@@ -13,28 +13,28 @@ from .linear_test import LinearTest
 
 
 class FrequencyResponseTest(LinearTest):
-    r"""A measured frequency response, for `fit` beside recordings in time or alone.
+    r"""A measured frequency response, to be fitted alone or together with recordings in time.
 
     $$ \hat G_i = G(i\omega_i) + \sigma_i (e_i + i e'_i), \qquad \sigma = |\hat G| \sqrt{\frac{1 - \gamma^2}{2 n \gamma^2}} $$
 
-    with the response G of the motion near an equilibrium or a steady motion, both found anew for all parameters that `fit` tries, and with
-    independent e and e' of variance 1.
+    G is the response near an equilibrium or a steady motion, which is found again for all parameters that `fit` tries; e and e' are
+    independent and have variance 1.
 
     **Arguments:**
 
     - `omega`: (w,), angular frequencies in rad/time.
-    - `values`: complex, (w, outputs, inputs); axes of length one may be left out. NaN stands for what was not measured.
+    - `values`: complex, (w, outputs, inputs); axes of length one may be omitted. NaN marks what was not measured.
     - `q`, `qdot`: a guess of the equilibrium, or where `qdot` is given, of the steady motion, structured as for `simulate`.
     - `inputs`: what was excited, by names as for `linearise`: a force on a coordinate, an entry of `params`, a moved constraint.
     - `observe`: the sensors, as for `Experiment`; by default all coordinates.
-    - `sigma`: standard deviation of the real and of the imaginary part, each, a number or structured like `values`; or in its place
-    - `coherence`, `averages`: γ², between 0 and 1, structured like `values`, and the number n of independent averages it is of. Where
-      several inputs act at once, use `sigma`.
+    - `sigma`: standard deviation of the real part and of the imaginary part, a number or structured like `values`; or, in its place,
+    - `coherence`, `averages`: γ², between 0 and 1, structured like `values`, and the number n of independent averages behind it. If several
+      inputs act at once, use `sigma`.
     - `params`: parameters of this test only, which override those of the fit: an added mass. `fixed`, `fixed_rates`: as for `steady`.
 
     Any consistent units.
 
-    **Raises:** `ValueError` or `TypeError` where shapes do not fit each other, or neither sigma nor coherence is given, or both are.
+    **Raises:** `ValueError` or `TypeError` if shapes do not fit each other, or neither sigma nor coherence is given, or both are.
 
     **Source:** Bendat & Piersol, Random Data, 4th ed., section 9.2 (errors of gain and phase); Pintelon & Schoukens, System Identification:
     A Frequency Domain Approach, 2nd ed., chapter 9.
@@ -93,7 +93,7 @@ class FrequencyResponseTest(LinearTest):
         return [f"{output}/{given}" for output in near.output_names for given in near.input_names]
 
     def refuse_misfit(self, near: LinearSystem) -> None:
-        """Raises where the linear system `near` has more or fewer outputs or inputs."""
+        """Raises if the linear system `near` has more or fewer outputs or inputs."""
         system, measured = (len(near.output_names), len(near.input_names)), self.values.shape[1:]
         without_ones = lambda shape: [size for size in shape if size != 1]
         if without_ones(system) != without_ones(measured):
@@ -103,7 +103,7 @@ class FrequencyResponseTest(LinearTest):
             )
 
     def doubts(self, near: LinearSystem) -> list[str]:
-        """None, whatever linear system is `near`: every value is that of its frequency."""
+        """None: every value belongs to its own frequency, whatever linear system is `near`."""
         return []
 
 

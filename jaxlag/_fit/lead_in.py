@@ -27,16 +27,16 @@ ALIKE = 1e-3  # of -2 log likelihood: fits that differ by less say the same, and
 
 @dataclasses.dataclass(frozen=True)
 class Regress:
-    """Leads a fit in from a poor start, as `start` of `fit`: by `regress`, which needs no start; then the whole motion; where that does not
-    explain the measurements, segments (multiple shooting), and the whole motion from there.
+    """Finds a start for a fit (`start=`) that has a poor one: by `regress`, which needs none; then by fitting the whole motion; and, if
+    that does not explain the measurements, by segments (multiple shooting) and the whole motion from there.
 
-    The most likely of the fits is returned, and its card says what was done. An estimate of `regress` at a bound is moved inside, by its
+    The most likely of these fits is returned, and its card says what was done. An estimate of `regress` at a bound is moved inside by its
     standard error.
 
-    - `segments`: how many each record is cut into; by default 20, or fewer where they would have less than ten samples.
-    - `width`: of the windows of `regress`, a time in the unit of the samples; by default chosen by the data.
+    - `segments`: the number of segments of each record; by default 20, or fewer if they would have less than ten samples.
+    - `width`: of the windows of `regress`, a time in the unit of the samples; by default chosen from the data.
 
-    **Raises:** `ValueError` where `segments` is not a whole number from 2 on.
+    **Raises:** `ValueError` if `segments` is not a whole number from 2 on.
 
     **Source:** Bock, Recent advances in parameter identification techniques for o.d.e. (1983).
 
@@ -66,10 +66,10 @@ def _segments(start, experiments):
 
 
 def led_in(
-    fit_from: Callable[..., Fit], start: Regress, experiments: Sequence[Experiment], params: PyTree, said: str, max_steps: int
+    fit_from: Callable[..., Fit], start: Regress, experiments: Sequence[Experiment], params: PyTree, done: str, max_steps: int
 ) -> Fit:
-    """The best of the fits on the way. `fit_from(experiments, params, max_steps, segments)` is a fit; `said`: what was done before."""
-    steps, fits = [said], []
+    """The best of the fits on the way. `fit_from(experiments, params, max_steps, segments)` is a fit; `done`: what was done before."""
+    steps, fits = [done], []
 
     def stage(name, *where, **more):
         try:
@@ -106,7 +106,7 @@ def inside_bounds(found: Regression, free: Sequence[str], bounds: Any) -> tuple[
     """The parameters found, those at a bound moved inside; and words for what was done."""
     chosen = Free.of(found.params, free, bounds)
     flat = lambda tree: np.concatenate([np.ravel(np.asarray(x)) for name in free for x in jax.tree.leaves(tree[name])])
-    errors, theta, said = flat(found.standard_errors), np.array(chosen.start), []
+    errors, theta, moves = flat(found.standard_errors), np.array(chosen.start), []
     for i, name in enumerate(chosen.entries):
         lower, upper = float(chosen.lower[i]), float(chosen.upper[i])
         most = MARGIN * min(upper - lower, max(abs(theta[i]), 1.0)) if np.isinf(errors[i]) else MARGIN * (upper - lower)
@@ -115,6 +115,6 @@ def inside_bounds(found: Regression, free: Sequence[str], bounds: Any) -> tuple[
         if moved != theta[i]:
             bound = lower if moved > theta[i] else upper
             theta[i] = bound + np.copysign(margin, moved - theta[i])
-            said.append(f"{name} moved inside from its bound {bound:g} to {theta[i]:.3g}")
-    moved_inside = f" ({'; '.join(said)})" if said else ""
+            moves.append(f"{name} moved inside from its bound {bound:g} to {theta[i]:.3g}")
+    moved_inside = f" ({'; '.join(moves)})" if moves else ""
     return chosen.insert(np.asarray(theta, chosen.start.dtype)), f"regress{moved_inside}"

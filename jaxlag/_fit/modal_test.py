@@ -20,13 +20,13 @@ DOUBTFUL = 0.5  # modal assurance below which two shapes are hardly those of one
 
 
 class ModalTest(LinearTest):
-    r"""Natural frequencies and damping ratios, as a modal test finds them, for `fit` beside recordings in time or alone.
+    r"""Natural frequencies and damping ratios from a modal test, to be fitted alone or together with recordings in time.
 
     $$ f_i = \frac{|\lambda_i|}{2\pi} + \sigma_i e_i, \qquad
        \zeta_i = -\frac{\mathrm{Re}\,\lambda_i}{|\lambda_i|} + \varsigma_i e'_i, \qquad
        \mathrm{MAC}(\varphi, \psi) = \frac{|\varphi^H \psi|^2}{\varphi^H\varphi\;\psi^H\psi} $$
 
-    with the eigenvalues λ of the motion near an equilibrium or a steady motion, both found anew for all parameters that `fit` tries.
+    λ are the eigenvalues near an equilibrium or a steady motion, which is found again for all parameters that `fit` tries.
 
     **Arguments:**
 
@@ -34,16 +34,16 @@ class ModalTest(LinearTest):
     - `q`, `qdot`: a guess of the equilibrium, or where `qdot` is given, of the steady motion, structured as for `simulate`.
     - `sigma`: their standard deviation in 1/time, a number or (k,).
     - `damping_ratio`, `damping_sigma`: ζ, (k,), and its standard deviation, a number or (k,).
-    - `shapes`: what the sensors see of each mode, a pytree like that which `observe` returns, with the modes as first axis; real or
-      complex, of any scale. Each is paired with the predicted mode of the most similar shape, by the modal assurance criterion MAC;
-      sensors should have one unit. Without shapes, modes are paired in ascending order, the first with the lowest that oscillates.
+    - `shapes`: what the sensors see of each mode: a pytree like the one that `observe` returns, with the modes as first axis; real or
+      complex, of any scale. Each is paired with the predicted mode of the most similar shape, by the modal assurance criterion MAC; sensors
+      should have one unit. Without shapes, modes are paired in ascending order, the first with the lowest that oscillates.
     - `observe`: the sensors, as for `Experiment`; by default the coordinates named in `shapes`.
     - `params`: parameters of this test only, which override those of the fit: an added mass. `fixed`, `fixed_rates`: as for `steady`.
 
-    NaN among frequencies and damping ratios stands for what was not measured. Any consistent units. As fields, `values` and `sigma` hold
-    both kinds by name; `inputs` is empty.
+    Frequencies and damping ratios that were not measured are NaN. Any consistent units. As fields, `values` and `sigma` hold both kinds by
+    name; `inputs` is empty.
 
-    **Raises:** `ValueError` or `TypeError` where lengths differ, a sigma is missing, or shapes are of a single number.
+    **Raises:** `ValueError` or `TypeError` if lengths differ, a sigma is missing, or shapes are of a single number.
 
     **Source:** Ewins, Modal Testing, 2nd ed., chapter 5; Allemang & Brown, Proc. 1st Int. Modal Analysis Conf. (1982) 110 (MAC).
 
@@ -90,13 +90,13 @@ class ModalTest(LinearTest):
         super().__init__(values, sigmas, q, qdot, params, observe, (), fixed, fixed_rates)
 
     def predicted(self, near: LinearSystem) -> PyTree:
-        """Those of the linear system `near`, of the modes that were measured; NaN of one that does not oscillate."""
+        """Frequencies and damping ratios of the linear system `near`, for the measured modes; NaN for one that does not oscillate."""
         values, _, _ = self.paired(near)
         found = {"frequency": jnp.abs(values) / (2 * jnp.pi), "damping_ratio": damping_ratios(values)}
         return {name: found[name] for name in self.values}
 
     def paired(self, near: LinearSystem) -> tuple[Array, Float[Array, " k"], Float[Array, " k"]]:
-        """Of each measured mode the eigenvalue of the system `near`, the agreement of their shapes, and that with the most similar."""
+        """For each measured mode the paired eigenvalue of the system `near`, the agreement of the two shapes, and the best of any pair."""
         found = of_first_order(near.A, near.sample_time)
         oscillates, count = found.values.imag > 0, len(self.values["frequency"])
         if self.shapes is None:
@@ -110,11 +110,11 @@ class ModalTest(LinearTest):
         return values, jnp.take_along_axis(agreement, chosen[:, None], axis=1)[:, 0], jnp.max(agreement, axis=1)
 
     def labels(self, near: LinearSystem) -> list[str]:
-        """Names of the channels, in the order of JAX; the same whatever system is `near`."""
+        """Names of the channels, in JAX's order; they do not depend on the system `near`."""
         return sorted(self.values)
 
     def refuse_misfit(self, near: LinearSystem) -> None:
-        """Raises where fewer modes of the linear system `near` oscillate, or its outputs are others."""
+        """Raises if fewer modes of the linear system `near` oscillate, or if its outputs differ."""
         count, there = len(self.values["frequency"]), int(np.sum(np.asarray(near.eigenvalues).imag > 0))
         if count > there:
             raise ValueError(f"`frequency` must be of modes that the system has, but {count} are given and {there} oscillate. Give fewer.")

@@ -26,8 +26,8 @@ def different_halves(minimum: Minimum, uncertainty: Uncertainty) -> Halves | Non
 
     Each half has its own parameters, θ and θ + δ, in the model linearised at its minimum. With the covariance C of δ, the sandwich where
     what is then left of the residuals is correlated, $\delta^T C^{-1} \delta / p$ has the F distribution where the model is right; the
-    residuals count as `independent_samples`. Of random records of 200 and 1000 samples, one in 200 or fewer was said to differ for noise of
-    any correlation, and of 60 samples none for white noise (tests/benchmarks/bench_coverage.py counts them).
+    residuals count as `independent_samples`. Of random records of 200 and 1000 samples, one in 200 or fewer was reported to differ, for
+    noise of any correlation, and of 60 samples none, for white noise (tests/benchmarks/bench_coverage.py counts them).
 
     **Source:** Chow, Econometrica 28 (1960) 591; Andrews & Fair, Rev. Econ. Stud. 55 (1988) 615.
     """

@@ -24,7 +24,7 @@ class Prediction(NamedTuple):
     - `values`: structured like the experiment's `values`; leaves (T, ...) in the units of the channels.
     - `standard_errors`: of `values`, from the uncertainty of the parameters; structured like them.
     - `lower`, `upper`: the confidence band; structured like `values`.
-    - `motion`: the `Trajectory` behind them; of a `ModalTest` or `FrequencyResponseTest`, the `LinearSystem`.
+    - `motion`: the `Trajectory` behind them; for a `ModalTest` or `FrequencyResponseTest`, the `LinearSystem`.
 
     ```python
     import jax.numpy as jnp

@@ -28,9 +28,9 @@ class Regression:
 
     - `params`: all parameters, the free ones at their estimate: a start for `fit`. `estimates`: the free ones only, by name.
     - `standard_errors`: structured like `estimates`, in the same units; infinite where the measurements do not determine a parameter.
-    - `names`: of the p numbers, in flat order.
+    - `names`: the p numbers, in flat order.
     - `linear`: whether the equations are linear in the free parameters, so that one step solved them.
-    - `width`: of the windows, a time; `windows`: how many there were. `reversals`: whether dry friction reverses in some of them.
+    - `width`: of the windows, a time; `windows`: their number. `reversals`: whether dry friction reverses in some of them.
 
     ```python
     import jax.numpy as jnp
@@ -86,13 +86,13 @@ def regress(
        p = \frac{\partial L}{\partial \dot q}, \quad F = \frac{\partial L}{\partial q} - \frac{\partial D}{\partial \dot q} + Q, \quad
        P = 1 - G^T (G G^T)^+ G $$
 
-    for test functions φ = (1 − s²)⁴ on overlapping windows, −1 ≤ s ≤ 1 (the weak form). The time derivative of the momentum p has gone to
-    φ by integration by parts, so that no acceleration is needed and inputs need no filter: a `Signal` that is held is integrated
-    exactly. P eliminates the unknown constraint forces, also nonholonomic ones. q and q̇ come from smoothing splines of all channels,
-    measured velocities and accelerations among them; means of the constraints over the windows are residuals too. Where the equations
-    are linear in the parameters, which is checked by differentiation, one step solves them. Each equation is weighted by one over the
-    size of its residuals. Windows in which dry friction may stick are left out; those in which it only reverses are used where that
-    lowers the standard errors.
+    for test functions φ = (1 − s²)⁴ on overlapping windows, −1 ≤ s ≤ 1 (the weak form). Integration by parts has moved the time derivative
+    from the momentum p to φ, so that no acceleration is needed and inputs need no filter: a `Signal` that is held is integrated exactly. P
+    eliminates the unknown constraint forces, also nonholonomic ones. q and q̇ come from smoothing splines of all channels, including
+    measured velocities and accelerations; the means of the constraints over the windows are further residuals. If the equations are linear
+    in the parameters, which is checked by differentiation, one step solves them. Each equation is weighted by the inverse of the size of
+    its residuals. Windows in which dry friction may stick are left out; windows in which it only reverses are used if that lowers the
+    standard errors.
 
     **Arguments:**
 
@@ -100,16 +100,16 @@ def regress(
       an experiment keep their value.
     - `params`: all parameters, as for `fit`; a free one that is NaN needs no starting value.
     - `free`, `bounds`: as for `fit`.
-    - `width`: of the windows, a time. In narrow windows the noise of the motion biases the estimates; wide windows are few. By default,
-      of the widths whose estimates agree with those of all wider windows within their errors, the one with the smallest errors.
+    - `width`: of the windows, a time. In narrow windows the noise of the motion biases the estimates; wide windows are few. The default is
+      the width with the smallest errors among those whose estimates agree, within their errors, with those of all wider windows.
 
     Units are any consistent set.
 
-    **Returns:** a `Regression`. Its standard errors come from the scatter of the windows: they hold for coloured noise and for forces
-    that the model lacks, not for a bias of all windows alike. Estimates of `fit` are more accurate where noise is all that is wrong.
+    **Returns:** a `Regression`. Its standard errors come from the scatter of the windows: they account for coloured noise and for forces
+    that the model lacks, but not for a bias common to all windows. If noise is all that is wrong, estimates of `fit` are more accurate.
 
-    **Raises:** `ValueError` where the system has states beside q, `free` names no parameter, the equations contain only ratios of the
-    parameters, the sensors do not see the motion, or they have a delay; where `width` is not positive, or fits no window into the records.
+    **Raises:** `ValueError` if the system has further states, `free` names no parameter, the equations contain only ratios of the
+    parameters, the sensors do not see the motion, or they have a delay; if `width` is not positive, or fits no window into the records.
 
     **Source:** Shinbrot, Trans. ASME 79 (1957) 582 (method of modulating functions); Messenger & Bortz, J. Comput. Phys. 443 (2021)
     110525 (weak form); Gautier & Khalil, IEEE Trans. Robot. Autom. 6 (1990) 368; Goldenshluger & Nemirovski, Math. Methods Stat. 6

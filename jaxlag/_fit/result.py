@@ -43,43 +43,44 @@ class Fit:
 
     $$ \mathrm{cov}\,\hat\theta = \hat\sigma^2 (J^T J)^{-1}, \qquad \hat\sigma^2 = \frac{\sum r_i^2}{N - p} $$
 
-    In the covariance, σ̂ is replaced by 1 where every experiment came with its sigma. Otherwise each channel has its own: r is what was
-    measured minus what is predicted, over the most likely sigma of the channel relative to σ̂, found together with θ̂; profile likelihoods
-    keep it. Where residuals are correlated in time (the test is `whiteness` of a channel), all errors, intervals and bands are those of
-    the sandwich, with R the correlation of each channel and experiment according to an autoregression of its residuals:
+    If every experiment has a sigma, σ̂ is replaced by 1 in the covariance. Otherwise each channel has its own sigma: r is measured minus
+    predicted, divided by the most likely sigma of the channel relative to σ̂, which is found together with θ̂; profile likelihoods keep it.
+    If residuals are correlated in time (tested by `whiteness` of a channel), all errors, intervals and bands come from the sandwich
+    formula, where R is the correlation of each channel and experiment according to an autoregression of its residuals:
 
     $$ \mathrm{cov}\,\hat\theta = \hat\sigma^2 (J^T J)^{-1} J^T R J (J^T J)^{-1} $$
 
-    Of the parameters, p numbers:
+    Parameters (p numbers):
 
     - `params`: all parameters, the free ones at their estimate; `estimates`: the free ones only, by name.
-    - `standard_errors`: structured like `estimates`; infinite where the measurements do not determine a parameter.
-      `white_standard_errors`: what they would be if residuals were white. `remarks`: sentences on what the measurements determine
-      instead, on bounds, and on a model that does not explain them.
-    - `names`: of the p numbers; in this order `covariance` (p, p), `correlation` (p, p), and `inflation` (p,), by which factor correlated
-      residuals enlarge the standard errors. `correlated`: over how many samples they are correlated, 0 where they are white.
+    - `standard_errors`: structured like `estimates`; infinite where the measurements do not determine a parameter. `white_standard_errors`:
+      what they would be if residuals were white. `remarks`: sentences about what the measurements do not determine, about bounds, and about
+      a model that does not explain the measurements.
+    - `names`: the p numbers, in the order of `covariance` (p, p), `correlation` (p, p), and `inflation` (p,), the factors by which
+      correlated residuals enlarge the standard errors. `correlated`: the number of samples over which they are correlated, 0 if they are
+      white.
 
-    Of the E experiments, lists with one entry for each:
+    Experiments (lists with one entry for each of the E experiments):
 
-    - `experiments`: with estimated starts and parameters put in; `unknowns`: those estimates by name, `"q0"`, `"qdot0"` and parameters;
+    - `experiments`: with estimated starts and parameters filled in; `unknowns`: these estimates by name, `"q0"`, `"qdot0"` and parameters;
       `unknown_errors`: their standard errors.
     - `predictions`, `residuals` (measured minus predicted): structured like the values of the experiment, leaves (T, ...).
       `prediction_errors`: standard errors of the predictions, NaN where nothing was measured.
     - `channels`: a flat list of how well each `Channel` is predicted.
 
-    A `ModalTest` among them has values by name, `"frequency"` and `"damping_ratio"`; a `FrequencyResponseTest` has complex ones, of which
-    errors are those of the real and of the imaginary part, as a complex number.
+    The values of a `ModalTest` have the names `"frequency"` and `"damping_ratio"`; those of a `FrequencyResponseTest` are complex, and so
+    are their errors: one part for the real, one for the imaginary part.
 
-    Of the noise and the iteration:
+    Noise and iteration:
 
-    - `sigma`: σ̂, in units of the given sigma; where none was given, in units of the measurements, the geometric mean of those of the
-      channels. `sigmas`: for each experiment, one for each channel, estimated or given; structured like a row of its values. `absolute`:
-      whether sigma was given.
-    - `cost`: ½ Σ r² at the estimates; `measurements`: N; `unknown_count`: determined unknowns, the p parameters and those of experiments;
-      `exact`: how many of the measurements are those of channels that are predicted exactly.
-    - `converged`; `reason`: why the iteration ended; `steps`: how many it took; `costs`: the cost at the start and after each step.
-    - `led_in`: by which steps the start was found, where it was not `params` (`Regress`).
-    - `problem`, `x`, `x_covariance`: the least-squares problem, all its unknowns at the minimum, and their covariance over σ̂².
+    - `sigma`: σ̂, in units of the given sigma; if none was given, the geometric mean of those of the channels, in units of the
+      measurements. `sigmas`: for each experiment, one for each channel, estimated or given; structured like a row of its values.
+      `absolute`: whether sigma was given.
+    - `cost`: ½ Σ r² at the estimates; `measurements`: N; `unknown_count`: the number of determined unknowns, of parameters and experiments;
+      `exact`: the number of measurements in channels that are predicted exactly.
+    - `converged`; `reason`: why the iteration ended; `steps`: the number of steps; `costs`: the cost at the start and after each step.
+    - `led_in`: the steps by which the start was found, if it was not `params` (`Regress`).
+    - `problem`, `x`, `x_covariance`: the least-squares problem, all its unknowns at the minimum, and their covariance divided by σ̂².
 
     Quantities have the units of the parameters and measurements, any consistent set. `fit.plot()` draws it, with all that `plot.fit` takes.
 
@@ -155,12 +156,12 @@ class Fit:
 
     @property
     def aic(self) -> float:
-        """Akaike's criterion; of two models of the same data the one with the smaller value is better. Takes residuals as independent."""
+        """Akaike's criterion; of two models of the same data the one with the smaller value is better. Assumes independent residuals."""
         return self.misfit + 2 * self._fitted
 
     @property
     def bic(self) -> float:
-        """Schwarz's criterion, which penalises parameters more than Akaike's. Takes residuals as independent, too."""
+        """Schwarz's criterion, which penalises parameters more than Akaike's. Assumes independent residuals."""
         return self.misfit + float(np.log(self.measurements)) * self._fitted
 
     @property
@@ -170,11 +171,11 @@ class Fit:
 
     @property
     def sigma_scale(self) -> float:
-        """The factor of all standard errors: σ̂, or 1 where sigma was given."""
+        """The factor of all standard errors: σ̂, or 1 if sigma was given."""
         return 1.0 if self.absolute and self.problem.model.loss is None else self.sigma
 
     def quantile(self, level: float) -> float:
-        """t of the interval θ̂ ± t · standard error with this `level`: of the normal distribution where sigma was given, or Student's."""
+        """t of the interval θ̂ ± t · standard error at this `level`: of the normal distribution if sigma was given, otherwise Student's."""
         if not 0 < level < 1:
             raise ValueError(f"`level` must lie between 0 and 1, but is {level:g}. Use e.g. 0.95.")
         from scipy import special
@@ -184,13 +185,13 @@ class Fit:
     def interval(self, name: str, level: float = 0.95, *, profile: bool = False) -> Interval:
         """The confidence interval of one parameter.
 
-        **Arguments:** `name`: an entry of `names`; `level`: between 0 and 1. `profile`: False for the linearised interval,
-        θ̂ ± t · standard error. True for that of the profile likelihood, where all other unknowns are fitted anew for each value of the
-        parameter: it need not be symmetric. Correlated residuals widen both by the same factor.
+        **Arguments:** `name`: an entry of `names`; `level`: between 0 and 1. `profile`: False for the linearised interval, θ̂ ± t ·
+        standard error. True for that of the profile likelihood, which refits all other unknowns for each value of the parameter and need
+        not be symmetric. Correlated residuals widen both by the same factor.
 
         **Returns:** an `Interval`.
 
-        **Raises:** `ValueError` where `name` is not a fitted parameter, `level` is out of range, or a robust loss is profiled.
+        **Raises:** `ValueError` if `name` is not a fitted parameter, `level` is out of range, or a robust loss is profiled.
 
         **Source:** Bates & Watts, Nonlinear Regression Analysis and Its Applications (1988), section 6.1.
         """
@@ -212,10 +213,10 @@ class Fit:
         return Interval(*ends)
 
     def band(self, number: int = 0, level: float = 0.95) -> tuple[PyTree, PyTree]:
-        """The confidence band of the predictions of a fitted experiment, from the uncertainty of all unknowns, its start included.
+        """The confidence band of the predictions of a fitted experiment, from the uncertainty of all unknowns, including its start.
 
         **Arguments:** `number`: of the experiment; `level`: between 0 and 1. **Returns:** the lower and the upper end, each structured
-        like the values of the experiment. **Raises:** `ValueError` where `level` is out of range.
+        like the values of the experiment. **Raises:** `ValueError` if `level` is out of range.
 
         **Source:** Seber & Wild, Nonlinear Regression (1989), section 5.1.
         """
@@ -231,20 +232,21 @@ class Fit:
         **Arguments:** `experiment`: its start is taken as exact; its `values` may be None. Or a `ModalTest` or `FrequencyResponseTest`.
         `level`: of the band, between 0 and 1.
 
-        **Returns:** a `Prediction`. Where the sensors have a delay, its `motion` has one more sample, the first one at the start.
+        **Returns:** a `Prediction`. If the sensors have a delay, its `motion` has one more sample, the first one at the start.
 
-        **Raises:** `ValueError` where the motion cannot be computed, or `level` is out of range.
+        **Raises:** `ValueError` if the motion cannot be computed, or `level` is out of range.
         """
         covariance = self.sigma_scale**2 * self.x_covariance
         of = predicted_test if isinstance(experiment, LinearTest) else predicted
         return of(self.problem, self.x, covariance, experiment, self.quantile(level))  # type: ignore[operator]
 
     def to_dict(self, *, level: float = 0.95) -> dict[str, Any]:
-        """The fit as plain data for `json.dumps`. None stands for a number that does not exist, e.g. the error of an undetermined one.
+        """The fit as plain data for `json.dumps`. None stands for a number that does not exist, such as the error of an undetermined
+        parameter.
 
         - `"parameters"`: a row for each number, of the parameters and then of each experiment's unknowns, with `"name"`, `"value"`,
-          `"standard_error"`, `"lower"` and `"upper"` at the confidence `level`, and its `"unit"` where the system states
-          units. `"params"`: all parameters as nested dicts.
+          `"standard_error"`, `"lower"` and `"upper"` at the confidence `level`, and its `"unit"` if the system states units. `"params"`:
+          all parameters as nested dicts.
         - `"channels"`, and the fields and properties of `Fit` that are numbers or text, under their names.
         """
         copied = ("names", "correlation", "covariance", "remarks", "sigma", "absolute", "cost", "costs", "aic", "bic", "measurements")
@@ -253,13 +255,13 @@ class Fit:
         return jsonable({"parameters": rows, "level": level} | parts | {"channels": channels})
 
     def to_dataframe(self, frame: Callable | None = None, *, level: float = 0.95) -> Any:
-        """A table with a row for each number: name, value, standard_error, lower, upper, and unit where the system states units.
+        """A table with a row for each number: name, value, standard_error, lower, upper, and unit if the system states units.
 
         **Arguments:** `frame`: the class of data frames, as for `Trajectory.to_dataframe`; `level`: of the intervals.
 
         **Returns:** a `frame`.
 
-        **Raises:** `ImportError` where no `frame` is given and neither pandas nor polars is installed.
+        **Raises:** `ImportError` if no `frame` is given and neither pandas nor polars is installed.
         """
         rows = list(self._rows(level))
         return frame_of({column: [row[column] for row in rows] for column in rows[0]}, frame)

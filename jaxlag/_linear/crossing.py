@@ -22,8 +22,8 @@ FEW = 256  # numbers by which A is differentiated forward; of more, backward
 
 
 class Crossing(eqx.Module):
-    """Where a branch crosses the imaginary axis: the `value` of the parameter, the `frequency` |Im λ| in rad/time, its `kind`, "flutter"
-    (a pair that oscillates) or "divergence" (λ = 0), and the `direction`: whether growth of the parameter "destabilises" or "stabilises".
+    """Where a branch crosses the imaginary axis: the `value` of the parameter, the `frequency` |Im λ| in rad/time, its `kind`, "flutter" (a
+    pair that oscillates) or "divergence" (λ = 0), and the `direction`: whether increasing the parameter "destabilises" or "stabilises".
     """
 
     value: Float[Array, ""]

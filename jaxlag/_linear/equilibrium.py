@@ -27,11 +27,12 @@ class Equilibrium(eqx.Module):
     """Where a system rests, or moves steadily.
 
     - `q`, `qdot`: structured like the guess; `states`, `multipliers`: by name; `t`: the time.
-    - `friction`: by dissipation term with dry friction, the force that holds and the bound that it would have to exceed.
-    - `stability`: "stable", "unstable" or "neutral", by the potential energy on the constraints; elsewhere a sentence.
+    - `friction`: for each dissipation term with dry friction, the force that holds and the bound that it would have to exceed.
+    - `stability`: "stable", "unstable" or "neutral", judged by the potential energy on the constraints; if that is impossible, a sentence
+      says why.
     - `stiffness`: the second variation of the potential on the constraints, relative to M: squares of natural frequencies, ascending;
-      without inertia, the eigenvalues of the stiffness itself. None where there is no potential, of many coordinates that are each coupled
-      to a few, under `jit` and under `vmap`. Its derivative is NaN: take those of `linearise`.
+      without inertia, the eigenvalues of the stiffness itself. None if there is no potential, for large sparse systems, and under `jit` and
+      `vmap`. Its derivative is NaN: differentiate `linearise` instead.
     - `undecided`: coordinates on which nothing depends: they stay where they were.
     """
 
@@ -91,18 +92,17 @@ def equilibrium(
 
     $$ f(q, 0, \lambda) + G^T\lambda = 0, \qquad g(q) = 0, \qquad \dot z = 0 $$
 
-    Newton's method from the guess `q`, to whatever equilibrium is near, a minimum or not. Coordinates on which nothing depends stay where
-    they are. Without friction the equilibrium is a point; with dry friction it is the middle of a band, and where there is none without
-    friction, the guess itself, if friction can hold it.
+    Newton's method from the guess `q` to a nearby equilibrium, stable or not. Coordinates on which nothing depends stay where they are.
+    With dry friction, equilibria form a band: the result is its middle, the equilibrium without friction, or, if there is none, the guess
+    itself, provided that friction can hold it.
 
     **Arguments:** `q`, a guess, structured as for `simulate`; `params`, `t`, `states` (guesses, too) as for `acceleration`; `fixed`: names
-    of coordinates that stay as given, to choose one of many equilibria (what holds a coordinate by a force is a holonomic constraint);
-    `stable`: goes down in the potential energy to a minimum first, which asks for a system whose forces at rest all come from L. Any
-    consistent units.
+    of coordinates that stay as given, to choose one of many equilibria (to hold a coordinate by a force, state a holonomic constraint);
+    `stable`: first descends in the potential energy to a minimum, which requires that all forces at rest come from L. Any consistent units.
 
     **Returns:** an `Equilibrium`; print it. Differentiable in `params` to any order, by the implicit function theorem.
 
-    **Raises:** `ValueError` where no equilibrium was found, with the force that is left; of many under `vmap` where the first has none.
+    **Raises:** `ValueError` if no equilibrium was found, with the force that is left; of many under `vmap` if the first has none.
     Under `jit`, and of the others, all is NaN there.
 
     **Source:** Goldstein, Classical Mechanics, 3rd ed., section 6.1.
@@ -136,16 +136,16 @@ def steady(
 
     $$ f(q, \dot q, \lambda) + G^T\lambda = 0, \qquad \ddot q = 0, \qquad g(q) = 0, \qquad \psi(q, \dot q) = 0 $$
 
-    A spinning top, a governor, a rolling wheel. Coordinates run whose velocity in `qdot` is not zero; nothing may depend on them but by
-    their velocities, and by t where a motor drives them. Velocities that the equations leave open stay as given, as the speed of a
-    governor; others are a guess, as that of a body that falls through air.
+    For example a spinning top, a governor, a rolling wheel. The coordinates that run are those whose velocity in `qdot` is not zero;
+    nothing may depend on them except through their velocities, and through t if a motor drives them. Velocities that the equations leave
+    open stay as given, such as the speed of a governor; others are guesses, such as the speed of a body that falls through air.
 
-    **Arguments:** as `equilibrium`, and `qdot`, the velocities; `fixed_rates`: names of coordinates whose velocity is no guess. Any
+    **Arguments:** as `equilibrium`, and `qdot`, the velocities; `fixed_rates`: names of coordinates whose velocity stays as given. Any
     consistent units.
 
     **Returns:** an `Equilibrium`, with its `qdot`. Differentiable in `params` and in what stays as given.
 
-    **Raises:** `ValueError` where no steady motion was found, or what was found does not stay as it is.
+    **Raises:** `ValueError` if no steady motion was found, or what was found does not stay as it is.
 
     **Source:** Goldstein, Classical Mechanics, 3rd ed., section 8.3 (Routh's procedure, steady motion).
 

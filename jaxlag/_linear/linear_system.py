@@ -43,14 +43,14 @@ class LinearSystem(eqx.Module):
     In discrete time, x(k + 1) = A x(k) + B u(k), with u held over each `sample_time`. Along a `Trajectory` all arrays have the samples
     as first axis.
 
-    - `A`, `B`, `C`, `D`; `D_rates`: D₁ and D₂, zero unless an input moves a constraint and rates or forces are seen.
-    - `basis`: T, where inputs move no constraint; q flat in the order of `jax.flatten_util.ravel_pytree`. `constraint_forces`: Λ, with
-      δλ = Λ x. `mass`: M. `coordinates`: which entries of q are independent.
+    - `A`, `B`, `C`, `D`; `D_rates`: D₁ and D₂, zero unless an input moves a constraint and the outputs include rates or forces.
+    - `basis`: T, if inputs move no constraint; q is flat in the order of `jax.flatten_util.ravel_pytree`. `constraint_forces`: Λ, with δλ =
+      Λ x. `mass`: M. `coordinates`: which entries of q are independent.
     - `state_names`, `input_names`, `output_names`: one for each number; `phi_dot` is the velocity of `phi`.
     - `q`, `qdot`: the state, structured as given; `origin`: the same, with time and params; None along a trajectory.
     - `sample_time`: None in continuous time.
-    - `second_order`: the matrices M, C, G, K, N of a system of second order; None where there are first-order states, nonholonomic
-      constraints or friction that sticks.
+    - `second_order`: the matrices M, C, G, K, N of a system of second order; None with first-order states, nonholonomic constraints or
+      sticking friction.
 
     ```python
     import jaxlag as jl
@@ -81,12 +81,12 @@ class LinearSystem(eqx.Module):
 
     @property
     def eigenvalues(self) -> Complex[Array, "*t d"]:
-        """Those of A, sorted by size; in discrete time the multipliers of a step. Differentiable; of repeated ones the mean is."""
+        """Eigenvalues of A, sorted by size; in discrete time the multipliers of a step. Differentiable; of repeated ones, their mean is."""
         return _eigenvalues(self.A)
 
     @property
     def second_order(self) -> SecondOrder | None:
-        """M ξ̈ + (C + G) ξ̇ + (K + N) ξ = … of a mechanical system alone."""
+        """M ξ̈ + (C + G) ξ̇ + (K + N) ξ = … of a purely mechanical system."""
         at = self.coordinates.partition
         k, n = len(at.positions), self.coordinates.q.size
         if self.sample_time is not None or at.positions != at.velocities or len(self.state_names) != 2 * k:
@@ -128,7 +128,7 @@ class LinearSystem(eqx.Module):
 
     def power_spectrum(self, omega: Any, density: Any) -> Complex[Array, "w p p"]:
         """Spectral density of the outputs, G S Gᴴ, under inputs of the spectral `density` S: a number (white noise in each input), a
-        matrix, or one of either for each of `omega`, as measured. In the convention of S: two-sided and per rad/time, or one-sided and
+        matrix, or one of these for each of `omega`, as measured. It has the convention of S: two-sided and per rad/time, or one-sided and
         per Hz.
         """
         response = self.frequency_response(omega)
@@ -148,7 +148,7 @@ class LinearSystem(eqx.Module):
 
     def impulse_response(self, ts: Any) -> Float[Array, "t p m"]:
         """Outputs at the times `ts` after a unit impulse of each input at t = 0; without the impulse that D passes on. In discrete time,
-        after an input that is 1 at the first sample alone.
+        after an input that is 1 only at the first sample.
         """
         A, B, C, D = self._matrices
         self._refuse_rates("the response to an impulse")
@@ -159,7 +159,7 @@ class LinearSystem(eqx.Module):
         return jnp.einsum("pd,tdm->tpm", C, free_motion(A, B, _times(ts)))
 
     def transfer_zeros(self) -> np.ndarray:
-        """Invariant zeros, as numbers of NumPy, not differentiated: where the transfer matrix loses rank."""
+        """Invariant zeros, where the transfer matrix loses rank; as NumPy numbers, not differentiable."""
         A, B, C, D = self._matrices
         if not is_concrete(self):
             raise TypeError(
@@ -169,7 +169,7 @@ class LinearSystem(eqx.Module):
         return zeros(A, B, C, D[0])
 
     def discrete(self, sample_time: Any) -> "LinearSystem":
-        """The same in discrete time, with inputs held over each `sample_time`, exactly; of many systems each."""
+        """The same system in discrete time, exact for inputs held over each `sample_time`; of many systems, each."""
         if self.sample_time is not None:
             raise ValueError("`discrete` must start from continuous time, but this system is in discrete time already. Linearise it anew.")
         self._refuse_rates("`discrete`")

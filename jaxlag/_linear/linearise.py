@@ -48,30 +48,30 @@ def linearise(
        \frac{\partial(g, \psi)}{\partial(q, \dot q, z)}\,T = 0, \qquad
        A = \left[\frac{\partial F}{\partial(q, \dot q, z)}\,T\right]_{\text{independent}} $$
 
-    F is the motion (q̇, q̈, ż) and ψ = (dg/dt, a). x holds the deviations of independent coordinates, then of independent velocities, then
-    of the states z of first order; where x is one of these, T is the identity.
+    F is the rate (q̇, q̈, ż) and ψ = (dg/dt, a). x holds the deviations of independent coordinates, then of independent velocities, then of
+    the first-order states z; in these rows, T is the identity.
 
     **Arguments:**
 
-    - `q`, `qdot`: the state, at rest where `qdot` is left out; or in place of both what `equilibrium` or `steady` found, or a `Trajectory`,
-      along which all arrays get the samples as first axis. `params`, `t`, `states` as for `acceleration`.
-    - `inputs`: names of what u moves: entries of `params` (numbers, arrays, signals), a coordinate (a force on it), a force (1 + u times
-      itself), a holonomic constraint (g = u) or a nonholonomic one (a = u), a sampled state. What moves does so with its velocity and
-      acceleration wherever these count: a base is shaken by its place.
-    - `outputs`: what is seen, a function as `observe` of an `Experiment`; all coordinates where it is left out.
-    - `independent`: names of coordinates that are to be independent if possible, or a `LinearSystem` whose choice is taken. Needed under
-      `jit` where there are constraints: the choice is made by numbers, which `jit` hides; `grad` and `vmap` do not.
-      Along a trajectory the choice is that of its first sample; where these cease to be independent, T and A grow beyond all bounds.
-    - `frozen`: allows a state that is not steady, at which eigenvalues say little of stability.
+    - `q`, `qdot`: the state, at rest if `qdot` is omitted; or, in place of both, the result of `equilibrium` or `steady`, or a
+      `Trajectory`, along which all arrays get the samples as first axis. `params`, `t`, `states` as for `acceleration`.
+    - `inputs`: names of what u acts on: entries of `params` (numbers, arrays, signals), a coordinate (a force on it), a force (multiplied
+      by 1 + u), a holonomic constraint (g = u) or a nonholonomic one (a = u), a sampled state. The velocity and acceleration of an input
+      are included wherever they matter: to shake a base, move its position.
+    - `outputs`: what is seen, a function like `observe` of an `Experiment`. Default: all coordinates.
+    - `independent`: names of coordinates that are to be independent if possible, or a `LinearSystem` whose choice is reused. Required under
+      `jit` if there are constraints, because the choice depends on numbers that `jit` hides; `grad` and `vmap` do not. Along a trajectory,
+      the choice at the first sample is kept; where those coordinates cease to be independent, T and A grow without bounds.
+    - `frozen`: allows a state that is not steady, where eigenvalues say little about stability.
 
-    Dry friction: what sticks is held, what slips keeps its sliding force. With `Sampled` states of one period the result is in discrete
-    time, exactly. Any consistent units.
+    Dry friction: elements that stick are held, elements that slip keep their sliding force. With `Sampled` states of one period the result
+    is in discrete time, and exact. Any consistent units.
 
-    **Returns:** a `LinearSystem`. Differentiable in `q`, `qdot`, `params`, `states`; a state that is given as numbers moves with its
-    constraints, as a pendulum's with the length of its rod.
+    **Returns:** a `LinearSystem`. Differentiable in `q`, `qdot`, `params`, `states`; a state given as numbers follows its constraints, as
+    the position of a pendulum follows the length of its rod.
 
-    **Raises:** `ValueError` where the state accelerates or A changes along the motion, where it is not on its constraints, at a singular
-    position, and where a name stands for nothing.
+    **Raises:** `ValueError` if the state accelerates or A changes along the motion, if it is off its constraints, at a singular position,
+    or if a name is unknown.
 
     **Source:** Wehage & Haug, J. Mechanical Design 104 (1982) 247-255 (independent coordinates); Meijaard, Papadopoulos, Ruina & Schwab,
     Proc. R. Soc. A 463 (2007) 1955-1982 (a rolling bicycle, as a check).
@@ -108,7 +108,7 @@ def linearise(
         raise ValueError("`inputs` must not move a constraint along a trajectory, where A changes, but do. Move a force instead.")
     if not (along or frozen):
         refuse_unsteady(found, lambda step: of(*moved_on(first, step)), near.names)
-    return _linear_system(near, choice, found, q, qdot, None if along else Origin.of(t, q, qdot, params))
+    return _linear_system(near, choice, found, q, qdot, None if along else Origin.of(t, q, qdot, params, system))
 
 
 def _with_constraints(system: System, t: Any, q: PyTree, qdot: PyTree, params: PyTree, states: PyTree) -> tuple[PyTree, PyTree]:

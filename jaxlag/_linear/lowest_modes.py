@@ -27,24 +27,25 @@ STILL = 0.375  # exponent of eps: forces that are left at rest, in parts of thei
 
 
 def lowest_modes(system: System, q: Any, params: PyTree = None, *, count: int = 10, shift: float = 0.0, t: Any = 0.0) -> Modes:
-    r"""The lowest natural frequencies and modes of a system at rest, of many coordinates that are each coupled to a few.
+    r"""The lowest natural frequencies and modes of a large sparse system at rest.
 
     $$ (\lambda^2 M + \lambda C + K)\,\hat q = G^T \hat\mu, \qquad G \hat q = 0 $$
 
     M, C, K and G are read from L, D and g as sparse matrices, the matrix at `shift` is factorised once, and Arnoldi's method finds the λ
-    nearest to it: time and memory grow with the number of coordinates. `linearise(…).modes()` finds all modes, by matrices of all by all.
+    nearest to it: time and memory grow in proportion to the number of coordinates. `linearise(…).modes()` finds all modes, with dense
+    matrices.
 
-    **Arguments:** `q`: where the system rests, or what `equilibrium` found; `params`, `t` as for `acceleration`; `count`: how many modes,
-    less than half as many as there are degrees of freedom; `shift`: a real number in 1/time, some part of the lowest frequency, needed
-    where a body is free to move or K is singular for another reason. Any consistent units.
+    **Arguments:** `q`: where the system rests, or the result of `equilibrium`; `params`, `t` as for `acceleration`; `count`: the number of
+    modes, less than half the degrees of freedom; `shift`: a real number in 1/time, a fraction of the lowest frequency, needed if a body is
+    free to move or K is singular for another reason. Any consistent units.
 
-    **Returns:** `Modes`, the smallest |λ − `shift`| first; without damping the lowest ω² = −λ², so that what grows fastest comes first, and
-    the inertia of the matrices tells that none was left out (a warning says so where that is not certain). The eigenvalues are
-    differentiable once, in `params` and `q`, those of repeated ones as their mean without damping; derivatives of shapes, and of repeated
-    eigenvalues with damping, are NaN.
+    **Returns:** `Modes`, the smallest |λ − `shift`| first; without damping the lowest ω² = −λ² first, so that the fastest growth leads, and
+    the inertia of the matrices confirms that none is missing (if that is not certain, a warning says so). The eigenvalues are
+    differentiable once, in `params` and `q`, repeated ones through their mean and without damping only; derivatives of shapes, and of
+    repeated eigenvalues with damping, are NaN.
 
-    **Raises:** `ValueError` where q is not at rest, where the matrix is singular, where modes were not found, and under `jit` and `vmap`,
-    which hide the numbers; for systems with dry friction, nonholonomic constraints, contacts, events or states beside q.
+    **Raises:** `ValueError` if q is not at rest, the matrix is singular, or modes were not found; under `jit` and `vmap`, which hide the
+    numbers; and for systems with dry friction, nonholonomic constraints, contacts, events or further states.
 
     **Source:** Lehoucq, Sorensen & Yang, ARPACK Users' Guide, SIAM 1998, section 3.2; Tisseur & Meerbergen, SIAM Review 43 (2001) 235.
 
@@ -144,12 +145,12 @@ class _Slopes(NamedTuple):
 
 
 def _described(system: System, given: tuple, values: Array, found: Found) -> Modes:
-    """Modes with all that is said of them."""
+    """Modes with everything that is reported about them."""
     t, q, params = given
     vectors = jnp.asarray(found.vectors, values.dtype)
     shapes, multipliers = _taken_apart(system, q, params, vectors.real if found.conservative else vectors)
     stable, repeated = jnp.asarray(found.values.real <= 0), jnp.asarray(np.sum(found.same, axis=1) > 1)
-    origin = Origin.of(t, q, jax.tree.map(jnp.zeros_like, q), params)
+    origin = Origin.of(t, q, jax.tree.map(jnp.zeros_like, q), params, system)
     return Modes(values, damping_ratios(values), stable, repeated, shapes, multipliers, {}, origin)
 
 

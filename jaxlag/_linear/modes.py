@@ -30,20 +30,21 @@ class SecondOrder(NamedTuple):
 
 
 class Modes(eqx.Module):
-    r"""Modes of a `LinearSystem`, by the size of their eigenvalue: one of each conjugate pair; under `jit` and `vmap`, of each eigenvalue.
+    r"""Modes of a `LinearSystem`, sorted by the size of their eigenvalue: one for each conjugate pair; under `jit` and `vmap`, for each
+    one.
 
     $$ \delta q = \mathrm{Re}\,(\hat q\,e^{\lambda t}), \qquad \omega_0 = |\lambda|, \qquad \zeta = -\mathrm{Re}\,\lambda/|\lambda| $$
 
-    - `eigenvalues`: λ, in 1/time; those of rigid bodies and of coordinates on which nothing depends are exactly 0, one for
-      each independent shape.
-    - `angular_frequency`: ω₀ in rad/time; `frequency`: ω₀/2π; both of the undamped oscillation, and of a real λ its size.
-    - `damping_ratio`: ζ; 1 and more of what does not oscillate, negative of what grows. `time_constant`: 1/|Re λ|.
-    - `stable`: whether it does not grow. `repeated`: whether another mode has the same eigenvalue: of these shapes any combination is
-      one too, and derivatives of their eigenvalues are those of the mean.
+    - `eigenvalues`: λ, in 1/time; exactly 0 for rigid-body modes and for coordinates on which nothing depends, one for each independent
+      shape.
+    - `angular_frequency`: ω₀ in rad/time; `frequency`: ω₀/2π; both of the undamped oscillation; for a real λ, its size.
+    - `damping_ratio`: ζ; 1 or more if the mode does not oscillate, negative if it grows. `time_constant`: 1/|Re λ|.
+    - `stable`: whether the mode does not grow. `repeated`: whether another mode has the same eigenvalue; any combination of their shapes is
+      then a shape, too, and derivatives of their eigenvalues are those of the mean.
     - `shapes`: q̂, structured like q, with the modes as first axis; real where there is no damping. `states`: of the first-order states.
-    - `multipliers`: the constraint forces of the mode, by name. `origin`: the state near which it is one; None along a trajectory.
+    - `multipliers`: the constraint forces of the mode, by name. `origin`: the state that was linearised; None along a trajectory.
 
-    `modes[0]` is one of them, which `animate` shows. Printed, it is a table. In discrete time λ is log(z)/T.
+    `modes[0]` is one of them, which `animate` shows. Prints as a table. In discrete time λ is log(z)/T.
     """
 
     eigenvalues: Complex[Array, "*k"]
@@ -91,7 +92,9 @@ class Modes(eqx.Module):
     def __repr__(self) -> str:
         if not is_concrete(self) or self.eigenvalues.ndim != 1:
             return f"Modes(of shape {self.eigenvalues.shape})"
-        head = f"{'mode':>4}  {'ω₀ (rad/s)':>12}  {'f (Hz)':>12}  {'ζ':>9}  {'1/|Re λ| (s)':>12}  "
+        time = "s" if self.origin is None else dict(self.origin.units).get("t", "s")
+        units = f"ω₀ (rad/{time})", "f (Hz)" if time == "s" else f"f (1/{time})", f"1/|Re λ| ({time})"
+        head = f"{'mode':>4}  {units[0]:>12}  {units[1]:>12}  {'ζ':>9}  {units[2]:>12}  "
         columns = tuple(map(np.asarray, (self.angular_frequency, self.frequency, self.damping_ratio, self.time_constant)))
         lines = []
         for still, run in itertools.groupby(range(len(self)), key=lambda i: bool(self.eigenvalues[i] == 0)):

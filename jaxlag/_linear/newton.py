@@ -112,8 +112,8 @@ def _felt(J: Float[Array, "r u"], forces_on: Float[Array, " f"], units: Float[Ar
 
 
 def without_rounding(J: Array, of_rows: Array, of_columns: Array) -> Array:
-    """Entries of a Jacobian, in any form, but 0 where a force changes with an unknown by rounding alone, beside the largest that another
-    does: no equation follows from what is zero by symmetry. In these units of its rows and columns, all are energies.
+    """Entries of a Jacobian, in any form, but 0 where a force changes with an unknown by rounding alone, compared with the change by
+    another: no equation follows from what is zero by symmetry. In these units of its rows and columns, all are energies.
     """
     energies = jnp.abs(J) * of_rows * of_columns
     return jnp.where((energies > 0) & (energies <= ROUNDING * jnp.finfo(J.dtype).eps * jnp.max(energies, initial=0.0)), 0, J)
@@ -127,7 +127,7 @@ def newton(
 
     A step is halved until the step that would follow it is shorter: a test that does not depend on the units of R or w. In these `units`
     the reach is the largest of the first `ways` unknowns, at the start or now, and at least that of each itself: forces, that constraints
-    which contradict each other make as large as may be, say nothing of how far a state may reach. What is nothing beside the start is zero.
+    which contradict each other make as large as may be, say nothing of how far a state may reach. Rounding of the start is zero.
 
     Source: Deuflhard, Newton Methods for Nonlinear Problems, section 3.3.2 (natural monotonicity test).
     """
@@ -164,13 +164,13 @@ def newton(
 
 
 def root_of_size(R: Array, J: Array | SparseMatrix, terms: Array, w: Array, reach: Array) -> Root:
-    """Whether w is a root: what is left is rounding beside the terms that cancel, or what a change of w by rounding brings about."""
+    """Whether w is a root: what is left is rounding relative to the terms that cancel, or what a change of w by rounding brings about."""
     size = abs(J) @ reach + terms
     return Root(w, jnp.all(jnp.isfinite(w)) & is_nothing(R, size), size)
 
 
 def is_nothing(R: Float[Array, " r"], size: Float[Array, " r"]) -> Bool[Array, ""]:
-    """Whether what is left of equations is rounding, beside the size of what cancels in them."""
+    """Whether what is left of equations is rounding, relative to the size of what cancels in them."""
     return jnp.all(jnp.abs(R) <= jnp.finfo(R.dtype).eps ** 0.5 * size)
 
 

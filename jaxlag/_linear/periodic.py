@@ -33,8 +33,9 @@ class PeriodicOrbit(eqx.Module):
     - `q`, `qdot`, `states`: at the section, just before its event, structured as given.
     - `period`: the time from there to the next passage.
     - `drift`: by how much the `cyclic` coordinates change in a period, structured like q; 0 for the others.
-    - `multipliers`: the Floquet multipliers, eigenvalues of the derivative of the return map by all of its state that returns, the largest
-      first: a small deviation is multiplied by them in a period. Deviations along the motion and off the constraints do not last: 0.
+    - `multipliers`: the Floquet multipliers: eigenvalues of the derivative of the return map with respect to all of the state that returns,
+      the largest first. A small deviation is multiplied by them in a period; deviations along the motion and off the constraints do not
+      last: 0.
     - `is_stable`: whether all of them are less than 1 in absolute value.
     - `t`, `params`, `system`: the time at the section, and what was given; `setting` and `tolerances`, with which it was computed.
     """
@@ -57,7 +58,7 @@ class PeriodicOrbit(eqx.Module):
         return jnp.all(jnp.abs(self.multipliers) < 1)
 
     def motion(self, samples: int = 201, **settings: Any) -> Trajectory:
-        """One period of it at some `samples`, from `simulate`: computed as the orbit was, but for `settings`."""
+        """One period of the motion at some `samples`, from `simulate`, computed as the orbit was except for `settings`."""
         ts, (rtol, atol) = self.t + self.period * jnp.linspace(0, 1, samples), self.tolerances
         given = self.setting.of_motions() | {"rtol": rtol, "atol": atol} | settings
         return simulate(self.system, self.q, self.qdot, ts, self.params, states=self.states, **given)
@@ -75,7 +76,7 @@ class PeriodicOrbit(eqx.Module):
         of = [f"{m.real:.4g}" if abs(m.imag) < 1e-12 else f"{m:.4g}" for m in np.asarray(self.multipliers) if abs(m) > 1e-9]
         rows.append(("multipliers", ", ".join([*of, *["0"] * (len(of) < self.multipliers.size)])))
         rows.append(("stability", "stable" if self.is_stable else "not stable"))
-        return "\n".join(["PeriodicOrbit", *(f"  {name:<13}{said}" for name, said in rows)])
+        return "\n".join(["PeriodicOrbit", *(f"  {name:<13}{text}" for name, text in rows)])
 
 
 def periodic(
@@ -104,11 +105,11 @@ def periodic(
 
     **Arguments:**
 
-    - `system`: where the section is an event, one in which nothing depends on t.
-    - `q0`, `qdot0`, `states`, `params`: a guess, as for `simulate`; where the cycle is stable, a state from which it is reached.
-    - `section`: `Event(when, direction=...)`, passed once in a period; or `Every(period)`, of a force that is periodic in t.
-    - `longest`: a time within which the motion from the guess passes through the section twice; needed where it is an event.
-    - `cyclic`: names of coordinates on which nothing depends, which need not return: a way, a full turn.
+    - `system`: if the section is an event, one in which nothing depends on t.
+    - `q0`, `qdot0`, `states`, `params`: a guess, as for `simulate`; for a stable cycle, any state from which it is reached.
+    - `section`: `Event(when, direction=...)`, passed once in a period; or `Every(period)`, for a force that is periodic in t.
+    - `longest`: a time within which the motion from the guess passes through the section twice; needed if it is an event.
+    - `cyclic`: names of coordinates on which nothing depends and which need not return, such as a distance travelled or a full turn.
     - `t`: the time at the start, the phase of a periodic force.
     - `friction`, `solver`, `rtol`, `atol`, `max_steps`: as for `simulate`; tolerances are a hundredth of those by default.
 
@@ -116,8 +117,8 @@ def periodic(
 
     **Returns:** a `PeriodicOrbit`; print it. Differentiable in `params` to any order.
 
-    **Raises:** `ValueError` where the guess does not pass through the section twice, no periodic motion is found, or it depends on when it
-    begins; of many under `vmap`, where the first has none. Under `jit`, and of the others, all is NaN there.
+    **Raises:** `ValueError` if the guess does not pass through the section twice, no periodic motion is found, or it depends on when it
+    begins; of many under `vmap`, if the first has none. Under `jit`, and of the others, all is NaN there.
 
     **Source:** Nayfeh & Balachandran, Applied Nonlinear Dynamics, sections 3.5 (Floquet) and 5.5 (Poincaré maps, shooting); Leine & van
     Campen, European Journal of Mechanics A 25 (2006) 595-616 (through impacts and friction).

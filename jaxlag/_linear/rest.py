@@ -44,7 +44,7 @@ class Slopes(NamedTuple):
 
 
 class Curvature(NamedTuple):
-    """What is said of the second variation of the potential on the constraints where its eigenvalues are not computed: how many are
+    """What is reported of the second variation of the potential on the constraints where its eigenvalues are not computed: how many are
     certainly below zero and how many not certainly above, whether that decides, and whether there is a potential; and on which
     coordinates nothing depends.
     """
@@ -187,7 +187,7 @@ def _units(M: Float[Array, "n n"]) -> Float[Array, " n"]:
 
 
 def _described(equations: Equations, given: Given, root: Root) -> Rest:
-    """A steady state with all that is said of it."""
+    """A steady state with everything that is reported about it."""
     flat, q, v, of = equations.taken_apart(given, root.w)
     t, (known, at_rest) = given.t, jax.lax.stop_gradient((given, root.w))
     R, M = equations(known, at_rest), inertia(flat, t, q, v)[0].as_matrix()

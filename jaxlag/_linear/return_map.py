@@ -22,7 +22,7 @@ from .newton import differentiable_root, is_nothing, least_change
 ITERATIONS = 30
 SECTION = "the section"  # among the events of the system
 LATER = 0.382  # of a period: whether the motion that returns does so there, too, is looked at
-MANY = 1000  # of the last digits of the clock: what they move is seen beside the errors of the integration
+MANY = 1000  # of the last digits of the clock: what they move is seen relative to the errors of the integration
 BY_STEPS = 10  # of them, what a motion errs by where each of some hundred steps errs by one
 
 

@@ -29,19 +29,23 @@ from .zero_eigenvalues import Core
 
 
 class RootLocus(eqx.Module):
-    """Eigenvalues `over` a parameter: `eigenvalues[k, i]` of branch i at `values[k]`, and the `crossings` in their order."""
+    """Eigenvalues `over` a parameter: `eigenvalues[k, i]` of branch i at `values[k]`, and the `crossings` in their order; `units` of the
+    system.
+    """
 
     over: str = eqx.field(static=True)
     values: Float[Array, " k"]
     eigenvalues: Complex[Array, "k d"]
     crossings: tuple[Crossing, ...]
+    units: tuple[tuple[str, str], ...] = eqx.field(static=True, default=())
 
     def __repr__(self) -> str:
         head = f"RootLocus of {self.eigenvalues.shape[1]} eigenvalues over {self.over} = {self.values[0]:g} … {self.values[-1]:g}"
         if not is_concrete(self):
             return head
+        rate = f"rad/{dict(self.units).get('t', 's')}"
         lines = [
-            f"  {self.over} = {float(c.value):.8g}: {c.kind} {c.direction}" + (f", {c.frequency:.5g} rad/s" if c.frequency else "")
+            f"  {self.over} = {float(c.value):.8g}: {c.kind} {c.direction}" + (f", {c.frequency:.5g} {rate}" if c.frequency else "")
             for c in self.crossings
         ]
         return "\n".join([head, *(lines or ["  no branch crosses the imaginary axis"])])
@@ -63,17 +67,17 @@ def root_locus(
     $$ \det(\lambda - A(p)) = 0, \qquad \mathrm{Re}\,\lambda(p^*) = 0, \qquad
        \mathrm dp^* = -\frac{\mathrm{Re}\,(y^H\,\mathrm dA\,x/y^H x)}{\mathrm{Re}\,(y^H A' x/y^H x)} $$
 
-    Branches are followed by their eigenvectors, so that they do not swap where they cross. A crossing is located to rounding between
-    the values at which it is seen; one that comes and goes between two eighths of a step is not.
+    Branches are followed by their eigenvectors, so that they do not swap where they cross. A crossing is located to rounding; a branch that
+    crosses and returns within an eighth of a step is not seen.
 
     **Arguments:** `q`, `qdot`: the steady state as functions of `params` and its entries, e.g. `qdot=lambda v, r: {"x": v, "phi": v / r}`;
-    or a guess, which takes longer, from which `equilibrium` or `steady` finds it anew at each value. `over`: the name of a number in
-    `params`; `values`: increasing, at least two. `t`, `states` as for `acceleration`. Any consistent units.
+    or a guess, from which `equilibrium` or `steady` finds it at each value, which takes longer. `over`: the name of a number in `params`;
+    `values`: increasing, at least two. `t`, `states` as for `acceleration`. Any consistent units.
 
-    **Returns:** a `RootLocus`. The `value` of a crossing is differentiable, once, in `params`; `eigenvalues` are not, and their derivative
-    is NaN: take those of `linearise`.
+    **Returns:** a `RootLocus`. The `value` of a crossing is differentiable once in `params`; the derivative of `eigenvalues` is NaN:
+    differentiate `linearise` instead.
 
-    **Raises:** `ValueError` where a state is not steady, `over` names no number, or the system has sampled states.
+    **Raises:** `ValueError` if a state is not steady, `over` names no number, or the system has sampled states.
 
     **Source:** Bolotin, Nonconservative Problems of the Theory of Elastic Stability (flutter, divergence); Seyranian & Mailybaev,
     Multiparameter Stability Theory with Mechanical Applications, sections 2.4 and 2.9 (derivatives, also where eigenvalues meet).
@@ -103,7 +107,8 @@ def root_locus(
     crossings = [_crossing(family, matrix, core, transition) for transition in transitions]
     eigenvalues = np.stack([at.values for at in shown])
     eigenvalues = np.concatenate([eigenvalues, np.zeros((len(values), len(grid[0]) - eigenvalues.shape[1]))], axis=1)
-    return RootLocus(over, jnp.asarray(values), without_derivative(jnp.asarray(eigenvalues), family.params), tuple(crossings))
+    eigenvalues = without_derivative(jnp.asarray(eigenvalues), family.params)
+    return RootLocus(over, jnp.asarray(values), eigenvalues, tuple(crossings), system.units)
 
 
 class _Family:

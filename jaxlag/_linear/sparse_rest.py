@@ -91,7 +91,7 @@ def _with_multipliers(equations: SparseEquations, given: Given, w: Array) -> Arr
 
 
 def _described(of_rest: EquationsOfRest, equations: SparseEquations, given: Given, w: Array, root: Root) -> Rest:
-    """A state of rest with all that is said of it."""
+    """A state of rest with everything that is reported about it."""
     flat, q, v, of = of_rest.taken_apart(given, w)
     known, at_rest = lax.stop_gradient((given, w))
     J, R = equations.jacobian(known, at_rest), equations.residual(known, at_rest)

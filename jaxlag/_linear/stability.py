@@ -12,7 +12,7 @@ from .._model.system import System
 from .rest import Curvature, Rest
 
 ELSEWHERE = "by the eigenvalues of `linearise`"
-NOISE = 0.75  # exponent of eps (1.8e-12 in double precision): a stiffness beside the largest, by what has inertia 1, that counts as none
+NOISE = 0.75  # exponent of eps (1.8e-12 in double precision): a stiffness, relative to the largest in units of inertia 1, that is none
 TURNS = 30  # each halves what is left of a scaling, in decades
 
 

@@ -17,13 +17,13 @@ from .zero_eigenvalues import Core
 
 @dataclasses.dataclass(frozen=True, repr=False)
 class StabilityMap:
-    """Stability `over` two parameters, as numbers of NumPy; entry [i, j] of an array is at `values[0][i]` and `values[1][j]`.
+    """Stability `over` two parameters, as NumPy arrays; entry [i, j] belongs to `values[0][i]` and `values[1][j]`.
 
     - `over`: the names of the two; `values`: their values.
-    - `growth`: the largest real part of the eigenvalues, in 1/time, without those that are zero everywhere; exactly 0 where rounding
-      decides on its sign, and NaN where there is no steady state.
-    - `frequency`: |Im λ| of that eigenvalue, in rad/time; of several the lowest.
-    - `missing`: by (i, j), why there is no steady state.
+    - `growth`: the largest real part of the eigenvalues, in 1/time, without those that are zero everywhere; exactly 0 where rounding would
+      decide its sign, and NaN where there is no steady state.
+    - `frequency`: |Im λ| of that eigenvalue, in rad/time; the lowest if there are several.
+    - `missing`: by (i, j), why there is no steady state. `units`: those that the system states.
 
     `kind`: "stable" where nothing grows, "flutter" where an oscillation does, "divergence" where λ is real, "missing" where there is none.
     """
@@ -33,10 +33,11 @@ class StabilityMap:
     growth: np.ndarray
     frequency: np.ndarray
     missing: dict[tuple[int, int], str]
+    units: tuple[tuple[str, str], ...] = ()
 
     @property
     def kind(self) -> np.ndarray:
-        """What becomes of a small disturbance, in a word for each point."""
+        """What becomes of a small disturbance, one word for each point."""
         unstable = np.where(self.frequency > 0, "flutter", "divergence")
         return np.where(np.isnan(self.growth), "missing", np.where(self.growth > 0, unstable, "stable"))
 
@@ -63,17 +64,17 @@ def stability_map(
 
     $$ \max_i\,\mathrm{Re}\,\lambda_i(p_1, p_2), \qquad \det(\lambda - A(p_1, p_2)) = 0 $$
 
-    Of a stable state of a system without damping the growth is 0. What happens between the points of the grid is not seen; the values
-    at which stability is lost are located by `root_locus`. `plot.stability_map` draws it.
+    A stable state of a system without damping has growth 0. Nothing between the points of the grid is seen; `root_locus` locates the values
+    at which stability is lost. `plot.stability_map` draws it.
 
     **Arguments:** `q`, `qdot`: the steady state as functions of `params` and its entries, or a guess, structured as for `simulate`, from
     which it is found at the first of all values and then, point by point, from a neighbour. `over`: two names of numbers in `params`, each
     with its values, increasing, at least two: `{"b1": jnp.linspace(0, 1, 21), "b2": …}`. `t`, `states` as for `acceleration`. Any
     consistent units.
 
-    **Returns:** a `StabilityMap`, not differentiable. Where there is no steady state it has NaN, and in `missing` the reason.
+    **Returns:** a `StabilityMap`, not differentiable. Points without a steady state are NaN, and `missing` gives the reason.
 
-    **Raises:** `ValueError` where no point has a steady state, `over` does not name two numbers, the system has sampled states, or `params`
+    **Raises:** `ValueError` if no point has a steady state, `over` does not name two numbers, the system has sampled states, or `params`
     are traced.
 
     **Source:** Bolotin, Nonconservative Problems of the Theory of Elastic Stability; Seyranian & Mailybaev, Multiparameter Stability Theory
@@ -100,7 +101,7 @@ def stability_map(
     growth, frequency = np.full((2, *plane.shape), np.nan)
     for at, value in zip(there, _fastest([rows[i][j] for i, j in there], len(missing)), strict=True):
         growth[at], frequency[at] = value.real, abs(value.imag)
-    return StabilityMap(plane.names, plane.values, growth, frequency, missing)
+    return StabilityMap(plane.names, plane.values, growth, frequency, missing, system.units)
 
 
 def _fastest(grid: list[np.ndarray], idle: int) -> list[complex]:

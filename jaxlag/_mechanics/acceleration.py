@@ -36,17 +36,17 @@ def acceleration(system: System, q: PyTree, qdot: PyTree, params: PyTree = None,
 
     $$ M\ddot q = f + G^T\lambda, \qquad G\ddot q = -\gamma $$
 
-    λ > 0 pushes along +∇g. With redundant constraints q̈ and Gᵀλ are still unique, and λ is the one of least norm;
-    M may be singular where the constraints hold what it leaves free.
+    λ > 0 pushes along +∇g. With redundant constraints q̈ and Gᵀλ are still unique, and λ is the solution of least norm; M may be singular
+    in directions that the constraints hold.
 
-    **Arguments:** the state `q`, `qdot` (one pytree structure, n numbers in all), `params`, the time `t`; `states`: values by name of the
-    states beside q, where they are not those at the start. Any consistent units.
+    **Arguments:** the state `q`, `qdot` (one pytree structure, n numbers in all), `params`, the time `t`; `states`: values of the system's
+    states by name, by default those at the start. Any consistent units.
 
     **Returns:** `Acceleration(qddot, multipliers)`: q̈ structured like q; λ by the constraint's name, structured like what g or a returns.
 
-    **Raises:** `ValueError` where an entry of `params` is NaN, where a direction has no inertia and no constraint holds it, where
-    constraints contradict each other, or where forces depend on λ such that none agrees with them, or more than one. Under `jit` the
-    result is NaN there.
+    **Raises:** `ValueError` if an entry of `params` is NaN, if a direction has no inertia and no constraint holds it, if constraints
+    contradict each other, or if forces depend on λ such that no λ, or more than one, agrees with them. Under `jit` the result is NaN
+    instead.
 
     **Source:** Hairer & Wanner, Solving Ordinary Differential Equations II, eqs. VII.1.46.
 
@@ -106,9 +106,9 @@ def constraint_force(
 
     **Arguments:** as `acceleration`; `at`: the position map x(t, q) of a point, which receives the arguments it names.
 
-    **Returns:** Q structured like q; their sum is Gᵀλ. With `at`, F structured like x: the force at that point that does the same
-    virtual work, NaN where the constraint does not act through that point alone. With redundant constraints the sum is unique, its parts
-    are those of the λ of least norm. Any consistent units.
+    **Returns:** Q structured like q; their sum is Gᵀλ. With `at`, F structured like x: the force at that point that does the same virtual
+    work, NaN if the constraint also acts at other points. With redundant constraints the sum is unique, and its parts belong to the λ of
+    least norm. Any consistent units.
 
     **Raises:** as `acceleration`.
 

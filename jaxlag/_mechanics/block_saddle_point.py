@@ -97,7 +97,7 @@ def factorised(M: SparseMatrix, G: SparseMatrix) -> Factors:
 
 
 def masses(M: SparseMatrix) -> Float[Array, " n"]:
-    """The diagonal of M, where that is not (next to) nothing beside its largest number, as of what constraints alone hold."""
+    """The diagonal of M, where that is not (next to) nothing relative to its largest number, as of what constraints alone hold."""
     return scales(summed_by(M.places, jnp.where(M.places.rows == M.places.columns, M.values, 0)))
 
 

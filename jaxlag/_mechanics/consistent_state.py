@@ -225,8 +225,8 @@ def consistent_state(
 
     **Returns:** (q, qdot), structured like q; differentiable in every argument.
 
-    **Raises:** `ValueError` where no such state was found, where inertia is missing, or where `fixed` names no coordinate.
-    Under `jit` the state is NaN there.
+    **Raises:** `ValueError` if no such state was found, if inertia is missing, or if `fixed` names no coordinate. Under `jit` the state is
+    NaN instead.
 
     **Source:** Hairer, Lubich & Wanner, Geometric Numerical Integration, section IV.4.
 

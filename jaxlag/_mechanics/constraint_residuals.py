@@ -15,7 +15,7 @@ from .lagrange import inertia, rows_of, velocity_residual
 from .saddle_point import Rows
 from .singular_directions import not_affine_in
 
-ROUNDING = 4  # eps, by which a residual may differ from zero beside the terms of its change
+ROUNDING = 4  # eps, by which a residual may differ from zero relative to the terms of its change
 
 
 class Residuals(NamedTuple):
@@ -45,8 +45,8 @@ class Residuals(NamedTuple):
 
 
 def off_constraints(flat: Flat, t, q, v, reach: tuple[Array, Array] | None = None) -> Float[Array, ""]:
-    """Largest residual of g and ψ beside the terms of its row, of coordinates and velocities as large as they are, or in a motion as they
-    `reach`.
+    """Largest residual of g and ψ relative to the terms of its row, for coordinates and velocities as large as they are, or
+    in a motion as they `reach`.
     """
     found, M = Residuals.of(flat, t, q, v), inertia(flat, t, q, v)[0]
     G = [rows for rows in (found.of_positions, found.of_velocities) if rows.shape[0]]
@@ -76,6 +76,6 @@ def is_on_constraints(flat: Flat, t, q, v) -> Bool[Array, ""]:
 
 
 def off(residual: Float[Array, " m"], size: Float[Array, " m"]) -> Float[Array, ""]:
-    """Largest residual, beside the size of the terms of its row: rounding makes some eps of it."""
+    """Largest residual, relative to the size of the terms of its row: rounding makes some eps of it."""
     each = jnp.where(residual == 0, 0, jnp.abs(residual) / size)
     return jnp.where(jnp.any(jnp.isnan(each)), jnp.nan, jnp.max(each, initial=0.0))  # a maximum of thousands leaves NaN out on a CPU

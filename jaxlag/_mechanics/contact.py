@@ -208,7 +208,7 @@ def select_closed(
 
 
 def _scales(flat, t, q, v):
-    """Of each contact, the force and the acceleration that count as rounding, beside those of the motion without contact."""
+    """Of each contact, the force and the acceleration that count as rounding, relative to those of the motion without contact."""
     free = constrained_acceleration(flat, t, q, v).x
     G = jnp.abs(jax.jacfwd(flat.gaps, argnums=1)(t, q))
     drift = jnp.abs(gap_accelerations(flat, t, q, v, jnp.zeros_like(v)))
@@ -223,7 +223,7 @@ def _times(G, x):
 
 
 def idle(flat: Flat, elements: FrictionElements, sigma: Float[Array, " r"], bound: Float[Array, " e"]) -> Bool[Array, " e"]:
-    """Which elements slip without a force while a contact is open: which way they do says nothing, and is found anew where it closes."""
+    """Which elements slip without a force while a contact is open: which way they do says nothing, and is found again where it closes."""
     if flat.closed is None:
         return jnp.zeros(elements.size, bool)
     return (bound == 0) & ~sticking(elements, sigma) & ~jnp.all(flat.closed)

@@ -29,18 +29,18 @@ from .surfaces import surfaces
 
 @dataclasses.dataclass(frozen=True)
 class Examination:
-    """What `examine` found; printed, a report.
+    """The findings of `examine`; prints as a report.
 
-    - `coordinates`: their names. `states`: those beside q. `degrees_of_freedom`: n − rank G.
-    - `rows`, `rank`: of G. `redundant`: how many rows depend on rows before them, by constraint.
+    - `coordinates`, `states`: their names. `degrees_of_freedom`: n − rank G.
+    - `rows`, `rank`: of G. `redundant`: by constraint, the number of rows that depend on earlier rows.
     - `off_position`, `off_velocity`: the largest residual of each constraint, in its own units.
     - `smallest_inertia`: the least eigenvalue of M on the motions that the constraints allow.
     - `dissipated`: the least of q̇·∂D/∂q̇ near the state, a power, by term.
-    - `time_constants`: 1/|eigenvalue| of the linearised motion, the fastest and the slowest, with the states beside q held.
-    - `findings`: sentences with the cure. `contacts`: which contacts are closed, by name. `without_inertia`: coordinates whose velocity
-      dissipation alone decides; they count as degrees of freedom.
-    - `couplings`: of 64 coordinates and more, by matrix and term, as ("G", "rods"): how many numbers may differ from zero (None where the
-      program is too long to be read), and of how many. The matrices: ∂²L/∂q̇², ∂²L/∂q², ∂²D/∂q̇², and rows of G.
+    - `time_constants`: 1/|eigenvalue| of the linearised motion, the fastest and the slowest, with the further states held.
+    - `findings`: sentences with the cure. `contacts`: which contacts are closed, by name. `without_inertia`: coordinates whose velocity is
+      decided by dissipation alone; they count as degrees of freedom.
+    - `couplings`: from 64 coordinates on, by matrix and term, e.g. ("G", "rods"): how many entries may be nonzero (None if the program is
+      too long to be read), and out of how many. The matrices: ∂²L/∂q̇², ∂²L/∂q², ∂²D/∂q̇², and rows of G.
     """
 
     coordinates: tuple[str, ...]
@@ -82,14 +82,14 @@ def examine(system: System, q: PyTree, qdot: PyTree, params: PyTree = None, *, t
     $$ \text{degrees of freedom} = n - \mathrm{rank}\,G, \qquad N^T M N > 0, \qquad \dot q\cdot\frac{\partial D}{\partial\dot q} \ge 0,
        \qquad \tau = 1/|\lambda_i| \text{ of the linearised motion} $$
 
-    N spans the null space of G: the motions that the constraints allow. All matrices are taken with their zeros here, whatever is solved
-    without: 1000 coordinates take half a minute and a gigabyte.
+    N spans the null space of G: the motions that the constraints allow. All matrices are dense here, even those that simulation solves as
+    sparse ones: 1000 coordinates take half a minute and a gigabyte.
 
     **Arguments:** as `acceleration`. Any consistent units.
 
     **Returns:** an `Examination`; print it.
 
-    **Raises:** `TypeError` or `ValueError` where an argument or a function of the system is of the wrong kind, or returns numbers
+    **Raises:** `TypeError` or `ValueError` if an argument or a function of the system is of the wrong kind, or returns numbers
     that are not finite at this state.
 
     **Source:** Hairer & Wanner, Solving Ordinary Differential Equations II, sections IV.1 (stiffness) and VII.1.
@@ -253,7 +253,7 @@ def _defects(mode, t, q, v):
 
 
 def _distance(residual, G, x, units):
-    """The largest distance of x from what rows ask for, beside the size of x, both in the metric of M."""
+    """The largest distance of x from what rows ask for, relative to the size of x, both in the metric of M."""
     length = jnp.linalg.norm(G * units[None], axis=1)
     each, size = jnp.abs(residual) / jnp.where(length > 0, length, 1), jnp.max(jnp.abs(x / units))
     return jnp.max(each / jnp.where(size > 0, size, 1), initial=0.0)

@@ -18,15 +18,15 @@ class StickSlip:
     Each nonsmooth term μN|s| of D slips with the force −μN sign(s), and sticks, as a constraint s = 0, while the constraint force stays
     within ±μN. The times of the transitions between the two are located to rounding and differentiated.
 
-    Elements that can share a load in more than one way, as the legs of a plate can, hold it as long as one way is possible; the motion
-    is the same for all of them. So do normal forces and friction that hold each other, as at the ends of a ladder, where the bounds move
-    with the share. The reported forces are then one possible share: for slip velocities of several components, and where bounds depend on
-    multipliers, the one that leaves most of all bounds, for others that of least norm until one reaches its bound. The share is not
-    differentiated.
+    Elements that can share a load in more than one way, such as the legs of a table, hold it as long as one distribution is admissible; the
+    motion is the same for all of them. The same holds if normal forces and friction support each other, as at the two ends of a ladder,
+    where the bounds change with the distribution. One admissible distribution is reported: for slip velocities of several components, and
+    if bounds depend on multipliers, the one that leaves the largest part of all bounds; for others the one of least norm, until an element
+    reaches its bound. The distribution is not differentiated.
 
     **Arguments:** `max_transitions`: limit on changes of mode, beyond which the motion is reported as chattering.
 
-    **Raises:** `TypeError` or `ValueError` where `max_transitions` is not a whole number of 0 or more.
+    **Raises:** `TypeError` or `ValueError` if `max_transitions` is not a whole number of 0 or more.
 
     **Source:** Pfeiffer & Glocker, Multibody Dynamics with Unilateral Contacts, chapters 5 and 6; for shares Moreau, Application of
     convex analysis to some problems of dry friction (1979).
@@ -60,7 +60,7 @@ class Regularised:
 
     **Arguments:** `width`: the velocity w, in the units of s.
 
-    **Raises:** `TypeError` or `ValueError` where `width` is not a positive number.
+    **Raises:** `TypeError` or `ValueError` if `width` is not a positive number.
 
     **Source:** Armstrong-Hélouvry, Dupont & Canudas de Wit, Automatica 30 (1994) 1083-1138.
 

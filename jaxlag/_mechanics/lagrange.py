@@ -92,11 +92,11 @@ def mass_matrix(
     """Mass matrix M = ∂²L/∂q̇², in the flat order of `jax.flatten_util.ravel_pytree(q)`.
 
     **Arguments:** the state `q`, `qdot` (one pytree structure, n numbers in all), `params`, the time `t`; `states`: values by name of the
-    states beside q, where they are not those at the start. Any consistent units.
+    further states, where they are not those at the start. Any consistent units.
 
     **Returns:** an (n, n) array, symmetric.
 
-    **Raises:** `TypeError` or `ValueError` where an argument or a function of the system is of the wrong kind.
+    **Raises:** `TypeError` or `ValueError` if an argument or a function of the system is of the wrong kind.
 
     **Source:** Goldstein, Classical Mechanics, 3rd ed., eq. 1.71.
 

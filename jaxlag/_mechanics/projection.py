@@ -28,7 +28,7 @@ class Projection:
 
     **Arguments:** `iterations`: Newton steps for the position, each of which squares the residual.
 
-    **Raises:** `TypeError` or `ValueError` where `iterations` is not a whole number of 1 or more.
+    **Raises:** `TypeError` or `ValueError` if `iterations` is not a whole number of 1 or more.
 
     **Source:** Hairer, Lubich & Wanner, Geometric Numerical Integration, section IV.4; Eich, SIAM J. Numer. Anal. 30 (1993).
 
@@ -92,7 +92,7 @@ class Baumgarte:
 
     **Arguments:** `alpha`, `beta`: in 1/time; α = β is critical damping. Large values make the equations stiff.
 
-    **Raises:** `TypeError` or `ValueError` where one of them is not a number of 0 or more.
+    **Raises:** `TypeError` or `ValueError` if one of them is not a number of 0 or more.
 
     **Source:** Baumgarte, Comput. Methods Appl. Mech. Eng. 1 (1972) 1-16.
 

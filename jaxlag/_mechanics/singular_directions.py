@@ -20,7 +20,7 @@ from .pseudo_inverse import CLEAR
 from .saddle_point import NO_INERTIA
 from .self_consistent import NOT_CONSISTENT
 
-LOOKS, BESIDE, FROM_REST = 7, 3, 12  # at a constraint, in so many decades beside the velocities that there are, or that have inertia 1
+LOOKS, BESIDE, FROM_REST = 7, 3, 12  # at a constraint, in so many decades relative to the velocities that there are, or that have inertia 1
 UNDEFINED = (
     "the functions of the system must return finite numbers, but one returns a NaN or an infinity there. Look for what is undefined, such "
     "as the root of a negative number or 0/0, for missing values, and for a motion that grows without bounds."
@@ -47,7 +47,7 @@ def explained(reason: str, system: System, q: PyTree, qdot: PyTree, params: PyTr
 
 def tangent_basis(G: np.ndarray, eps: float, least: float | None = None) -> np.ndarray:
     """A basis of the motions that the constraints allow, as columns: the null space of G, its rows scaled to unit length. Singular values
-    below the `least` beside the largest count as zero.
+    below the `least` relative to the largest count as zero.
     """
     size = np.linalg.norm(G, axis=1, keepdims=True)
     if not G.shape[0]:

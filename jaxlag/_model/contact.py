@@ -15,7 +15,7 @@ class NewtonRestitution:
 
 @dataclasses.dataclass(frozen=True)
 class PoissonRestitution:
-    """Poisson's law of restitution: in the expansion that follows the compression, a contact gives back e times the impulse of that."""
+    """Poisson's law of restitution: in the expansion, a contact gives back e times its impulse of the compression."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -26,15 +26,15 @@ class Contact:
        \dot g^+ + e\,\dot g^- \ge 0, \quad \Lambda \ge 0, \quad (\dot g^+ + e\,\dot g^-)\,\Lambda = 0 \text{ in an impact} $$
 
     **Arguments:** `gap`: g(t, q), a real number, the distance to the obstacle; negative inside of it. `restitution`: e from 0 to 1, a
-    number, or a function of `params`, their entries and `speed`, the rate −ġ⁻ of approach. What is beyond 0 and 1 counts as these.
-    `law`: `NewtonRestitution()`, the one above, or `PoissonRestitution()`: an impact with e = 0, the compression, and then one in which the
-    contact gives back Λ ≥ e Λᶜ. They differ where impacts are coupled by friction or other contacts; Poisson's gives a contact that does
-    not approach none of the restitution of others. Any consistent units.
+    number, or a function of `params`, their entries and `speed`, the rate −ġ⁻ of approach. Values outside this range are clipped to it.
+    `law`: `NewtonRestitution()`, the law above, or `PoissonRestitution()`: a compression, which is an impact with e = 0, and then an
+    expansion, in which the contact gives back Λ ≥ e Λᶜ. They differ if impacts are coupled by friction or other contacts; in Poisson's law
+    a contact that does not approach receives nothing from the restitution of others. Any consistent units.
 
-    The impacts of several contacts at one time, and the contacts that are closed already, follow Moreau's law: all at once, as one
-    complementarity problem. A system takes contacts by name: `System(..., unilateral={"table": Contact(gap, restitution=0.8)})`.
+    Simultaneous impacts, and contacts that are already closed, follow Moreau's law: one complementarity problem for all of them. Pass
+    contacts to a system by name: `System(..., unilateral={"table": Contact(gap, restitution=0.8)})`.
 
-    **Raises:** `TypeError` or `ValueError` where `gap` is no function, or `restitution` neither a function nor a number from 0 to 1.
+    **Raises:** `TypeError` or `ValueError` if `gap` is no function, or `restitution` neither a function nor a number from 0 to 1.
 
     **Source:** Glocker, Set-Valued Force Laws, chapters 5 and 10; Moreau, in Nonsmooth Mechanics and Applications (1988); Pfeiffer &
     Glocker, Multibody Dynamics with Unilateral Contacts, chapter 8 (Poisson's law).

@@ -16,22 +16,22 @@ from .pickling import picklable, unpickled
 
 @dataclasses.dataclass(frozen=True)
 class Falling:
-    """An event happens where `when` becomes negative, and not where it becomes positive."""
+    """The event happens when `when` becomes negative, not when it becomes positive."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Rising:
-    """An event happens where `when` becomes positive, and not where it becomes negative."""
+    """The event happens when `when` becomes positive, not when it becomes negative."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Either:
-    """An event happens where `when` changes its sign, whichever way."""
+    """The event happens when `when` changes its sign, in either direction."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Negative:
-    """An event happens where `when` becomes negative, and at the start where it is so already."""
+    """The event happens when `when` becomes negative, and at the start if it already is."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -58,27 +58,27 @@ class Event:
 
     **Arguments:**
 
-    - `when`: w, a continuous real number; it receives the arguments it names, out of `t`, `q`, `qdot`, `multipliers`, `params`, its
-      entries and the states. Or times, increasing numbers; or `Every(period)`; or the name of a contact, for each of its impacts. What
-      is given by times happens after the start.
-    - `then`: what the state becomes: a mapping with some of "q", "qdot" and "states", each structured like its own, where mappings may
-      leave out what stays. It receives what `when` does, but for the multipliers. Default: nothing, the event is recorded. What it is to
-      change of the params is stated as a state that stays, e.g. `State(lambda: 0.0, start=1.0)`.
-    - `stop`: whether the motion ends there. Samples behind are NaN, and the motion is a success.
-    - `direction`: one of `jaxlag.direction`: `Falling()`, `Rising()`, `Either()`, the default, or `Negative()`, as `Falling()` and at the
-      start, too.
-    - `most`: how many are recorded; one more ends the motion with that reason.
+    - `when`: w, a function that returns one real number and is continuous; it receives the arguments it names, out of `t`, `q`, `qdot`,
+      `multipliers`, `params`, its entries and the states. Or increasing times; or `Every(period)`; or the name of a contact, for each of
+      its impacts. Events at given times happen only after the start.
+    - `then`: the state after the event: a function that returns a mapping with some of "q", "qdot" and "states", each structured like the
+      original; mappings may omit what stays the same. It may name the same arguments as `when`, except the multipliers. Default: the event
+      is only recorded. To change a parameter, make it a constant state, e.g. `State(lambda: 0.0, start=1.0)`.
+    - `stop`: whether the motion ends there. Later samples are NaN, and the motion counts as successful.
+    - `direction`: one of `jaxlag.direction`: `Falling()`, `Rising()`, `Either()`, the default, or `Negative()`, which is `Falling()` and
+      also happens at the start.
+    - `most`: how many are recorded; one more ends the motion, with a reason that says so.
 
-    The time is located to rounding, and differentiated exactly, as is what `then` returns, which is put on the constraints and outside of
-    obstacles. A sample at the very time of an event shows the state before or behind it, as rounding has it. Where an impact, an input
-    that jumps or another event takes w to the other side of zero, the event happens, too, but none twice at one time. Where several
-    happen at once, those stated first come first. Where a force jumps or bends across w = 0, as by `jnp.where` or `jnp.maximum` of q, an
-    event makes steps end there, and derivatives right: up to there, forces are those of the side that the motion comes from.
+    The time is located to rounding and differentiated exactly, as is the state that `then` returns, which is projected onto the constraints
+    and out of obstacles. A sample exactly at the time of an event shows the state before or after it, depending on rounding. A sign change
+    of w caused by an impact, a jump of an input or another event also triggers the event, but none happens twice at one time. Simultaneous
+    events happen in the order in which they are listed. If a force jumps or bends across w = 0, as with `jnp.where` or `jnp.maximum` of q,
+    an event makes steps end there and derivatives exact: up to there, forces are those of the side that the motion comes from.
 
-    To `equilibrium`, `linearise`, `examine` and `equations` a system is what it is without events. Any consistent units. A system takes
-    events by name: `System(..., events={"latch": Event(...)})`; a motion, too: `simulate(..., events=...)`.
+    `equilibrium`, `linearise`, `examine` and `equations` ignore events. Any consistent units. Pass events by name to a system, `System(...,
+    events={"latch": Event(...)})`, or to a motion, `simulate(..., events=...)`.
 
-    **Raises:** `TypeError` or `ValueError` where these are not such functions, times and numbers.
+    **Raises:** `TypeError` or `ValueError` if these are not such functions, times and numbers.
 
     **Source:** Filippov, Differential Equations with Discontinuous Righthand Sides; Hiskens & Pai, IEEE Trans. Circuits Syst. I 47 (2000)
     204-220 (derivatives through events).

@@ -55,7 +55,7 @@ class Flat(NamedTuple):
 
 
 class StatesAt(NamedTuple):
-    """The states beside q by name, and the time and the state at which they have these values."""
+    """The further states by name, and the time and the state at which they have these values."""
 
     values: Mapping[str, PyTree]
     t: Any

@@ -28,10 +28,10 @@ def rate(coordinate: Callable) -> Callable:
     `t`, `q`, `params` and the entries of `params`.
 
     **Returns:** a function of `(t, q, qdot, params)`, whose value has the structure and shapes of x. Entries of params may be given by
-    name, and t left out where x does not name it: `rate(x)(q=..., qdot=..., l=1.0)`. Where x depends on states beside q, a function of
-    the system names `states` and hands it on as a fifth argument. Any consistent units.
+    name, and t omitted if x does not name it: `rate(x)(q=..., qdot=..., l=1.0)`. If x depends on states of the system, the function that
+    calls the rate names `states` and passes it on as a fifth argument. Any consistent units.
 
-    **Raises:** `TypeError` where `coordinate` is no hashable function; when the rate is called, `TypeError` where t, q or qdot is missing.
+    **Raises:** `TypeError` if `coordinate` is no hashable function; when the rate is called, `TypeError` if t, q or qdot is missing.
 
     **Source:** Goldstein, Classical Mechanics, 3rd ed., eq. 1.46.
 
@@ -59,7 +59,7 @@ def virtual_work(coordinate: Callable, effort: Any) -> Callable:
 
     **Returns:** a function for `System(force=...)`; its value is structured like q. Any consistent units.
 
-    **Raises:** `TypeError` where `coordinate` or `effort` is of a wrong kind; when the force is first computed, `ValueError` where the
+    **Raises:** `TypeError` if `coordinate` or `effort` is of a wrong kind; when the force is first computed, `ValueError` if the
     effort is not structured like the coordinate.
 
     **Source:** Goldstein, Classical Mechanics, 3rd ed., eq. 1.49.
@@ -96,7 +96,7 @@ def substitute(system: System, coordinates: Callable) -> System:
 
     **Returns:** a `System` in the new coordinates q, whose terms keep their names. Any consistent units.
 
-    **Raises:** `TypeError` where `coordinates` is no hashable function.
+    **Raises:** `TypeError` if `coordinates` is no hashable function.
 
     **Source:** Goldstein, Classical Mechanics, 3rd ed., section 1.4; Lurie, Analytical Mechanics, section 1.4.
 

@@ -23,29 +23,29 @@ class Signal(eqx.Module):
 
     for t_i ≤ t < t_{i+1}, or a cubic spline (see `Cubic`); before the first and after the last sample u keeps the end value.
 
-    **Choice of interpolation:** `ZeroOrderHold` where u enters as it is: a force, a brake, the speed of a belt; its derivative by t is
-    zero. `Linear` where mechanics differentiates u once: in a velocity constraint, where each jump of a zero-order hold is an impulse,
-    and beside q̇ in L, where such impulses are left out. `Cubic` where mechanics differentiates u twice: in a position constraint.
+    **Choice of interpolation:** `ZeroOrderHold` if u enters as it is: a force, a brake, the speed of a belt; its derivative with respect to
+    t is zero. `Linear` if mechanics differentiates u once: in a velocity constraint, where each jump of a zero-order hold is an impulse,
+    and together with q̇ in L, where such impulses are ignored. `Cubic` if mechanics differentiates u twice: in a position constraint.
 
     **Steps:** `simulate` ends a step at each sample of a zero-order hold or a linear signal in `params`, so leave out samples at which
-    nothing changes. With cubic signals the tolerances alone set the steps, and these are looked at between any two samples. Give a delay
-    as `delay` and not by `u(t - late)`, whose jumps are not looked for.
+    nothing changes. With cubic signals the tolerances alone set the steps, and error is checked between any two samples. Give a delay as
+    `delay`, not as `u(t - late)`, whose jumps are not located.
 
     **Arguments:**
 
     - `ts`: the sample times, increasing, at least two, shape (T,). Under `vmap` pad a shorter signal with its last time and value.
     - `values`: one scalar, vector or array for each time, shape (T, ...); u(t) has their precision. Any consistent units.
-    - `delay`: a time by which u comes later than its samples, u(t) = u_i for t_i ≤ t − delay; may be free in a fit.
+    - `delay`: the time by which u lags behind its samples, u(t) = u_i for t_i ≤ t − delay; may be free in a fit.
     - `interpolation`: `jaxlag.interpolation.ZeroOrderHold()`, the default, `Linear()` or `Cubic()`.
 
     **Fields:** `ts`, `values`, `delay` and `interpolation` as given; `times`: `ts` with the delay; `second_derivatives`: u'' at the samples
     of a cubic signal, shape (T, ...), which `simulate` computes once per motion; otherwise None.
 
     **Returns:** when called with t, a scalar or an array of shape S: u(t), of shape S + (...). Differentiable in the values, exactly, and
-    in t and the times of linear and cubic signals. By the times at which a zero-order hold jumps, that of u(t) is zero, and that of a
-    motion is exact: its steps end there.
+    in t and the times of linear and cubic signals. With respect to the times at which a zero-order hold jumps, the derivative of u(t) is
+    zero, but that of a motion is exact, because its steps end there.
 
-    **Raises:** `ValueError` or `TypeError` where times or values are not real, are missing, or do not match in number; `TypeError` where
+    **Raises:** `ValueError` or `TypeError` if times or values are not real, are missing, or do not match in number; `TypeError` if
     `interpolation` is none of the three.
 
     **Source:** Press et al., Numerical Recipes, 3rd ed., section 3.3; Åström & Wittenmark, Computer-Controlled Systems, section 2.3 (hold).
@@ -87,7 +87,7 @@ class Signal(eqx.Module):
 
     @property
     def times(self) -> Float[Array, " T"]:
-        """When u has its values: the sample times and the delay."""
+        """The times at which u has its values: the sample times plus the delay."""
         return self.ts + self.delay
 
 

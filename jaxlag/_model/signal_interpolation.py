@@ -42,7 +42,7 @@ class ZeroOrderHold(AbstractInterpolation):
     is_broken: ClassVar[bool] = True
 
     def evaluate(self, signal: Any, ts: Float[Array, " T"], t: Float[Array, "*n"], i: Any) -> Float[Array, "..."]:
-        """The value of the last sample; of the first one before it."""
+        """The value of the latest sample; before the first sample, that of the first."""
         return signal.values[jnp.maximum(i, 0)]
 
 

@@ -1,4 +1,4 @@
-"""Values of the states beside q: at the start, as vectors, and what their functions return."""
+"""Values of the further states: at the start, as vectors, and what their functions return."""
 
 import math
 from collections.abc import Mapping
@@ -59,7 +59,7 @@ def of_first_order(system: System) -> dict[str, State]:
 
 
 def sampled(system: System) -> dict[str, Sampled]:
-    """The states that change at sample times alone, by name."""
+    """The states that change only at sample times, by name."""
     return {name: state for name, state in system.states if isinstance(state, Sampled)}
 
 

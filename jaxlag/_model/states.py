@@ -1,4 +1,4 @@
-"""States beside q: those of first order, and those that change at sample times alone."""
+"""Further states: those of first order, and those that change only at sample times."""
 
 import dataclasses
 from collections.abc import Callable, Mapping
@@ -52,13 +52,14 @@ def _start(given: Any, label: str) -> Any:
 
 @dataclasses.dataclass(frozen=True)
 class State:
-    r"""A first-order state z beside q, for `System(states={"z": State(...)})`.
+    r"""A first-order state z in addition to q, for `System(states={"z": State(...)})`.
 
     $$ \dot z = r(t, q, \dot q, z, \dots) $$
 
     A low-pass actuator, the bristles of a friction model, an integrator of a controller, a temperature. All functions of the system may
-    name `z`, rates of other states too; where L or a constraint depends on z, its rate counts in d/dt. A state is driven and does not
-    push back: no force of q follows from ż. (A velocity constraint between q̇ and a coordinate without mass does push.)
+    name `z`, including the rates of other states; if L or a constraint depends on z, its rate is part of d/dt. A state is driven and does
+    not react on the mechanism: no force on q follows from ż. If it must react, as a gear does, state a velocity constraint between q̇ and a
+    coordinate without mass.
 
     **Arguments:**
 
@@ -69,7 +70,7 @@ class State:
 
     Any consistent set of units. A position constraint g may depend on a state whose rate does not depend on q̇.
 
-    **Raises:** `TypeError` where `rate` is no function or `start` holds no numbers.
+    **Raises:** `TypeError` if `rate` is no function or `start` holds no numbers.
 
     **Source:** Åström & Canudas de Wit, Revisiting the LuGre friction model, IEEE Control Systems Magazine 28 (2008) 101-114, as example.
 
@@ -96,13 +97,13 @@ class State:
 
 @dataclasses.dataclass(frozen=True)
 class Sampled:
-    r"""A state u that changes at sample times alone and is held in between, for `System(states={"u": Sampled(...)})`.
+    r"""A state u that changes only at sample times and is held in between, for `System(states={"u": Sampled(...)})`.
 
     $$ u_k = f(t_k, q, \dot q, u_{k-1}, \dots), \qquad t_k = t_0 + k T, \qquad u(t) = u_k \text{ for } t_k \le t < t_{k+1} $$
 
-    A digital controller, a counter, a filter in discrete time; its memory is part of u. The first update is at the start of the motion,
-    t₀ = ts[0]. States of different periods may stand side by side: those due at the same time all see the values before it. A sample of
-    the motion at t_k shows u_k.
+    A digital controller, a counter, a filter in discrete time; its memory is part of u. The first update is at the start of the motion, t₀
+    = ts[0]. States of one system may have different periods; updates due at the same time all see the previous values. A sample of the
+    motion at t_k shows u_k.
 
     **Arguments:**
 
@@ -110,9 +111,9 @@ class Sampled:
     - `every`: the period T > 0: a number, or a function of `params` and its entries, which may be free in a fit.
     - `start`: u before the first update, as that of a `State`.
 
-    Any consistent set of units. Derivatives by T are those of a motion in which no sample and no other update moves past an update.
+    Any consistent set of units. Derivatives with respect to T assume that no sample and no other update moves past an update.
 
-    **Raises:** `TypeError` or `ValueError` where `update` is no function, `every` is missing or not positive, or `start` holds no numbers.
+    **Raises:** `TypeError` or `ValueError` if `update` is no function, `every` is missing or not positive, or `start` holds no numbers.
 
     **Source:** Åström & Wittenmark, Computer-Controlled Systems, 3rd ed., section 2.3.
 

@@ -36,32 +36,32 @@ class System:
 
     - `lagrangian`: L(t, q, q̇), a real scalar.
     - `dissipation`: D(t, q, q̇), a real scalar; the generalized force is −∂D/∂q̇.
-    - `force`: Q(t, q, q̇), with the structure and shapes of q; lists may stand for vectors, and where q is a mapping, coordinates without
-      a force may be omitted.
+    - `force`: Q(t, q, q̇), with the structure and shapes of q; lists may stand for vectors, and if q is a mapping, coordinates without a
+      force may be omitted.
     - `holonomic`: g(t, q), an array of any shape or a pytree of arrays, kept at zero.
     - `nonholonomic`: a(t, q, q̇), likewise, affine in q̇, kept at zero.
-    - `unilateral`: gaps g(t, q) ≥ 0 of contacts, each a real number, or `Contact(gap, restitution)`: a table, a stop, a slack string.
-      λ ≥ 0 pushes along +∇g while g = 0, and is 0 where the contact is open; where it closes there is an impact.
+    - `unilateral`: gaps g(t, q) ≥ 0 of contacts, each a real number, or `Contact(gap, restitution)`: a table, a stop, a slack string. λ ≥ 0
+      pushes along +∇g while g = 0, and is 0 while the contact is open; closing is an impact.
     - `one_sided`: a name or names of holonomic constraints that push and never pull, as a table does: g ≥ 0 and λ ≥ 0, where λ > 0 pushes
-      along +∇g. The motion is computed with g = 0 all the same; where λ < 0 the contact would have opened, and `Trajectory.pulling()`, the
-      printed trajectory, `examine` and `plot.forces` report it.
-    - `states`: by name, states beside q: `State(rate)`, of first order, ż = rate(…), or `Sampled(update, every)`, which changes at
-      sample times alone, as in a digital controller.
-    - `events`: by name, `Event(when, then)`: what happens where a function of the state passes through zero, or at given times;
-      `with_events(...)` gives the system with others.
-    - `units`: the units of what has a name, as text: coordinates, states, params, terms, channels of experiments, `"t"` and `"energy"`,
-      e.g. `{"t": "s", "x": "m", "b": "N s/m"}`. They are written beside what is drawn and fitted; nothing is computed with them.
+      along +∇g. The motion is still computed with g = 0; `Trajectory.pulling()`, the printed trajectory, `examine` and `plot.forces` report
+      times with λ < 0, at which the contact would have opened.
+    - `states`: by name, states in addition to q: `State(rate)`, of first order, ż = rate(…), or `Sampled(update, every)`, which changes
+      only at sample times, as in a digital controller.
+    - `events`: by name, `Event(when, then)`: what happens when a function of the state passes through zero, or at given times;
+      `with_events(...)` replaces them.
+    - `units`: units as text, by the name of a coordinate, a state, a parameter, a term or a channel of an experiment, and of `"t"` and
+      `"energy"`, e.g. `{"t": "s", "x": "m", "b": "N s/m"}`. They label pictures, fits and tables; nothing is computed with them.
 
-    **Fields:** `lagrangian`, `dissipation`, `force`, `holonomic`, `unilateral` and `nonholonomic`, each a tuple of (name, function), which
-    `dict(system.lagrangian)` gives to another system; `restitution` and `laws`, tuples of (name, number or function) and of (name, law);
-    `one_sided`, a tuple of names; `states`, `events` and `units`, tuples of (name, state), (name, event) and (name, unit).
+    **Fields:** `lagrangian`, `dissipation`, `force`, `holonomic`, `unilateral` and `nonholonomic`, each a tuple of (name, function);
+    `dict(system.lagrangian)` can be passed to another system; `restitution` and `laws`, tuples of (name, number or function) and of (name,
+    law); `one_sided`, a tuple of names; `states`, `events` and `units`, tuples of (name, state), (name, event) and (name, unit).
 
-    Any consistent set of units. Functions may return plain numbers, integers or lists, which become floating arrays. A system is
-    immutable, hashable and compared by its functions. Create it once: one created again from new functions is compiled again. What was
-    compiled for it, and what its functions close over, stays in memory until `jax.clear_caches()`.
+    Any consistent set of units. Functions may return plain numbers, integers or lists, which become floating arrays. A system is immutable,
+    hashable and compared by its functions. Create it once: a system created again from new functions is compiled again. Its compiled
+    programs, and everything that its functions close over, stay in memory until `jax.clear_caches()`.
 
-    **Raises:** `TypeError` where a slot holds no function, `states` no state or `units` no text; `ValueError` where two terms have the same
-    name, where `one_sided` names no holonomic constraint, or where a position constraint depends on a state that q̇ drives or that jumps.
+    **Raises:** `TypeError` if a slot holds no function, `states` no state or `units` no text; `ValueError` if two terms have the same
+    name, if `one_sided` names no holonomic constraint, or if a position constraint depends on a state that q̇ drives or that jumps.
 
     **Source:** Goldstein, Classical Mechanics, 3rd ed., sections 1.5 and 2.4; sign of λ: M q̈ = f + Gᵀλ.
 
@@ -132,7 +132,7 @@ class System:
                 _check_position(role(slot, name), function, dict(self.states))
 
     def with_events(self, events: Mapping[str, Event] | None) -> "System":
-        """The system with these `events`, by name, in place of its own; with none for None."""
+        """The system with these `events`, by name, in place of its own; None removes them."""
         fields = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
         new = object.__new__(System)
         for name, value in (fields | {"events": events_of(events, [name for name, _ in self.unilateral])}).items():
@@ -166,7 +166,7 @@ class System:
 
     @property
     def terms(self) -> tuple[str, ...]:
-        """Names of all that does work: dissipation, forces, constraints, and explicit time in L."""
+        """Names of all terms that do work: dissipation, forces, constraints, and explicit time in L."""
         return (*(name for name, _ in (*self.dissipation, *self.force)), *self.constraints, EXPLICIT_TIME)
 
 

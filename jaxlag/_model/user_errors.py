@@ -59,10 +59,10 @@ def _cure(error: Exception) -> str | None:
         return CHOICE
     if isinstance(error, jax.errors.TracerArrayConversionError):
         return NUMPY
-    said = str(error)
+    message = str(error)
     if isinstance(error, jax.errors.ConcretizationTypeError):
-        return PLAIN if "`float` function" in said or "item()" in said else COUNT
-    if isinstance(error, jax.errors.TracerIntegerConversionError) or any(text in said for text in INTEGER_WANTED):
+        return PLAIN if "`float` function" in message or "item()" in message else COUNT
+    if isinstance(error, jax.errors.TracerIntegerConversionError) or any(text in message for text in INTEGER_WANTED):
         return COUNT
     return None
 

@@ -89,7 +89,7 @@ def _parameter(leaf, dtype, label):
         return np.asarray(leaf, dtype)
     if type(leaf) is np.ndarray and leaf.dtype == dtype:  # the common one
         return np.array(leaf)
-    if isinstance(leaf, jax.Array):  # a weakly typed one, such as `jnp.asarray(1.0)`, counts as a number: nothing is compiled anew for it
+    if isinstance(leaf, jax.Array):  # a weakly typed one, such as `jnp.asarray(1.0)`, counts as a number: nothing is compiled again for it
         return leaf.astype(dtype) if jax.typeof(leaf).weak_type and leaf.dtype.kind == "f" else leaf
     if isinstance(leaf, Mapping):  # one that JAX takes for a leaf
         return _parameters(dict(leaf), dtype, str(label).strip("`"))
@@ -247,7 +247,7 @@ def without_events(system: System, label: str) -> None:
 def at_state(core: Callable[..., Any], system: System, q: Any, qdot: Any, params: Any, t: Any, states: Any = None) -> Any:
     """`core(flat, t, q, v)` of the checked system at a state given by the user; compiled once for each `core` and `system`.
 
-    **Raises:** `ValueError` where an entry of params is NaN; under `jit` the result is NaN there.
+    **Raises:** `ValueError` if an entry of params is NaN; under `jit` the result is NaN there.
     """
     given = state_and_params(q, qdot, params)
     t = number(t, "`t`", given.dtype, cure="Pass one time, and use `jax.vmap` for several.")

@@ -74,15 +74,15 @@ def jsonable(tree: PyTree) -> Any:
 
 def write_arrays(file: str | Path, kind: str, arrays: Mapping[str, np.ndarray], **about: Any) -> None:
     """Arrays by name, in the format of NumPy (.npz), with a description of them."""
-    said = json.dumps({"jaxlag": kind, "format": FORMAT} | about)
+    text = json.dumps({"jaxlag": kind, "format": FORMAT} | about)
     with open(file, "wb") as stream:  # `savez` would add to a name
-        np.savez(stream, allow_pickle=False, about=np.array(said), **arrays)
+        np.savez(stream, allow_pickle=False, about=np.array(text), **arrays)
 
 
 def write_json(file: str | Path, kind: str, content: Mapping[str, Any]) -> None:
     """A text file that every language can read."""
-    said = json.dumps({"jaxlag": kind, "format": FORMAT} | dict(content), indent=1, allow_nan=False, ensure_ascii=False)
-    Path(file).write_text(said, encoding="utf-8")
+    text = json.dumps({"jaxlag": kind, "format": FORMAT} | dict(content), indent=1, allow_nan=False, ensure_ascii=False)
+    Path(file).write_text(text, encoding="utf-8")
 
 
 def outline(tree: PyTree, names: Iterable[str]) -> Any:

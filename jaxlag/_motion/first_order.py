@@ -87,7 +87,7 @@ class EquationsOfMotion:
         return self.flat(pieces_at(params, self.elsewhere, at.t), at)
 
     def states_of(self, t, parts: Parts) -> StatesAt:
-        """The states beside q, at the time t."""
+        """The further states, at the time t."""
         return StatesAt(self.states.unravelled(parts.z) | self.sampled.unravelled(parts.u), t, parts.q, parts.v)
 
     def contents(self, t, parts: Parts, args: Arguments) -> tuple[Flat, FrictionElements | None]:

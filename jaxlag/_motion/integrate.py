@@ -116,7 +116,7 @@ def initialised(equations: EquationsOfMotion, at: StatesAt, params, scales: Scal
 
 
 def _nearest(equations: EquationsOfMotion, flat: Flat, at: StatesAt, params, search: Search) -> Consistent:
-    """The start on the constraints; where it is that itself, only whether inertia is missing remains to be said."""
+    """The start on the constraints; where it is that itself, only whether inertia is missing remains to be reported."""
     _, t0, q, v = at
     if search != "nothing":
         flat = flat._replace(holonomic=flat.bilateral)

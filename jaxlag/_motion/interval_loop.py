@@ -209,7 +209,7 @@ class IntervalLoop(NamedTuple):
         t, coming = moving.t, self._coming(given, moving.t, steps)
         sample = self.ts.at(self.ts.shape[0] - 1)[0] if self.dense else self.sample_time(steps.sample)
         node, end = functools.reduce(lambda first, time: jnp.where(time + same < first, time, first), coming, sample), t + steps.length
-        t1 = jnp.where(end + same >= node, node, end)
+        t1 = jnp.where(end + jnp.minimum(same, steps.length / 2) >= node, node, end)  # a step that was refused becomes shorter at any time
         args = args._replace(params=self.inputs(given[0]).pieces(steps.following))
         state = eqx.combine(moving.solver_state, steps.solver_state)
         y, error, dense, new, result = self.solver.step(self._term(), t, t1, moving.y, args, state, steps.has_jumped)
@@ -257,7 +257,7 @@ class IntervalLoop(NamedTuple):
         return (Moving(t, y, changing), reached), jax.lax.stop_gradient((steps, is_sample))
 
     def _result(self, keep, solved, controlled):
-        """Of a step: that of its control, or what the solver said of one that is kept."""
+        """The result of a step: that of its control, or what the solver reported of one that is kept."""
         if solved is None:
             return controlled
         ended = solved != dfx.RESULTS.successful

@@ -28,7 +28,7 @@ def load(file: str | Path) -> Any:
     become dicts and lists; a NamedTuple or another object becomes the dict of its fields. For a fit, the dict of `Fit.to_dict`, with its
     card under `"card"`.
 
-    **Raises:** `ValueError` where the file is neither; whatever `open` raises.
+    **Raises:** `ValueError` if the file is neither; whatever `open` raises.
 
     **Source:** NumPy's format NPY 1.0 (NEP 1) in a ZIP archive, without pickled objects; JSON, RFC 8259.
 

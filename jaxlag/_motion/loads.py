@@ -16,14 +16,14 @@ from .._program.sparse_jacobian import MANY, sparsity_pattern
 from .._program.sparse_matrix import SparseMatrix
 from .batch import BatchedEquations
 from .first_order import EquationsOfMotion
-from .protocol import Arguments, AugmentedSystem
+from .protocol import Arguments, AugmentedSystem, undifferentiated
 
 
 def told_of_loads(equations: Any, t, y, args: Arguments) -> Arguments:
     """With what weighs as much as one of each coordinate, and what forces at the start make of each velocity."""
     if args.scales is None:
         return args
-    found = _loads(equations, *jax.lax.stop_gradient((t, y, args._replace(scales=args.scales._replace(driven=None)))))
+    found = _loads(equations, *undifferentiated((t, y, args._replace(scales=args.scales._replace(driven=None)))))
     return args if found is None else args._replace(scales=args.scales._replace(**found))
 
 
@@ -53,8 +53,8 @@ def _loads(equations: Any, t, y, args: Arguments) -> dict[str, Any] | None:
         G = velocity_rows(flat, t, parts.q, parts.v)[1]
         G = SparseMatrix(jnp.abs(G.values), G.places) if isinstance(G, SparseMatrix) else jnp.abs(G)
         held = held + rate(G.T @ jnp.abs(equations.accelerated(t, parts, args, False).multipliers[: flat.rows]))
-        if equations.projection is not None and not equations.works:  # which are integrals along what is given, too
-            given = _prescribed(flat, t, parts.q)
+        if equations.projection is not None:
+            given = _prescribed(flat, t, parts.q, may_move=not equations.works)  # works are integrals along what moves
     if elements is not None:
         slopes = jnp.abs(jax.jacfwd(lambda v: elements.slip(t, parts.q, v))(parts.v))
         bound = jnp.abs(equations.friction(t, parts, args).bound)[elements.element_of_row]
@@ -65,14 +65,17 @@ def _loads(equations: Any, t, y, args: Arguments) -> dict[str, Any] | None:
     return {"units": units, "held": held, "given": given, "driven": driven}
 
 
-def _prescribed(flat: Flat, t, q) -> Bool[Array, " n"]:
-    """Which coordinates a constraint on them alone gives as a function of the time, so that nothing of them is integrated."""
+def _prescribed(flat: Flat, t, q, may_move: bool) -> Bool[Array, " n"]:
+    """Which coordinates a constraint on them alone gives as a function of the time, so that nothing of them is integrated; or holds."""
     G = position_rows(flat, t, q)[1]
     if isinstance(G, SparseMatrix):
         rows, columns = np.asarray(G.places.rows), np.asarray(G.places.columns)
     else:
         rows, columns = np.nonzero(sparsity_pattern(lambda q: flat.holonomic(t, q), q)) if q.size < MANY else np.zeros((2, 0), int)
     alone = np.bincount(rows, minlength=1)[rows] == 1
+    if not may_move:
+        moves = np.nonzero(sparsity_pattern(lambda t: flat.holonomic(t[0], q), jnp.reshape(t, 1)))[0]
+        alone = alone & ~np.isin(rows, moves)
     values = G.values[alone] if isinstance(G, SparseMatrix) else G[rows[alone], columns[alone]]
     return jnp.zeros(q.size, bool).at[columns[alone]].set(values != 0)
 

@@ -56,8 +56,8 @@ class Interpolated(eqx.Module):
     """A motion at other times `ts`, from `Trajectory.at`.
 
     - `q`, `qdot`, `qddot`: structured like q0, with the axes of `ts` first. NaN outside the motion.
-    - `q_error`, `qdot_error`: error estimates, from how well interpolation reproduces samples that are left out: where the motion
-      is smooth, some 64 and 18 times too large.
+    - `q_error`, `qdot_error`: error estimates, from how well interpolation reproduces samples that are left out; for smooth motion they are
+      about 64 and 18 times too large.
     """
 
     ts: Float[Array, "..."]

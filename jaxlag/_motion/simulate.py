@@ -51,36 +51,36 @@ def simulate(
 
     $$ M\ddot q = f + G^T\lambda, \qquad g(t, q) = 0, \qquad a(t, q, \dot q) = 0 $$
 
-    Differentiable in q0, qdot0, ts and params, forward and reverse, to any order, under `jit` and `vmap`, without any setting.
-    The initial state is put on the constraints first (`stats["start_moved"]` says how far it was off), inside what is differentiated.
+    Differentiable in q0, qdot0, ts and params, forward and reverse, to any order, under `jit` and `vmap`, without any setting. The initial
+    state is first projected onto the constraints (`stats["start_moved"]` says how far it was off); derivatives include this.
 
     **Arguments:**
 
     - `system`: the `System`, n coordinates in all.
-    - `q0`, `qdot0`: the state at ts[0]; pytrees of one structure, of numbers or arrays of any shape. Any consistent units. To go on from
+    - `q0`, `qdot0`: the state at ts[0]; pytrees of one structure, of numbers or arrays of any shape. Any consistent units. To continue from
       `last = motion[-1]`: `last.q, last.qdot`, with `states=last.states`.
     - `ts`: sample times, shape (T,), increasing, at least two.
     - `params`: what the functions of the system name, any pytree; measured inputs among them are `Signal`s.
-    - `states`: values at the start of states of the system, by name, in place of those that `State` and `Sampled` give.
-    - `events`: by name, `Event(when, then, stop)`, in place of those of the system. Keep them: new ones are compiled anew.
+    - `states`: initial values of states of the system, by name, in place of the `start` of `State` and `Sampled`.
+    - `events`: by name, `Event(when, then, stop)`, in place of those of the system. Reuse these objects: new ones are compiled again.
     - `solver`: any explicit or diagonally implicit Runge–Kutta solver of diffrax. Default `jaxlag.Dop853()`; for forces
       that are not smooth `jaxlag.Dopri5()`, for stiff systems `diffrax.Kvaerno5()`.
-    - `rtol`, `atol`: tolerances of the step size control. `rtol` is 1e-8 in double and 1e-4 in single precision. Without `atol` each
-      coordinate, velocity and state is compared with its own scale, a hundredth of the largest that it has been, in any unit;
-      otherwise it is a number, or one for each coordinate and its velocity in a pytree like `q0`. Derivatives are as exact as the
-      motion: their errors, compared with their own scales, shorten the steps of a motion that is differentiated.
+    - `rtol`, `atol`: tolerances of the step size control. `rtol` is 1e-8 in double and 1e-4 in single precision. Without `atol`, each
+      coordinate, velocity and state is compared with its own scale, a hundredth of its largest value so far, in any unit; otherwise `atol`
+      is a number, or a pytree like `q0` with one for each coordinate and its velocity. Derivatives are as accurate as the motion: their
+      errors, compared with their own scales, shorten the steps of a motion that is differentiated.
     - `stabilisation`: how the constraints are maintained: `Projection()`, `Baumgarte(...)` or `NoStabilisation()`.
     - `friction`: treatment of dry friction: `StickSlip()` (exact Coulomb friction) or `Regularised(width)`.
     - `max_steps`: step limit.
-    - `adjoint`: a diffrax adjoint, used in place of the derivative rule of this package; beside contacts, events, updates of states and
-      signals that jump or bend, either `diffrax.ForwardMode()` or `diffrax.RecursiveCheckpointAdjoint()`, for forward or reverse mode.
+    - `adjoint`: a diffrax adjoint, used in place of the derivative rule of this package; with contacts, events, sampled states, and signals
+      that jump or bend, either `diffrax.ForwardMode()` or `diffrax.RecursiveCheckpointAdjoint()`, for forward or reverse mode.
     - `works`: integrates the work of each term along with the motion, for `Trajectory.work()` and the energy balance.
-    - `progress`: shows a progress bar on standard error; in a log, a line now and then. Says so where compilation takes long.
+    - `progress`: shows a progress bar on standard error; in a log, a line now and then. It also reports compilation that takes long.
     - `throw`: whether a failure raises. If not, or under `jit`, `Trajectory.result` holds the reason, and samples not reached are NaN.
 
     **Returns:** a `Trajectory`; each of its fields has the samples, T, as its first axis.
 
-    **Raises:** `ValueError` or `TypeError` for unusable arguments; `RuntimeError` where the integration fails.
+    **Raises:** `ValueError` or `TypeError` for unusable arguments; `RuntimeError` if the integration fails.
 
     **Source:** Hairer, Lubich & Wanner, Geometric Numerical Integration, section IV.4 (projection).
 

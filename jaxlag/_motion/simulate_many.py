@@ -62,23 +62,23 @@ def simulate_many(
 
     $$ M(q_i; p_i)\,\ddot q_i = f(q_i, \dot q_i; p_i) + G^T\lambda_i, \qquad i = 1 \dots B $$
 
-    What `over` names has the members as its first axis. The result is that of `simulate` for each of them, within the tolerances, with
-    the members as first axis of every field; derivatives are those of `simulate`, with up to 96 numbers of a member differentiated in
-    one pass. With several devices each takes its part of the members; so do several processes (`jax.distributed.initialize`) that make
-    this call with the same arguments, and each of them gets the whole result.
+    Everything that `over` names has the members as its first axis. The result is that of `simulate` for each member, within the tolerances,
+    with the members as first axis of every field; derivatives are those of `simulate`, with up to 96 numbers of a member differentiated in
+    one pass. The members are divided among all devices, and among several processes (`jax.distributed.initialize`) that make this call with
+    the same arguments; each process gets the whole result.
 
     **Arguments:**
 
     - `system`, `q0`, `qdot0`, `ts`, `params`, `events`, `solver` to `throw`: as `simulate`; `ts` is the same for all.
     - `over`: what differs: "q0", "qdot0", entries of them ("q0.phi") or of `params` ("b", "wheel.c").
-    - `common_steps`: True has 64 members at a time take the same steps, short enough for each of them, with the members as the last
-      axis of all arithmetic: many times as fast as one by one. False lets each member take its own. Default: True, but False where there
-      is dry friction, a contact, an event or a measured input that jumps, or bends and drives a constraint: these end steps at times
-      that differ. Where one of 64 cannot go on, all stop: `common_steps=False` then says which.
+    - `common_steps`: True makes 64 members at a time take the same steps, short enough for each of them, with the members as the last axis
+      of all arithmetic: many times faster than one by one. False lets each member take its own steps. Default: True, but False with dry
+      friction, a contact, an event, or a measured input that jumps, or bends and drives a constraint: these end steps at different times.
+      If one of 64 cannot go on, all stop; `common_steps=False` then shows which.
 
     **Returns:** a `Trajectory`; each of its fields has the B members as its first axis, the samples as its second.
 
-    **Raises:** as `simulate`; `ValueError` where `over` names none of these, where sizes differ, or where common steps are impossible.
+    **Raises:** as `simulate`; `ValueError` if `over` names none of these, if sizes differ, or if common steps are impossible.
 
     **Source:** Hairer, Nørsett & Wanner, Solving Ordinary Differential Equations I, section II.4: a step fits a vector of equations
     when it fits the worst of them.

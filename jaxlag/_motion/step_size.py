@@ -46,7 +46,7 @@ class Scale(NamedTuple):
 
 
 class StepControl(dfx.AbstractStepSizeController):
-    """Steps by the error of each component beside its own scale, or beside `atol` where that is given.
+    """Steps by the error of each component relative to its own scale, or to `atol` where that is given.
 
     They shrink where they meet numbers that are not finite, and end there as `undefined`. Those that resume their length after one that
     was cut short at a node make the next one no shorter than was planned, and one that is rejected must stay above `smallest`. (Without

@@ -31,7 +31,7 @@ class Trajectory(eqx.Module):
     """A motion at sample times: each field has the samples as its first axis; of many motions, the members.
 
     `len(motion)` is the number of samples, `motion[-1]` the last one (an `Instant`), `motion[100:200]` and `motion[motion.ts > 1]` are
-    motions again, which start at the first sample they keep: works count from there. Of many motions (`simulate_many`, `vmap`),
+    motions again, which start at the first sample they keep: works count from there. For many motions (`simulate_many`, `vmap`),
     `motions[3]` is one of them. `motion.at(ts)` is the motion between the samples. `motion.plot()` and `motion.animate(points)` draw it,
     with all that `plot.motion` and `plot.animate` take.
 
@@ -85,10 +85,13 @@ class Trajectory(eqx.Module):
         return self.works
 
     def balance(self) -> Float[Array, " T"]:
-        """Residual of the energy balance, ΔE − ΣW, as a fraction of the energy exchanged: the largest q̇ · ∂L/∂q̇ and all works."""
+        """Residual of the energy balance, ΔE − ΣW, as a fraction of the energy exchanged: the largest q̇ · ∂L/∂q̇ and all works; or of the
+        rounding of the energy, if that is more, as of a machine that friction holds.
+        """
         energy, exchanged = energies(self)
         works = jnp.stack(list(self.work().values()))
         scale = jnp.nanmax(jnp.abs(exchanged)) + jnp.nansum(jnp.nanmax(jnp.abs(works), axis=1))
+        scale = jnp.maximum(scale, jnp.finfo(energy.dtype).eps * jnp.nanmax(jnp.abs(energy)))
         return (energy - energy[0] - jnp.sum(works, axis=0)) / jnp.where(scale > 0, scale, 1)
 
     def slip(self) -> dict[str, Float[Array, "..."]]:
@@ -96,8 +99,9 @@ class Trajectory(eqx.Module):
         return self.provenance.slip if isinstance(self.provenance, Recorded) else _slips(self)
 
     def pulling(self) -> dict[str, PyTree]:
-        """By the name of each constraint that is `one_sided`, at which samples λ < 0: there it would have to pull, and the contact would
-        have opened. What is below the rounding of the largest |λ| is zero. Where redundant rows share a load, λ is that of least norm.
+        """For each constraint that is `one_sided`, by name, the samples at which λ < 0: there it would have to pull, and the contact would
+        have opened. Values below the rounding of the largest |λ| count as zero. If redundant rows share a load, λ is the solution of least
+        norm.
         """
         axis = self.ts.ndim - 1
 
@@ -144,14 +148,14 @@ class Trajectory(eqx.Module):
         $$ |\delta q| \le \frac{h^6}{46080}\,|q^{(6)}|, \qquad |\delta\dot q| \le \frac{h^4}{384}\,|q^{(5)}|, \qquad
            |\delta\ddot q| \le \frac{\sqrt3\,h^3}{216}\,|q^{(5)}| $$
 
-        with h from sample to sample, where the motion is smooth; where friction changes or an input jumps between two samples, δq is of
-        the order of h² times the jump of q̈. Nothing is interpolated across an impact, or an event that changes the state: up to it and
-        from it on the motion follows from the sample on its side by q, q̇ and q̈, δq ≤ h³/6 |q⁽³⁾|, exact in free flight. Between the first
-        and the last of several in one interval it is NaN. `q_error` and `qdot_error` are estimates for all cases. λ is not interpolated:
-        it follows from the state by `acceleration`. Differentiable, also in `ts`.
+        where h is the distance of the samples and the motion is smooth; if friction changes or an input jumps between two samples, δq is of
+        the order of h² times the jump of q̈. Nothing is interpolated across an impact, or an event that changes the state: on either side
+        of it the motion is extrapolated from the nearest sample by q, q̇ and q̈, δq ≤ h³/6 |q⁽³⁾|, exact in free flight. Between the first
+        and the last of several in one interval it is NaN. `q_error` and `qdot_error` are estimates for all cases. λ is not interpolated: it
+        follows from the state by `acceleration`. Differentiable, also in `ts`.
 
-        **Raises:** `ValueError` where a time lies outside the motion (under `jit` the state there is NaN), for many motions at once, and
-        where there are less than two samples.
+        **Raises:** `ValueError` if a time lies outside the motion (under `jit` the state there is NaN), for many motions at once, and
+        if there are less than two samples.
 
         **Source:** Hairer, Nørsett & Wanner, Solving Ordinary Differential Equations I, section II.6.
         """
@@ -184,10 +188,10 @@ class Trajectory(eqx.Module):
         """A table with a row for each sample and the columns of `to_dict`, "r[0]", "r[1]", … of an array; `jl.Experiment.from_dataframe`
         reads it.
 
-        **Arguments:** `frame`: what makes the table from columns: `pandas.DataFrame`, `polars.DataFrame`. Default: that of pandas where it
-        is installed, else of polars.
+        **Arguments:** `frame`: the class of data frames: `pandas.DataFrame`, `polars.DataFrame`. Default: that of pandas if it is
+        installed, otherwise that of polars.
 
-        **Raises:** `ValueError` for many motions at once, `ImportError` where there is neither pandas nor polars.
+        **Raises:** `ValueError` for many motions at once, `ImportError` if there is neither pandas nor polars.
         """
         if self.ts.ndim > 1:
             raise ValueError(f"`to_dataframe` must be of one motion, but there are {len(self)}. Take one of them, e.g. `motions[0]`.")
@@ -198,9 +202,9 @@ class Trajectory(eqx.Module):
     def save(self, file: str | Path) -> None:
         """Writes the motion, with its energies and slip velocities, to `file` in the format of NumPy (.npz).
 
-        `jl.load` makes a `Trajectory` of it, without the functions of the system; a pickle needs them.
+        `jl.load` reads it as a `Trajectory` again, without the functions of the system, which a pickle would need.
 
-        Of params the numbers are kept. Structures become dicts and lists: of a NamedTuple the dict of its fields.
+        The numbers of params are kept. Structures become dicts and lists; a NamedTuple becomes the dict of its fields.
         """
         each = lambda function: functools.reduce(lambda f, _: jax.vmap(f), self.ts.shape[1:], function)
         of = self.provenance

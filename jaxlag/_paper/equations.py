@@ -53,8 +53,8 @@ def equations(
 
     $$ \frac{d}{dt}\frac{\partial L}{\partial\dot q} - \frac{\partial L}{\partial q} + \frac{\partial D}{\partial\dot q} = Q + G^T\lambda $$
 
-    L, D, Q, g and a are read as formulas (`to_sympy`), differentiated on paper and simplified as by a person; the result is then compared
-    with `acceleration` at a random state.
+    L, D, Q, g and a are read as formulas (`to_sympy`), differentiated on paper and simplified as a person would; the result is then
+    compared with `acceleration` at a random state.
 
     **Arguments:**
 
@@ -62,27 +62,27 @@ def equations(
     - `q`, `params`: example values, or names in their place: a string for a number, a list of strings for a vector, a set of strings
       for a mapping of numbers. Symbols have the names of the entries: `Theta_s` is Θₛ, the velocity of `phi` is φ̇; entries of arrays are
       counted from 1. All symbols are real.
-    - `multipliers`: `False` expresses coordinates by others where holonomic constraints are linear in them, and finds the multipliers
-      of these constraints afterwards (Lagrange's equations of the second kind); `True`, and wherever there are contacts, keeps all
-      coordinates and all multipliers (of the first kind).
+    - `multipliers`: `False` eliminates coordinates in which holonomic constraints are linear, and finds the multipliers of these
+      constraints afterwards (Lagrange's equations of the second kind); `True` keeps all coordinates and all multipliers (of the first
+      kind), as is always done with contacts.
     - `positive`: names of parameters, coordinates or multipliers to be taken as positive, so that √(l²) is l.
     - `linearised_at`: an equilibrium, as a tree like q of numbers, text or SymPy expressions, e.g. `{"phi": 0, "y": "l - m*g/c"}`; or a
-      pair (q, q̇), a steady motion at these constant rates. In a mapping, coordinates may be left out: constraints determine them, or they
-      keep their symbols; and parameters may be given beside them, such as a preload `"s": "m*g/c"`. Unknown names are new symbols.
-    - `inputs`: with `linearised_at`, names of parameters u that change with time; their deviations stand on the right-hand side.
+      pair (q, q̇), a steady motion at these constant rates. A mapping may omit coordinates: constraints determine them, or they keep their
+      symbols; and it may include parameters, such as a preload `"s": "m*g/c"`. Unknown names are new symbols.
+    - `inputs`: with `linearised_at`, names of parameters u that change with time; their deviations appear on the right-hand side.
 
-    Contacts follow the equations of motion: g ≥ 0, λ ≥ 0, g λ = 0, and ġ⁺ = −e ġ⁻ in an impact; q̈ and other λ are given by theirs.
-    States beside q follow the equations of motion: ż = rate, and u⁺ = update of a sampled one where that has a formula.
+    Contacts follow the equations of motion: g ≥ 0, λ ≥ 0, g λ = 0, and ġ⁺ = −e ġ⁻ in an impact; q̈ and other λ are given by theirs. States
+    follow in the same way: ż = rate, and u⁺ = update of a sampled one if that has a formula.
 
     **Returns:** `Equations`, whose multipliers have the sign of M q̈ = f + Gᵀλ. With `linearised_at`, `LinearisedEquations`:
     M δq̈ + (C + G) δq̇ + (K + N) δq = B δu in independent coordinates, compared with the derivatives of the simulation. Any consistent set
     of units.
 
-    **Raises:** `ValueError` or `TypeError` where an argument or a function of the system is of the wrong kind, where two symbols would have
-    the same name, or where the equations differ from the simulation, as they do where a function has a derivative rule that does not follow
-    from its formula; where `linearised_at` is neither an equilibrium nor a steady motion (the message says what accelerates, and when it
+    **Raises:** `ValueError` or `TypeError` if an argument or a function of the system is of the wrong kind, if two symbols would have
+    the same name, or if the equations differ from the simulation, as they do if a function has a derivative rule that does not follow
+    from its formula; if `linearised_at` is neither an equilibrium nor a steady motion (the message says what accelerates, and when it
     would be one), or has no linear equations of second order (nonholonomic constraints, a kink of friction); `NotImplementedError`, which
-    names the line, where an operation has no formula; `ImportError` without SymPy.
+    names the line, if an operation has no formula; `ImportError` without SymPy.
 
     **Source:** Goldstein, Classical Mechanics, 3rd ed., sections 1.4, 1.5, 2.4 and 6.2.
 

@@ -116,7 +116,7 @@ class Lineariser:
         moving = [x.name for x in inputs if x in steps.G.free_symbols | s.g.free_symbols | momenta]
         reasons = {
             "has nonholonomic constraints. Write those that can be integrated as `holonomic`": bool(s.a),
-            "has states beside q that act on it. Write them as parameters": not used.isdisjoint((*s.z, *s.zdot, *s.u)),
+            "has further states that act on it. Write them as parameters": not used.isdisjoint((*s.z, *s.zdot, *s.u)),
             "has forces that depend on multipliers. Write them by coordinates": not steps.f.free_symbols.isdisjoint(s.multipliers),
             f"of `inputs` {', '.join(moving)} moves a constraint or a mass. Name those of forces and potentials": bool(moving),
         }

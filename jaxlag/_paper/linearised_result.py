@@ -27,7 +27,7 @@ class LinearisedEquations:
 
     $$ M\,\delta\ddot q + (C + G)\,\delta\dot q + (K + N)\,\delta q = B\,\delta u $$
 
-    Formulas are SymPy expressions; d independent deviations remain, and m inputs u. What is not coupled is printed apart, and a single
+    Formulas are SymPy expressions; d independent deviations remain, and m inputs u. Uncoupled equations are printed separately, a single
     oscillator with its natural angular frequency ω₀² = K/M and its damping ratio ζ = C/(2 M ω₀). Any consistent set of units.
 
     - `q`, `qdot`, `qddot`: the symbols of the deviations and of their derivatives, `inputs`: those of δu, as tuples. Their names begin

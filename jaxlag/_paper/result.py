@@ -35,8 +35,8 @@ class Equations:
     - `motion`: the equations of motion, one `sympy.Eq` for each coordinate.
     - `rates`: the rates of the states of first order, by the symbol of ż; `updates`: those of the sampled states, by the symbol of u, None
       where an update has no formula.
-    - `eliminated`: the coordinates that constraints express by the remaining ones, and their formulas.
-    - `contacts`: the gaps of contacts, by name; their rows of G stand behind those of g, as if all were closed.
+    - `eliminated`: the coordinates that were eliminated, and their formulas in the remaining ones.
+    - `contacts`: the gaps of contacts, by name; their rows of G follow those of g, as if all were closed.
 
     ```python
     import jaxlag as jl
@@ -106,7 +106,7 @@ class Equations:
 
         `q` and `qdot` (n) hold the coordinates in the order of `Equations.q`; `params` is structured as it was for `equations`.
 
-        **Raises:** `ValueError` where there are states beside q or coordinates that D alone moves, NumPy lacks a function, or λ enters
+        **Raises:** `ValueError` if there are further states or coordinates that D alone moves, NumPy lacks a function, or λ enters
         nonlinearly and has no formula.
         """
         from .codegen import to_python
@@ -116,7 +116,7 @@ class Equations:
     def to_c(self) -> str:
         """The source of `void acceleration(t, q, qdot, params, qddot, multipliers)` in C99; a comment lists the entries in order.
 
-        **Raises:** `ValueError` where there are states beside q or coordinates that D alone moves, C lacks a function, or λ enters
+        **Raises:** `ValueError` if there are further states or coordinates that D alone moves, C lacks a function, or λ enters
         nonlinearly and has no formula.
         """
         from .codegen import to_c
@@ -132,7 +132,7 @@ class Equations:
                 "`holonomic`."
             )
         if self.rates or self.updates:
-            raise ValueError("a program must be of a system without states beside q, but there are some. Write them as parameters.")
+            raise ValueError("a program must be of a system without further states, but there are some. Write them as parameters.")
         details = self._details
         return Program(self.t, self.q, self.qdot, self.qddot, details.paths, details.multipliers, details.residuals, details.solution)
 
@@ -232,13 +232,13 @@ def arranged(shape: tuple, formulas: Iterable) -> Any:
 
 def lines(sections: Iterable[Section]) -> str:
     """Sections as text, with an empty line between them."""
-    said = lambda left, right, relation="=": f"{left} {relation} {right}"
-    return "\n\n".join("\n".join(said(*line) for line in section) for section in sections if section)
+    written = lambda left, right, relation="=": f"{left} {relation} {right}"
+    return "\n\n".join("\n".join(written(*line) for line in section) for section in sections if section)
 
 
 def aligned(sections: Iterable[Section]) -> str:
     """Sections as an `aligned` environment of LaTeX."""
     signs = {"=": "=", "≥": r"\ge"}
-    said = lambda left, right, relation="=": f"{left} &{signs[relation]} {right}"
-    rows = [said(*line) for section in sections for line in section]
+    written = lambda left, right, relation="=": f"{left} &{signs[relation]} {right}"
+    rows = [written(*line) for section in sections for line in section]
     return "\\begin{aligned}\n" + " \\\\\n".join(rows) + "\n\\end{aligned}"

@@ -32,7 +32,7 @@ def dotted(symbol: Symbol, dot: str) -> Symbol:
 
 
 class States(NamedTuple):
-    """The states beside q: symbols of those of first order, of their rates, and of the sampled ones; and all of them by name."""
+    """The further states: symbols of those of first order, of their rates, and of the sampled ones; and all of them by name."""
 
     z: tuple[Symbol, ...]
     zdot: tuple[Symbol, ...]

@@ -26,7 +26,7 @@ def to_sympy(function: Callable, *arguments: PyTree) -> PyTree:
     **Returns:** what the function returns: an expression for each scalar, and a NumPy array of expressions, of the same shape, for each
     array.
 
-    **Raises:** `NotImplementedError`, which names the operation and its line, where an operation has no formula; `TypeError` where an
+    **Raises:** `NotImplementedError`, which names the operation and its line, if an operation has no formula; `TypeError` if an
     argument is neither an expression nor a number; `ImportError` without SymPy.
 
     **Source:** the program is JAX's jaxpr: Frostig, Johnson & Leary, Compiling machine learning programs via high-level tracing (2018).

@@ -42,7 +42,7 @@ class Value(NamedTuple):
 def dependence(function: Callable, x: Array | jax.ShapeDtypeStruct) -> scipy.sparse.csr_matrix:
     """Whether element i of f(x) depends on element j of x, as a sparse (m, n) matrix.
 
-    **Raises:** `TooLong` where the pattern has too many entries, or the program has loops of too many turns, or effects.
+    **Raises:** `TooLong` if the pattern has too many entries, or the program has loops of too many turns, or effects.
     """
     closed, out = jax.make_jaxpr(function, return_shape=True)(x)
     if closed.effects:

@@ -18,28 +18,28 @@ SMALLEST = {  # programs of any size: a fit has dozens of small ones, which take
 
 
 def keep_compiled(folder: str | os.PathLike | None = None, *, max_bytes: int = 2**30) -> Path:
-    r"""Keeps compiled programs on disk, so that the next process reads them where it would compile them.
+    r"""Keeps compiled programs on disk, so that the next process reads them instead of compiling.
 
-    Call it once, before the first motion. It sets JAX's persistent compilation cache, for all programs of the process; what Python calls,
-    as `simulate`, a gradient of it and `fit`, is on a CPU not traced either. It is found as long as the user's functions return the same
-    programs, and shapes, settings, and the versions of JAX and jaxlag are the same. Functions that were called before this one, that
-    have a derivative rule of their own (`jax.custom_jvp`) or call Python, and motions within the user's own `jit` are traced as ever;
-    only `simulate(..., progress=True)` compiles anew, as its progress bar is called by the compiled program.
+    Call it once, before the first motion. It sets JAX's persistent compilation cache for all programs of the process. On a CPU, calls from
+    Python, such as `simulate`, a gradient of it and `fit`, skip tracing, too: the cache key is your functions' jaxprs, with shapes,
+    settings, and the versions of JAX and jaxlag. Functions that were called before this one, functions that have a derivative rule of their
+    own (`jax.custom_jvp`) or call Python, and motions within your own `jit` are traced as usual. Only `simulate(..., progress=True)`
+    compiles again, because the compiled program calls its progress bar.
 
     **Arguments:**
 
-    - `folder`: where to keep them. Default: the folder that is set already, by `JAX_COMPILATION_CACHE_DIR` or `jax.config`; else the
+    - `folder`: where to keep them. Default: the folder that is already set by `JAX_COMPILATION_CACHE_DIR` or `jax.config`, otherwise the
       user's cache folder: `$XDG_CACHE_HOME/jaxlag` or `~/.cache/jaxlag` on Linux, `~/Library/Caches/jaxlag` on macOS and
-      `%LOCALAPPDATA%\jaxlag` on Windows. It is made if need be, for this user alone: whoever can write to it can run code in your
+      `%LOCALAPPDATA%\jaxlag` on Windows. It is created if necessary, for this user alone: whoever can write to it can run code in your
       processes.
-    - `max_bytes`: if the folder is larger when this is called, the programs that were used longest ago are deleted. Not in a folder that
-      was set already, which is left to its owner.
+    - `max_bytes`: if the folder is larger when this is called, the least recently used programs are deleted; a folder that was already set
+      is left to its owner.
 
-    The smallest compile time of a program that is kept is set to zero, unless `JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS` is set.
+    JAX's smallest compile time of a kept program is set to zero, unless `JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS` is set.
 
     **Returns:** the folder.
 
-    **Raises:** `ValueError` where the folder cannot be made or written to; `TypeError` where `folder` is no path, or `max_bytes` no whole
+    **Raises:** `ValueError` if the folder cannot be made or written to; `TypeError` if `folder` is no path, or `max_bytes` no whole
     number of 0 or more.
 
     **Source:** the guide of JAX, "Persistent compilation cache".

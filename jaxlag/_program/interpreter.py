@@ -33,7 +33,7 @@ def evaluate(closed: Any, algebra: Algebra, *arguments: Any, limit: int | float 
 
     **Arguments:** for each input an array of numbers, or an object array of scalars of the algebra and numbers.
 
-    **Raises:** `UnknownPrimitive`, which names the primitive and its line; `TooLong` where there are more than `limit` nodes.
+    **Raises:** `UnknownPrimitive`, which names the primitive and its line; `TooLong` if there are more than `limit` nodes.
     """
     interpreter = Interpreter(algebra, limit)
     interpreter.with_signed_zeros = equations_with_signed_zeros(closed)
@@ -53,7 +53,7 @@ def evaluate(closed: Any, algebra: Algebra, *arguments: Any, limit: int | float 
 def traced(closed: Any, interpreter: "Interpreter") -> tuple[Arrays, Arrays]:
     """Inputs and outputs of a jaxpr in which everything but known numbers is an argument: its constants come first.
 
-    **Raises:** as `evaluate`, and `TooLong` where it has effects, or arguments that are not numbers.
+    **Raises:** as `evaluate`, and `TooLong` if it has effects, or arguments that are not numbers.
     """
     jaxpr = constants_as_inputs(closed)
     if closed.effects or any(map(has_extended_dtype, jaxpr.invars)):

@@ -50,7 +50,7 @@ MOST = 128  # programs that a process finds again at once; one has some megabyte
 
 
 class CompiledAgain(UserWarning):
-    """Says that something is compiled again and again. It need not be said of a program that is found."""
+    """Says that something is compiled again and again. Not needed for a program that is found."""
 
 
 class KeptPrograms:

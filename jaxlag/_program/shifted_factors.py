@@ -14,7 +14,7 @@ from .conditions import repeated
 SHIFT = 0.35  # exponent of eps: what is added then, in units in which the matrix has numbers near one
 GROWTH = 0.85  # exponent of 1/eps: what the inverse makes of a number then; that of a straight chain of m links makes m²/8 of it
 REFINEMENTS = 12, 400  # times that a solution is put right then, at least and at most: a straight chain of 1000 links takes 40
-LIGHT = 0.25  # exponent of eps: a number on the diagonal beside the largest, below which it sets no scale
+LIGHT = 0.25  # exponent of eps: a number on the diagonal relative to the largest, below which it sets no scale
 
 
 def shifted_where_singular(factored: Callable, probed: Callable, shift: Array, is_work: bool = True) -> tuple[Any, Bool[Array, ""]]:
@@ -62,7 +62,7 @@ def put_right(once: Callable, matvec: Callable, b: Array, least: int, shifted: B
 
 
 def scales(diagonal: Float[Array, " n"]) -> Float[Array, " n"]:
-    """The sizes of a diagonal, those that are (next to) nothing beside the largest raised; ones where all are nothing."""
+    """The sizes of a diagonal, those that are (next to) nothing relative to the largest raised; ones where all are nothing."""
     size = jnp.abs(diagonal)
     largest = jnp.max(size)
     return jnp.where(largest > 0, jnp.maximum(size, jnp.finfo(size.dtype).eps ** LIGHT * largest), 1)

@@ -1,4 +1,4 @@
-"""How large the terms are that a function adds up: where they cancel to zero, rounding is small beside them."""
+"""How large the terms are that a function adds up: where they cancel to zero, rounding is small compared with them."""
 
 from collections.abc import Callable
 from typing import Any

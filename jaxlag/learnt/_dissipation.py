@@ -45,7 +45,7 @@ class ConvexDissipation(eqx.Module):
 
     **Returns:** `net(qdot)` is a scalar. Any consistent units.
 
-    **Raises:** `ValueError` where `scale`, `power`, `width` or `depth` is not positive, or where `qdot` differs in size from `scale`.
+    **Raises:** `ValueError` if `scale`, `power`, `width` or `depth` is not positive, or if `qdot` differs in size from `scale`.
 
     **Source:** Amos, Xu & Kolter, Input Convex Neural Networks, ICML 2017, eq. 2. Related: convex dissipation potentials from networks in
     Huang, He, Chem & Reina, Variational Onsager Neural Networks, arXiv:2112.09085; input-convex layers for JAX in the library klax.
@@ -114,7 +114,7 @@ class PassiveDissipation(eqx.Module):
 
     **Returns:** `net(qdot)` is a scalar. Any consistent units.
 
-    **Raises:** as `ConvexDissipation`; `ValueError` where `width` is below 2.
+    **Raises:** as `ConvexDissipation`; `ValueError` if `width` is below 2.
 
     **Source:** Runje & Shankaranarayana, Constrained Monotonic Neural Networks, ICML 2023 (increasing networks need bounded units
     beside convex ones); Armstrong-Hélouvry, Dupont & Canudas de Wit, Automatica 30 (1994) 1083-1138 (Stribeck's curve).

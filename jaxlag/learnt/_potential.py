@@ -26,7 +26,7 @@ class Potential(eqx.Module):
 
     **Returns:** `net(q)` is a scalar. Any consistent units.
 
-    **Raises:** `ValueError` where `scale`, `energy`, `width` or `depth` is not positive, or where `q` differs in size from `scale`.
+    **Raises:** `ValueError` if `scale`, `energy`, `width` or `depth` is not positive, or if `q` differs in size from `scale`.
 
     **Source:** Hornik, Stinchcombe & White, Neural Networks 3 (1990) 551-560 (a network and its derivative approximate together).
     Networks that learn all of L or H: Cranmer et al., Lagrangian Neural Networks (2020);
@@ -78,7 +78,7 @@ class ConvexPotential(eqx.Module):
 
     **Returns:** `net(q)` is a scalar. Any consistent units.
 
-    **Raises:** `ValueError` where `scale`, `energy`, `width` or `depth` is not positive, or where `rest` or `q` differs in size from
+    **Raises:** `ValueError` if `scale`, `energy`, `width` or `depth` is not positive, or if `rest` or `q` differs in size from
     `scale`.
 
     **Source:** as `ConvexDissipation`.

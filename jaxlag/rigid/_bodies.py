@@ -21,12 +21,12 @@ def angular_velocity(rotation: Callable, axes: str = "body") -> Callable:
     $$ [\omega]_\times = R^T \dot R \text{ in the axes of the body}, \qquad \dot R R^T \text{ in those of space}, \qquad
        \dot R = \frac{\partial R}{\partial q}\,\dot q $$
 
-    **Arguments:** `rotation`: R(q), which turns components in the axes of the body into those in space; q is any pytree. `axes`: "body"
-    or "world", those in which ω is given. R must not depend on the time but through q: a driven angle is a coordinate with a constraint.
+    **Arguments:** `rotation`: R(q), which turns components in the axes of the body into those in space; q is any pytree. `axes`: "body" or
+    "world", those in which ω is given. R may depend on time only through q: a driven angle is a coordinate with a constraint.
 
     **Returns:** a function of (q, qdot), whose value is ω, of shape (3,).
 
-    **Raises:** `ValueError` where `axes` is neither, or R is no rotation (as far as its numbers are known).
+    **Raises:** `ValueError` if `axes` is neither, or R is no rotation (as far as its numbers are known).
 
     **Source:** Murray, Li & Sastry, A Mathematical Introduction to Robotic Manipulation, eqs. 2.48 and 2.49.
 
@@ -57,15 +57,15 @@ def kinetic_energy(m: Any, Theta: Any, position: Callable, rotation: Callable | 
     - `Theta`: Θ, its inertia about the centre of mass in the axes of the body, (3, 3), or (3,) about principal axes; `rigid.inertia` has
       those of many bodies.
     - `position`: x(q), the centre of mass, (3,).
-    - `rotation`: R(q), which turns components in the axes of the body into those in space. Without it, `position` gives both, as a
-      `Frame` at the centre of mass; or a dict or a sequence of them, of several bodies of which one carries another: then `m` and
-      `Theta` are dicts or sequences as well.
+    - `rotation`: R(q), which turns components in the axes of the body into those in space. Without it, `position` returns both, as a
+      `Frame` at the centre of mass; or a dict or a sequence of frames, for several bodies that carry one another: `m` and `Theta` are then
+      dicts or sequences as well.
 
-    **Returns:** a function of (q, qdot), to be added to a Lagrangian. Any consistent units. Where two of three moments are one and the same
-    number, as of a wheel, how far it has turned about the third axis drops out of T, if R ends with that rotation: `[A, A, C]` and
-    `… @ rigid.rotation_z(spin)`.
+    **Returns:** a function of (q, qdot), to be added to a Lagrangian. Any consistent units. If two of the three moments are one and the
+    same number, as for a wheel, the angle about the third axis drops out of T, provided that R ends with that rotation: `[A, A, C]` and `…
+    @ rigid.rotation_z(spin)`.
 
-    **Raises:** `ValueError` where the inertia is that of no body, R is no rotation (as far as their numbers are known), or masses,
+    **Raises:** `ValueError` if the inertia is that of no body, R is no rotation (as far as their numbers are known), or masses,
     inertias and frames are not those of the same bodies.
 
     **Source:** Goldstein, Classical Mechanics, 3rd ed., eqs. 5.1 and 5.19 (König's theorem).

@@ -8,7 +8,7 @@ from ._vectors import check_rotation, one, vector
 
 
 class Frame(NamedTuple):
-    """A place and three axes: of a body as it moves, of a joint on a body, of a plane.
+    """An origin and three axes: of a moving body, of a joint on a body, of a plane.
 
     - `origin`: in space, (3,).
     - `axes`: x, y and z as the columns of a rotation matrix, (3, 3).
@@ -18,7 +18,7 @@ class Frame(NamedTuple):
     axes: Float[Array, "3 3"]
 
     def point(self, r: Any) -> Float[Array, "3"]:
-        """The place in space of a point with the components `r` in these axes."""
+        """The position in space of a point with the components `r` in these axes."""
         return self.origin + self.axes @ vector(r, "r")
 
     def direction(self, d: Any) -> Float[Array, "3"]:
@@ -35,11 +35,11 @@ class Frame(NamedTuple):
 def frame(origin: Any = (0.0, 0.0, 0.0), axes: Any = None) -> Frame:
     """A frame, by default that of space.
 
-    **Arguments:** `origin`: its place, (3,); `axes`: a rotation matrix, whose columns are its axes, (3, 3); by default those of space.
+    **Arguments:** `origin`: its position, (3,); `axes`: a rotation matrix, whose columns are its axes, (3, 3); by default those of space.
 
     **Returns:** a `Frame`, with `point(r)`, `direction(d)` and `on(origin, axes)`, a frame that is fixed to it.
 
-    **Raises:** `ValueError` where `origin` is no vector or `axes` no rotation, as far as their numbers are known.
+    **Raises:** `ValueError` if `origin` is no vector or `axes` no rotation, as far as their numbers are known.
 
     ```python
     from jaxlag import rigid

@@ -13,13 +13,13 @@ from ._vectors import vector
 
 
 def on_plane(point: Any, plane: Frame) -> Float[Array, ""]:
-    r"""The height of a point over a plane, the x and y axes of a frame: zero where it lies in it, a gap where it must not be below.
+    r"""The height of a point above the plane of a frame's x and y axes: zero if it lies in the plane, a gap if it must stay above.
 
     $$ h = (x - x_0)\cdot n $$
 
     **Arguments:** `point`: in space, (3,); `plane`: a `Frame`, whose z axis is the normal. **Returns:** a number.
 
-    **Raises:** `ValueError` where `point` is not three numbers.
+    **Raises:** `ValueError` if `point` is not three numbers.
 
     ```python
     from jaxlag import rigid
@@ -36,7 +36,7 @@ def length(*points: Any) -> Float[Array, ""]:
 
     **Arguments:** `points`: two or more, each (3,). **Returns:** a number: `length(a, b) − l` as a constraint, `l − length(a, b)` as a gap.
 
-    **Raises:** `ValueError` where there are fewer than two points.
+    **Raises:** `ValueError` if there are fewer than two points.
 
     ```python
     from jaxlag import rigid
@@ -50,12 +50,12 @@ def length(*points: Any) -> Float[Array, ""]:
 
 
 def wheel_height(wheel: Frame, radius: Any, plane: Frame | None = None) -> Float[Array, ""]:
-    r"""The height of the lowest point of a thin wheel over a plane: zero where it stands on it.
+    r"""The height of the lowest point of a thin wheel above a plane: zero if the wheel stands on it.
 
     $$ g = h - r\sqrt{1 - (n\cdot e)^2} $$
 
     **Arguments:** `wheel`: a `Frame` at its centre, whose z axis e is its axle; `radius`: r; `plane`: a `Frame`, whose z axis is the normal
-    n; by default the plane z = 0. **Returns:** a number. It has no derivative where the wheel lies flat.
+    n; by default the plane z = 0. **Returns:** a number. It has no derivative when the wheel lies flat.
 
     **Raises:** nothing.
 
@@ -71,15 +71,15 @@ def wheel_height(wheel: Frame, radius: Any, plane: Frame | None = None) -> Float
 
 
 def rolling(wheel: Callable, radius: Any, plane: Frame | None = None) -> Callable:
-    r"""The velocity of the point of a thin wheel that touches a plane, in two directions of the plane: zero where it rolls without slip.
+    r"""The velocity of the point of a thin wheel that touches a plane, in two directions of the plane: zero if it rolls without slipping.
 
     $$ a = \dot x + \omega\times\rho, \qquad \rho = -r\,\frac{n - (n\cdot e)\,e}{\sqrt{1 - (n\cdot e)^2}} $$
 
     **Arguments:** `wheel`: a function of q, whose value is the `Frame` of the wheel, which turns with it, its z axis the axle; `radius` and
     `plane`: as for `wheel_height`.
 
-    **Returns:** a function of (q, qdot), whose value has to be zero, (2,): for `System(nonholonomic=...)`, beside `wheel_height` as a
-    holonomic constraint. A ball rolls likewise where `radius` is that and ρ = −r n: `rolling_ball`.
+    **Returns:** a function of (q, qdot), whose value has to be zero, (2,): for `System(nonholonomic=...)`, together with `wheel_height` as
+    a holonomic constraint. For a ball, take `rolling_ball`.
 
     **Raises:** nothing.
 
@@ -97,14 +97,14 @@ def rolling(wheel: Callable, radius: Any, plane: Frame | None = None) -> Callabl
 
 
 def rolling_ball(ball: Callable, radius: Any, plane: Frame | None = None) -> Callable:
-    r"""The velocity of the point of a ball that touches a plane, in two directions of the plane: zero where it rolls without slip.
+    r"""The velocity of the point of a ball that touches a plane, in two directions of the plane: zero if it rolls without slipping.
 
     $$ a = \dot x + \omega\times\rho, \qquad \rho = -r\,n $$
 
     **Arguments:** as for `rolling`; `ball`: a function of q, whose value is the `Frame` at its centre that turns with it.
 
-    **Returns:** a function of (q, qdot), whose value has to be zero, (2,); the height, `on_plane(centre, plane) − radius`, is a constraint
-    beside it. **Raises:** nothing. **Source:** Neimark & Fufaev, Dynamics of Nonholonomic Systems, section I.4.
+    **Returns:** a function of (q, qdot), whose value has to be zero, (2,); the height, `on_plane(centre, plane) − radius`, is a second
+    constraint. **Raises:** nothing. **Source:** Neimark & Fufaev, Dynamics of Nonholonomic Systems, section I.4.
 
     ```python
     from jaxlag import rigid

@@ -11,7 +11,7 @@ from ._frames import Frame
 
 
 def spherical(a: Frame, b: Frame) -> Float[Array, "3"]:
-    r"""A ball joint: both origins at one place. Three conditions.
+    r"""A ball joint: the origins coincide. Three conditions.
 
     $$ x_a - x_b = 0 $$
 
@@ -83,7 +83,8 @@ def cylindrical(a: Frame, b: Frame) -> Float[Array, "4"]:
 
 
 def universal(a: Frame, b: Frame) -> Float[Array, "4"]:
-    r"""A universal joint (Cardan's, Hooke's): one place, and the x axis of a, an arm of its cross, at a right angle to the y axis of b.
+    r"""A universal joint (Cardan's, Hooke's): the origins coincide, and the x axis of a, an arm of its cross, is orthogonal to the y axis
+    of b.
 
     $$ x_a - x_b = 0, \qquad x_a\cdot y_b = 0 \text{ (of the axes)} $$
 
@@ -118,12 +119,12 @@ def fixed(a: Frame, b: Frame) -> Float[Array, "6"]:
 
 
 def same_axes(a: Frame, b: Frame) -> Float[Array, "3"]:
-    r"""Zero where the axes of both frames agree: three conditions, the sine of the angle by which a is turned times its axis, in b.
+    r"""Zero if the axes of both frames agree: three conditions, the axis about which a is turned times the sine of the angle, in b.
 
     $$ \tfrac12 (T - T^T)^\vee = e \sin\alpha = 0, \qquad T = R_b^T R_a $$
 
     **Arguments:** `a`, `b`: frames on the two bodies. **Returns:** what has to be zero, (3,); its multipliers are the moment on `a` about
-    the axes of b. At angles of π it is zero as well: start near the position meant.
+    the axes of b. At angles of π it is zero as well: start near the intended position.
 
     **Raises:** nothing.
 

@@ -14,12 +14,12 @@ def quaternion(q: Any) -> Float[Array, "3 3"]:
 
     $$ R = \frac{(w^2 - v\cdot v)\,1 + 2\,v v^T + 2 w\,[v]_\times}{w^2 + v\cdot v}, \qquad v = (x, y, z) $$
 
-    A rotation for every q ≠ 0: its length does not matter, and does not move. State the length as a constraint, `holonomic={"unit":
-    rigid.unit}`; a start of another length is put on it.
+    A rotation for every q ≠ 0: the length of q does not matter, and nothing changes it. State it as a constraint, `holonomic={"unit":
+    rigid.unit}`; a start of another length is projected onto it.
 
     **Arguments:** `q`: four numbers. **Returns:** a rotation matrix, (3, 3).
 
-    **Raises:** `ValueError` where `q` has another shape.
+    **Raises:** `ValueError` if `q` has another shape.
 
     **Source:** Shuster, A survey of attitude representations, J. Astronaut. Sci. 41 (1993) 439, with Hamilton's product.
 
@@ -45,11 +45,11 @@ def _of_quaternion(q):
 
 
 def to_quaternion(R: Any) -> Float[Array, "4"]:
-    """The quaternion (w, x, y, z) of length 1 with w ≥ 0 of a rotation: to start where angles say.
+    """The unit quaternion (w, x, y, z) of a rotation, with w ≥ 0: for a start that is given by angles.
 
-    **Arguments:** `R`: a rotation matrix, (3, 3). **Returns:** (4,). At angles of π either of two signs.
+    **Arguments:** `R`: a rotation matrix, (3, 3). **Returns:** (4,). At angles of π the sign is arbitrary.
 
-    **Raises:** `ValueError` where `R` is no rotation, as far as its numbers are known.
+    **Raises:** `ValueError` if `R` is no rotation, as far as its numbers are known.
 
     **Source:** Shepperd, Quaternion from rotation matrix, J. Guid. Control 1 (1978) 223.
 
@@ -69,13 +69,13 @@ def to_quaternion(R: Any) -> Float[Array, "4"]:
 
 
 def quaternion_rate(q: Any, omega: Any) -> Float[Array, "4"]:
-    r"""The rate of a quaternion of a body that turns: its q̇ at the start.
+    r"""The rate of a quaternion at a given angular velocity, for the q̇ of a start.
 
     $$ \dot q = \tfrac12\, q \circ (0, \omega) $$
 
     **Arguments:** `q`: (w, x, y, z); `omega`: the angular velocity in the axes of the body, (3,).
 
-    **Returns:** (4,), at a right angle to q. **Raises:** `ValueError` where `q` or `omega` has another shape.
+    **Returns:** (4,), orthogonal to q. **Raises:** `ValueError` if `q` or `omega` has another shape.
 
     **Source:** Shuster, A survey of attitude representations, J. Astronaut. Sci. 41 (1993) 439.
 

@@ -20,11 +20,11 @@ def rotation(axis: Any, angle: Any) -> Float[Array, "3 3"]:
 
     $$ R = 1 + \sin\alpha\,[a]_\times + (1 - \cos\alpha)\,[a]_\times^2 $$
 
-    **Arguments:** `axis`: a, a vector of shape (3,), which is divided by its length; `angle`: α in rad, counted by the right-hand rule.
+    **Arguments:** `axis`: a, a vector of shape (3,), which is normalised; `angle`: α in rad, counted by the right-hand rule.
 
     **Returns:** a rotation matrix, (3, 3).
 
-    **Raises:** `ValueError` where `axis` is no vector of three numbers, or is zero.
+    **Raises:** `ValueError` if `axis` is no vector of three numbers, or is zero.
 
     **Source:** Goldstein, Classical Mechanics, 3rd ed., eq. 4.62 (the active rotation).
 
@@ -126,7 +126,7 @@ def _along(x: Float[Array, ""], axis: int) -> Float[Array, "3"]:
 
 @dataclasses.dataclass(frozen=True)
 class Euler:
-    """Three rotations one after another, each about an axis that the ones before have turned; made by `euler`.
+    """Three successive rotations, each about an axis that the previous ones have turned; made by `euler`.
 
     - `sequence`: the axes, such as "zxz".
     """
@@ -140,7 +140,7 @@ class Euler:
         return first @ second @ third
 
     def margin(self, angles: Any) -> Float[Array, ""]:
-        """How far the `angles` are from their singularity, where the first and the third turn about the same axis: 1 at best, 0 there.
+        """How far the `angles` are from their singularity, where the first and third axes coincide: 1 at best, 0 at the singularity.
 
         |sin β| where first and third axis have the same name, |cos β| otherwise; rates of the angles grow by its inverse.
         """
@@ -149,7 +149,7 @@ class Euler:
 
 
 def euler(sequence: str) -> Euler:
-    r"""Rotations about three axes one after another, each of which the rotations before have turned.
+    r"""Three successive rotations, each about an axis that the previous ones have turned.
 
     $$ R = R_a(\alpha)\, R_b(\beta)\, R_c(\gamma) \text{ for the sequence } abc $$
 
@@ -158,10 +158,10 @@ def euler(sequence: str) -> Euler:
     **Arguments:** `sequence`: three of the letters x, y, z, no two neighbours alike.
 
     **Returns:** a function of three angles in rad (an array, a sequence, or a dict of three in this order), whose value is a rotation
-    matrix; its method `margin(angles)` says how far they are from their singularity, from 1 to 0. There the mass matrix is singular and
-    steps become small: an event can end the motion before, or quaternions avoid it.
+    matrix; its method `margin(angles)` says how far they are from their singularity, from 1 to 0. At 0 the mass matrix is singular and
+    steps become small: let an event end the motion before, or use quaternions.
 
-    **Raises:** `ValueError` where the sequence is none, or repeats an axis.
+    **Raises:** `ValueError` if the sequence is none, or repeats an axis.
 
     **Source:** Goldstein, Classical Mechanics, 3rd ed., section 4.4 and appendix A.
 
@@ -188,7 +188,7 @@ def rotation_vector(r: Any) -> Float[Array, "3 3"]:
 
     **Arguments:** `r`: three numbers. **Returns:** a rotation matrix, (3, 3).
 
-    **Raises:** `ValueError` where `r` has another shape.
+    **Raises:** `ValueError` if `r` has another shape.
 
     **Source:** Murray, Li & Sastry, A Mathematical Introduction to Robotic Manipulation, eq. 2.14.
 

@@ -129,7 +129,7 @@ def steiner(Theta: Any, m: Any, r: Any) -> Float[Array, "3 3"]:
 
     **Arguments:** `Theta`: about the centre of mass, (3, 3) or (3,); `m`: the mass; `r`: from one point to the other, (3,).
 
-    **Returns:** a matrix, (3, 3), in the same axes. **Raises:** `ValueError` where Θ is that of no body, or r is no vector.
+    **Returns:** a matrix, (3, 3), in the same axes. **Raises:** `ValueError` if Θ is that of no body, or r is no vector.
 
     **Source:** Goldstein, Classical Mechanics, 3rd ed., section 5.3 (the parallel axis theorem).
 
@@ -149,7 +149,7 @@ def rotated(Theta: Any, R: Any) -> Float[Array, "3 3"]:
 
     **Returns:** a matrix, (3, 3). Those of parts about one point in the same axes add up.
 
-    **Raises:** `ValueError` where Θ is that of no body.
+    **Raises:** `ValueError` if Θ is that of no body.
 
     ```python
     import jax.numpy as jnp
@@ -174,7 +174,7 @@ def principal_axes(Theta: Any) -> Principal:
 
     **Returns:** `Principal(moments, axes)`. Derivatives of the axes exist where no two moments are equal.
 
-    **Raises:** `ValueError` where Θ is that of no body. **Source:** Goldstein, Classical Mechanics, 3rd ed., section 5.4.
+    **Raises:** `ValueError` if Θ is that of no body. **Source:** Goldstein, Classical Mechanics, 3rd ed., section 5.4.
 
     ```python
     from jaxlag import rigid
@@ -204,7 +204,7 @@ def physical(x: Any) -> Body:
 
     **Arguments:** `x`: (α, d₁, d₂, d₃, s₁₂, s₂₃, s₁₃, t₁, t₂, t₃), as `log_cholesky` makes them.
 
-    **Returns:** `Body(m, c, Theta)`. **Raises:** `ValueError` where `x` is not ten numbers.
+    **Returns:** `Body(m, c, Theta)`. **Raises:** `ValueError` if `x` is not ten numbers.
 
     **Source:** Rucker & Wensing, Smooth parameterization of rigid-body inertia, IEEE Robot. Autom. Lett. 7 (2022) 2771, eq. 9.
 
@@ -227,7 +227,7 @@ def log_cholesky(m: Any, c: Any, Theta: Any) -> Float[Array, "10"]:
 
     **Arguments:** `m`: its mass; `c`: its centre of mass, (3,); `Theta`: its inertia about it, (3, 3) or (3,).
 
-    **Returns:** (10,). **Raises:** `ValueError` where no body has this inertia, or only one without thickness.
+    **Returns:** (10,). **Raises:** `ValueError` if no body has this inertia, or only one without thickness.
 
     **Source:** Rucker & Wensing, Smooth parameterization of rigid-body inertia, IEEE Robot. Autom. Lett. 7 (2022) 2771, eq. 9.
 
@@ -251,7 +251,7 @@ def log_cholesky(m: Any, c: Any, Theta: Any) -> Float[Array, "10"]:
 def matrix(Theta: Any) -> Float[Array, "3 3"]:
     """An inertia as a matrix, (3, 3), from that or from its principal moments, (3,).
 
-    **Arguments:** `Theta`: (3, 3) or (3,). **Returns:** (3, 3). **Raises:** `ValueError` where no body has it, as far as its numbers are
+    **Arguments:** `Theta`: (3, 3) or (3,). **Returns:** (3, 3). **Raises:** `ValueError` if no body has it, as far as its numbers are
     known.
 
     ```python

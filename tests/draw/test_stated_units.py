@@ -85,3 +85,33 @@ def test_units_change_no_number_and_go_with_the_system(motion):
 def test_units_are_text_by_name(units):
     with pytest.raises(TypeError, match="`units` must be a mapping from names to units as text"):
         jl.System(lagrangian, units=units)
+
+
+def test_modes_and_responses_have_the_units_of_the_system():
+    """Milliseconds: natural frequencies are in 1/ms, not in Hz."""
+    slow = jl.System(
+        lambda q, qdot, m, c: 0.5 * m * qdot**2 - 0.5 * c * q**2,
+        dissipation=lambda qdot, b: 0.5 * b * qdot**2,
+        units={"t": "ms", "b": "g/ms"},
+    )
+    params = {"m": 1.0, "c": 4.0, "b": 0.1}
+    near = jl.linearise(slow, 0.0, params=params, inputs=["q"])
+    assert all(text in repr(near.modes()) for text in ("ω₀ (rad/ms)", "f (1/ms)", "1/|Re λ| (ms)"))
+    magnitude, phase = plot.bode(near, [1.0, 2.0])
+    assert (magnitude.get_ylabel(), phase.get_xlabel()) == ("|G|", "ω (rad/ms)")
+    points = {"p": lambda q: (q, 0.0)}
+    assert plot.mode_shapes(near.modes(), points, [((0.0, 0.0), "p")])[0].get_title().startswith("f₀ = 0.3183 1/ms")
+    locus = jl.root_locus(slow, lambda: 0.0, params=params, over="b", values=[-0.1, 0.1])
+    assert "2 rad/ms" in repr(locus)
+    growth, frequency = locus.plot()
+    assert (growth.get_ylabel(), frequency.get_ylabel(), frequency.get_xlabel()) == ("Re λ (1/ms)", "Im λ (1/ms)", "b (g/ms)")
+    growth, _ = locus.plot(units={"eigenvalues": "kHz"})
+    assert growth.get_ylabel() == "Re λ (kHz)"
+    ax = jl.stability_map(slow, lambda: 0.0, params=params, over={"b": [-1.0, 1.0], "c": [1.0, 2.0]}).plot()
+    assert (ax.get_xlabel(), ax.get_ylabel()) == ("b (g/ms)", "c")
+
+
+def test_without_units_modes_are_in_seconds():
+    plain = jl.System(lambda q, qdot: 0.5 * qdot**2 - 2.0 * q**2)
+    assert "ω₀ (rad/s)" in repr(jl.linearise(plain, 0.0).modes())
+    assert plot.bode(jl.linearise(plain, 0.0, inputs=["q"]), [1.0, 3.0])[1].get_xlabel() == "ω"

@@ -51,6 +51,29 @@ def test_restitution_from_the_sound_of_a_ball():
 
 
 @pytest.mark.slow
+def test_nothing_but_clicks():
+    """Restitution and height of a ball in a plane, by Gauss and Newton's method on the closed form; the place of the throw is known."""
+    heard = clicks(0.83, 0.62) + 1e-3 * np.random.default_rng(0).standard_normal(7)
+    thrown = jl.System(
+        lambda q, qdot: 0.5 * (qdot["x"] ** 2 + qdot["y"] ** 2) - G * q["y"],
+        unilateral={"floor": jl.Contact(lambda q: q["y"], restitution=lambda e: e)},
+        events={"click": jl.Event("floor")},
+    )
+    start = {"x": 0.0, "y": 0.65}, {"x": 1.0, "y": 0.0}
+    record = jl.Experiment(TS, None, *start, events={"click": heard}, unknown=("q0.y",), sigma={"click": 1e-3})
+    found = jl.fit(thrown, record, {"e": 0.82}, free=("e",))
+    x = jnp.array([0.82, 0.65])
+    for _ in range(20):
+        J = jax.jacfwd(lambda x: clicks(*x))(x)
+        x = x + jnp.linalg.lstsq(J, heard - clicks(*x))[0]
+    errors = 1e-3 * jnp.sqrt(jnp.diag(jnp.linalg.inv(J.T @ J)))
+    np.testing.assert_allclose([found.params["e"], found.unknowns[0]["q0"]["y"]], x, rtol=1e-7)
+    np.testing.assert_allclose([found.standard_errors["e"], found.unknown_errors[0]["q0"]["y"]], errors, rtol=1e-4)
+    assert "q0.y" in repr(found) and "q0.x" not in repr(found)
+    assert [row["name"] for row in found.to_dict()["parameters"]] == ["e", "experiment 0: q0.y"]
+
+
+@pytest.mark.slow
 def test_clear_errors():
     experiment, _ = recording(sigma=1e-3)
     with pytest.raises(ValueError, match="must name events of the system, but holds 'click'"):

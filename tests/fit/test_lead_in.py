@@ -28,7 +28,7 @@ def test_one_call_leads_in_from_far_away():
     for name, truth in (("c", 4.0), ("b", 0.02)):
         assert abs(found.estimates[name] - truth) < 4 * found.standard_errors[name]
     assert found.converged and found.steps < 8 and found.led_in == ("regress", f"whole motion: {found.steps} steps")
-    assert f"  led in by regress, then whole motion: {found.steps} steps" in repr(found)
+    assert f"  start found by regress, then whole motion: {found.steps} steps" in repr(found)
     assert found.to_dict()["led_in"] == list(found.led_in)
 
 

@@ -211,3 +211,22 @@ def test_the_work_of_a_drive_that_gives_the_only_coordinate(L, T, t0, a, b):
     by_hand = [np.stack([2 * a * (b * path - swing), a**2 * path], 1), np.stack([-2 * a * b * path, -(a**2) * path], 1)]
     for derivative in (jax.jacfwd, jax.jacrev):
         np.testing.assert_allclose(derivative(lambda x: run(x)[0])(x), by_hand, atol=2e-6)
+
+
+def test_works_of_a_net_that_hooks_hold():
+    """What a constraint holds does no work: with works along the motion takes no more steps (20 times as many where the hooks set them)."""
+    flat = np.stack(np.meshgrid(*2 * [0.1 * np.arange(20)], [0.0], indexing="ij"), axis=-1)[:, :, 0]
+    stretched = lambda q: [jnp.linalg.norm(jnp.diff(q, axis=side), axis=-1) - 0.1 for side in (0, 1)]
+
+    def lagrangian(q, qdot):
+        return 0.0125 * jnp.sum(qdot**2) - 0.025 * 9.81 * jnp.sum(q[..., 2]) - 1000.0 * sum(jnp.sum(s**2) for s in stretched(q))
+
+    def damping(q, qdot):
+        return sum(0.5 * jnp.sum(rate**2) for rate in jax.jvp(stretched, (q,), (qdot,))[1]) + 0.015 * jnp.sum(qdot**2)
+
+    hooks = {"left": lambda q: q[0, 0] - flat[0, 0], "right": lambda q: q[-1, 0] - flat[-1, 0]}
+    net = jl.System(lagrangian, dissipation=damping, holonomic=hooks)
+    run = lambda works: jl.simulate(net, flat, np.zeros_like(flat), np.linspace(0.0, 0.6, 7), works=works, throw=False, max_steps=3000)
+    plain, audited = run(False), run(True)
+    assert audited.succeeded and audited.stats["num_steps"] <= 1.1 * plain.stats["num_steps"]
+    np.testing.assert_allclose(audited.balance(), 0, atol=1e-7)

@@ -322,8 +322,12 @@ NOTEBOOK_SYSTEMS = {  # by notebook and name: its coordinates
     "17_gyroscope.racket": {"p": np.zeros(4)},
     "17_gyroscope.wheel": {"x", "y", "z", "psi", "theta", "phi"},
 }
-RECORDED = {"11_driven_pendulum.pendulum"}  # driven by a recorded `Signal`, which has no formula
-WITH_CONTACTS = {f"15_bouncing_rocking_pecking.{name}" for name in ("ball", "block", "woodpecker")}  # `test_contact_equations`
+RECORDED = {"11_driven_pendulum.pendulum", "19_gear_friction.winch"}  # driven by a `Signal`, which has no formula
+IN_CELLS_THAT_SIMULATE = {"19_gear_friction.driven"}  # `test_gears`
+WITH_CONTACTS = {  # `test_contact_equations`
+    *(f"15_bouncing_rocking_pecking.{name}" for name in ("ball", "block", "woodpecker")),
+    *(f"20_backlash.{name}" for name in ("drive", "servo")),
+}
 WITHOUT_INERTIA = {f"16_viscoelastic.{name}" for name in ("mount", "iwan")}  # `test_equations_without_inertia`
 OF_A_THOUSAND = {f"18_whip_and_net.{name}" for name in ("rope", "net")}  # whose equations nobody would read
 FROM_EXAMPLES = {"13_bicycle"}  # defines no system of its own
@@ -366,7 +370,7 @@ def test_every_system_of_a_notebook_is_in_the_table():
         for source in code_of(notebook)
         for name in re.findall(r"(\w+) = jl\.System\(", source)
     }
-    table = set(NOTEBOOK_SYSTEMS) | RECORDED | WITH_CONTACTS | WITHOUT_INERTIA | OF_A_THOUSAND
+    table = set(NOTEBOOK_SYSTEMS) | RECORDED | IN_CELLS_THAT_SIMULATE | WITH_CONTACTS | WITHOUT_INERTIA | OF_A_THOUSAND
     assert there <= table and {name.split(".")[0] for name in table} | FROM_EXAMPLES == set(notebooks)
 
 

@@ -551,7 +551,7 @@ WRONG = {
         {"x", "y"},
         "m",
         {},
-        "has states beside q that act on it. Write them as parameters; `linearise` does it with numbers.",
+        "has further states that act on it. Write them as parameters; `linearise` does it with numbers.",
     ),
     "friction of a reaction": (
         jl.System(
