@@ -1,4 +1,4 @@
-"""Runs the programs of the pages and writes what they print, and their pictures, into them.
+"""Runs the programs of the pages and writes their output and pictures into the pages.
 
 python docs/fill.py docs/pages/howto/friction.md …
 """
@@ -15,7 +15,7 @@ BLOCK = re.compile(r"```python\n(.*?)```\n\n```text\n(.*?)```", re.S)
 
 
 def outputs(text: str) -> list[tuple[str, str]]:
-    """What is stated behind each program of a page, and what it prints; pictures go to the current folder."""
+    """The output stated after each program of a page, and the output it prints; pictures go to the current folder."""
     import matplotlib
 
     matplotlib.use("Agg")
@@ -31,7 +31,7 @@ def outputs(text: str) -> list[tuple[str, str]]:
 
 
 def main() -> None:
-    """Each page in its own folder."""
+    """Fills each page, in its own folder."""
     for page in map(Path, sys.argv[1:]):
         page, text = page.resolve(), page.read_text()
         os.chdir(page.parent)

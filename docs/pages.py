@@ -9,7 +9,7 @@ from pathlib import Path
 
 HERE = Path(__file__).parent
 ROOT, PAGES = HERE.parent, HERE / "pages"
-TEXTS = {  # of the repository, and the pages they become
+TEXTS = {  # files of the repository, and the pages they become
     "README.md": "index.md",
     "CONTRIBUTING.md": "contributing.md",
     "CHANGELOG.md": "changelog.md",
@@ -32,21 +32,22 @@ REFERENCE = {  # names in `jaxlag`
     "At one state": "acceleration results.Acceleration mass_matrix momentum energy constraint_jacobian constraint_residual "
     "constraint_force powers results.Residual consistent_state examine results.Examination",
     "Motions": "simulate simulate_many results.Trajectory results.FrictionState results.ContactState results.EventState "
-    "results.RESULTS results.Instant results.Interpolated load Dop853 Dopri5 Projection Baumgarte NoStabilisation StickSlip Regularised "
+    "results.RESULTS results.Instant results.Interpolated load Dop853 Dopri5 stabilisation.Projection "
+    "stabilisation.Baumgarte stabilisation.NoStabilisation StickSlip Regularised "
     "keep_compiled",
     "Near a steady state": "equilibrium steady results.Equilibrium linearise results.LinearSystem results.Modes lowest_modes root_locus "
     "results.RootLocus results.Crossing periodic results.PeriodicOrbit stability_map results.StabilityMap",
     "Identification": "Experiment ModalTest FrequencyResponseTest fit fit_each results.Fit results.Channel results.Interval "
-    "results.Prediction regress results.Regression Regress validate results.Validation compare results.Comparison "
+    "results.Prediction regress results.Regression Regress MultiStart validate results.Validation compare results.Comparison "
     "information results.Information Huber learnt.ConvexDissipation learnt.PassiveDissipation learnt.Potential "
     "learnt.ConvexPotential",
     "On paper": "equations results.Equations results.LinearisedEquations to_sympy",
     "Pictures": "plot.motion plot.phase plot.forces plot.energy plot.balance plot.friction plot.bode plot.nyquist plot.root_locus "
     "plot.mode_shapes plot.stability_map plot.fit plot.parameters plot.convergence plot.equations plot.animate",
 }
-SHOWN = (".ipynb", ".png", ".gif", ".svg")  # of the folder of notebooks
+SHOWN = (".ipynb", ".png", ".gif", ".svg")  # files shown from the folder of notebooks
 WITHOUT_TOC = "---\nhide: [toc]\n---\n"
-LONGEST_TEASER = 240  # characters of a card of the gallery
+LONGEST_TEASER = 240  # characters on a card of the gallery
 LINK = re.compile(r"(?P<code>```.*?```|`[^`\n]+`)|\[(?P<label>(?:[^\[\]]|\[[^\[\]]*\])*)\]\((?P<target>[^)\s]+)\)", re.DOTALL)
 log = logging.getLogger("mkdocs.hooks.pages")
 
@@ -62,7 +63,7 @@ def on_config(config):
                 file.unlink()
     for page, content in pages.items():
         file, content = PAGES / page, content if isinstance(content, bytes) else content.encode()
-        if not file.exists() or file.read_bytes() != content:  # else `mkdocs serve` would begin again and again
+        if not file.exists() or file.read_bytes() != content:  # otherwise `mkdocs serve` would start again and again
             file.parent.mkdir(parents=True, exist_ok=True)
             file.write_bytes(content)
     tutorials = [{"Gallery": "tutorials.md"}, *sorted(page for page in pages if page.endswith(".ipynb"))]
@@ -73,10 +74,10 @@ def on_config(config):
 
 
 def on_page_markdown(markdown, page, **_):
-    """Links to files of the repository become links to their pages; what has no page is named without a link."""
+    """Turns links to files of the repository into links to their pages; a file without a page is named without a link."""
     if not page.file.src_uri.endswith(".md"):
         return markdown
-    if page.parent is None:  # beside which there is nothing to navigate
+    if page.parent is None:  # with nothing to navigate next to it
         page.meta["hide"] = ["navigation"]
     own = page.file.src_uri
     source = next((source for source, name in TEXTS.items() if name == own), f"docs/pages/{own}")
@@ -84,12 +85,12 @@ def on_page_markdown(markdown, page, **_):
 
 
 def on_page_content(html, page, files, **_):
-    """A notebook in the dress of the other pages: without styles and scripts of its own, with links to pages."""
+    """A notebook in the style of the other pages: without its own styles and scripts, with links to pages."""
     if not page.file.src_uri.endswith(".ipynb"):
         return html
     html = html[html.index('<div class="jupyter-wrapper">') :]
-    html = html[: html.rindex("<style>")]  # of JupyterLab, half a megabyte a page
-    html = re.sub(r'<link [^>]*rel="stylesheet"[^>]*>', "", html)  # icons of an animation, from elsewhere: assets/site.css has others
+    html = html[: html.rindex("<style>")]  # of JupyterLab, half a megabyte per page
+    html = re.sub(r'<link [^>]*rel="stylesheet"[^>]*>', "", html)  # external icons of an animation: assets/site.css has others
     html = re.sub(r'<div class="zeroclipboard-container">.*?</clipboard-copy>\s*</div>', "", html, flags=re.DOTALL)
     html = re.sub(r'<div class="clipboard-copy-txt".*?</div>', "", html, flags=re.DOTALL)
     code = re.compile(r'<div class="highlight-ipynb[^"]*"><pre>(.*?)</pre>', re.DOTALL)
@@ -113,13 +114,15 @@ def _relinked(link, folder, page_folder):
 
 def _page(file):
     """The page that a file of the repository becomes, or None."""
+    if file == "notebooks":
+        return "tutorials.md"
     if file.startswith("notebooks/") and file.endswith(SHOWN):
         return file
     return file.removeprefix("docs/pages/") if file.startswith("docs/pages/") else TEXTS.get(file)
 
 
 def _url(link, page, files):
-    """Where the page of a file stands to which a notebook links."""
+    """The URL of the page of a file that a notebook links to."""
     target = _page(posixpath.normpath(posixpath.join("notebooks", link)))
     file = files.get_file_from_path(target) if target else None
     if file is None:
@@ -155,7 +158,7 @@ def _gallery():
 
 
 def _teaser(text):
-    """The first sentences of the first paragraph, as many as a card holds, without one that ends amid a formula."""
+    """The first sentences of the first paragraph that fit on a card, without a sentence that ends in the middle of a formula."""
     paragraph = " ".join(text.strip().split("\n\n")[0].split())
     sentences = re.split(r"(?<=[.?!:]) (?=[A-Z])", paragraph)
     while len(sentences) > 1 and (len(" ".join(sentences)) > LONGEST_TEASER or sentences[-1][-1] not in ".?!:,"):

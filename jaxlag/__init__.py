@@ -10,6 +10,7 @@ from . import (
     plot as plot,
     results as results,
     rigid as rigid,
+    stabilisation as stabilisation,
 )
 from ._mechanics.acceleration import acceleration as acceleration, constraint_force as constraint_force
 from ._paper.equations import equations as equations
@@ -21,7 +22,7 @@ from ._fit.experiment import Experiment as Experiment
 from ._fit.frequency_response_test import FrequencyResponseTest as FrequencyResponseTest
 from ._fit.fit import fit as fit, fit_each as fit_each
 from ._fit.robust_loss import Huber as Huber
-from ._fit.lead_in import Regress as Regress
+from ._fit.lead_in import MultiStart as MultiStart, Regress as Regress
 from ._fit.modal_test import ModalTest as ModalTest
 from ._fit.regress import regress as regress
 from ._motion.simulate import simulate as simulate
@@ -37,7 +38,6 @@ from ._program.compilation_cache import keep_compiled as keep_compiled
 from ._model.contact import Contact as Contact, NewtonRestitution as NewtonRestitution, PoissonRestitution as PoissonRestitution
 from ._model.event import Event as Event, Every as Every
 from ._model.kinematics import rate as rate, substitute as substitute, virtual_work as virtual_work
-from ._mechanics.projection import Baumgarte as Baumgarte, NoStabilisation as NoStabilisation, Projection as Projection
 from ._mechanics.consistent_state import consistent_state as consistent_state
 from ._mechanics.lagrange import (
     constraint_jacobian as constraint_jacobian,

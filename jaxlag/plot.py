@@ -16,6 +16,7 @@ from ._draw.forces import forces, friction
 from ._draw.linear import bode, nyquist, root_locus
 from ._draw.mode_shapes import mode_shapes
 from ._draw.motion import balance, energy, motion, phase
+from ._draw.report import report
 from ._draw.stability_map import stability_map
 from ._fit.result import Fit
 from ._linear.modes import Modes
@@ -87,6 +88,7 @@ SHORT_WAYS: tuple[tuple[type, str, Any], ...] = (  # what is computed knows noth
     (Trajectory, "plot", motion),
     (Trajectory, "animate", animate),
     (Fit, "plot", fit),
+    (Fit, "report", report),
     (Modes, "plot", mode_shapes),
     (Modes, "animate", animate),
     (RootLocus, "plot", root_locus),

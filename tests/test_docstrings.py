@@ -129,7 +129,8 @@ def check_statement(node, comment, names):
 
 
 @pytest.mark.parametrize("name", WITH_EXAMPLES)
-def test_an_example_runs_and_gives_what_it_states(name, compilation_cache):
+def test_an_example_runs_and_gives_what_it_states(name, compilation_cache, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)  # some write files
     for code in re.findall(r"```python\n(.*?)```", inspect.getdoc((PUBLIC | METHODS)[name]), re.S):
         names: dict = {}
         for node, comment in statements(textwrap.dedent(code)):

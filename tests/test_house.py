@@ -65,6 +65,7 @@ WINGS = {  # each imports only from those above it, and each file of a wing only
         "pickling",
         "paths",
         "numbers",
+        "tables",
         "states",
         "contact",
         "event",
@@ -219,6 +220,7 @@ WINGS = {  # each imports only from those above it, and each file of a wing only
         "uncertainty",
         "parameter_stability",
         "remarks",
+        "doubt",
         "experiment_statistics",
         "linear_test_statistics",
         "statistics",
@@ -272,10 +274,11 @@ WINGS = {  # each imports only from those above it, and each file of a wing only
         "mode_shapes",
         "stability_map",
         "fit",
+        "report",
     ],
 }
 BESIDE = ["dissipation", "learnt", "rigid"]  # need nothing of the package
-ON_TOP = ["plot", "results", "direction", "interpolation", "__init__", "__main__"]  # import from any wing
+ON_TOP = ["plot", "results", "direction", "interpolation", "stabilisation", "__init__", "__main__"]  # import from any wing
 
 
 HOMES = [

@@ -1,6 +1,7 @@
 """README and the pages of the site: their programs run and print what the page says, what they link to exists, and claims have tests."""
 
 import ast
+import json
 import pathlib
 import re
 import sys
@@ -9,6 +10,7 @@ import pytest
 
 ROOT = pathlib.Path(__file__).parents[1]
 sys.path.append(str(ROOT / "docs"))
+import figures  # noqa: E402
 from fill import outputs  # noqa: E402
 
 PAGES = ROOT / "docs" / "pages"
@@ -37,6 +39,14 @@ def test_what_the_readme_links_to_exists_and_it_is_short():
     for link in re.findall(r"\]\(([^)h#][^)]*)\)", readme):
         assert (ROOT / link).exists(), link
     assert len(readme.encode()) < 7000
+
+
+@pytest.mark.fast
+def test_tables_of_times_are_those_that_the_benchmarks_wrote():
+    results, text = json.loads(figures.RESULTS.read_text()), figures.PAGE.read_text()
+    assert figures.filled(text, results) == text
+    assert text.count("<!-- figures:") == text.count("<!-- end -->") == len(figures.BLOCK.findall(text)) >= 6
+    assert "| jaxlag |" in text
 
 
 @pytest.mark.fast

@@ -18,7 +18,7 @@ from .mode_on_points import ModesOnPoints, as_many, draw_at_rest, titles, units_
 from .moving_picture import POINTS_PER_FRAME, MovingPicture
 
 MOST_FRAMES = 2000
-PERIOD = 2.0  # seconds in which a mode is shown
+PERIOD = 2.0  # seconds for which a mode is shown
 
 
 def animate(
@@ -186,7 +186,7 @@ def _track(motion: Trajectory, at: np.ndarray, name: str, point: Callable) -> np
     x = np.asarray(jax.jit(jax.vmap(position))(state.ts, state.q, state.qdot))
     if x.shape[1] != 2:
         raise ValueError(f"`points` {name!r} must return a position (x, y), but returned {x.shape[1]} numbers. Return two.")
-    known = np.all(np.isfinite(x), axis=1)  # not between two impacts within one interval of samples
+    known = np.all(np.isfinite(x), axis=1)  # unknown between two impacts within one sample interval
     within = lambda column: np.interp(fine, fine[known], column[known], np.nan, np.nan)
     return x if np.all(known) or not np.any(known) else np.stack([within(column) for column in x.T], axis=1)
 

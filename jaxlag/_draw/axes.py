@@ -1,4 +1,4 @@
-"""What all pictures share: axes, colours, labels. Matplotlib is imported when the first one is drawn."""
+"""Axes, colours and labels that all pictures share. Matplotlib is imported when the first one is drawn."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -19,7 +19,7 @@ Units = Mapping[str, str] | None
 
 
 def colour(i: int) -> str:
-    """The colours in turn."""
+    """Colour number i, in cyclic order."""
     return COLOURS[i % len(COLOURS)]
 
 
@@ -49,7 +49,7 @@ def chosen(names: Sequence[str] | None, known: Sequence[str], what: str) -> tupl
 
 
 def panels(axes: Any, shape: tuple[int, int], which: str, *, sharex: Any = True, **layout: Any) -> Any:
-    """The given axes, or those of a new figure, as an array of that shape."""
+    """The given axes, or axes of a new figure, as an array of this shape."""
     if axes is None:
         _, axes = pyplot().subplots(*shape, sharex=sharex, squeeze=False, layout="constrained", **layout)
     if np.size(axes) != np.prod(shape):
@@ -61,7 +61,7 @@ def panels(axes: Any, shape: tuple[int, int], which: str, *, sharex: Any = True,
 
 
 def canvas(ax: Any, **layout: Any) -> Any:
-    """The given axes, or those of a new figure."""
+    """The given axes, or axes of a new figure."""
     return pyplot().subplots(layout="constrained", **layout)[1] if ax is None else ax
 
 
@@ -75,7 +75,7 @@ def pyplot() -> Any:
 
 
 def curve(ax: Any, x: Any, y: Any, **style: Any) -> None:
-    """A line; where it coincides with earlier lines it is dashed, so that these show through."""
+    """Draws a line, dashed if it coincides with earlier lines, so that these show through."""
     x, y = np.asarray(x), np.asarray(y)
     before = [np.asarray(line.get_ydata()) for line in ax.lines if np.array_equal(line.get_xdata(), x)]
     height = max((float(np.ptp(z[np.isfinite(z)])) for z in (y, *before) if np.isfinite(z).any()), default=0.0)
@@ -99,12 +99,12 @@ def zero_line(ax: Any) -> None:
 
 
 def units_of(stated: tuple[tuple[str, str], ...], given: Units) -> dict[str, str]:
-    """The units that a system states, and those given in their place."""
+    """The units that a system states, overridden by the given ones."""
     return dict(stated) | dict(given or {})
 
 
 def label(name: str, units: Units, of: str | None = None) -> str:
-    """A name with its unit, or with that of another quantity."""
+    """A name with its unit, or with the unit of another quantity."""
     unit = (units or {}).get(of or name)
     return f"{name} ({unit})" if unit else name
 

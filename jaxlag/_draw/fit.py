@@ -13,7 +13,7 @@ from .._fit.rounding import plus_minus
 from .axes import GREY, Units, canvas, channels, chosen, colour, label, legend_above, legend_beside, panels, units_of
 
 MOST_PARAMETERS = 40  # in one picture
-MOST_WITH_NUMBERS = 8  # up to which correlations are written as numbers
+MOST_WITH_NUMBERS = 8  # most parameters for which correlations are written as numbers
 
 
 def fit(fit: Fit, *, number: int = 0, level: float = 0.95, units: Units = None, axes: Any = None) -> Any:
@@ -197,7 +197,7 @@ def convergence(fit: Fit, *, ax: Any = None) -> Any:
 
 
 def _in_words(value, error):
-    """The estimate with its error, in words where it has none."""
+    """The estimate with its error, or words if it has none."""
     if np.isfinite(error):
         return plus_minus(value, error)
     return "not determined" if np.isinf(error) else f"{value:.4g}"

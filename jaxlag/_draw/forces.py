@@ -1,4 +1,4 @@
-"""Pictures of the forces during one motion: those of constraints, and dry friction."""
+"""Pictures of the forces during one motion: constraint forces and dry friction."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -147,7 +147,7 @@ def friction(trajectory: Trajectory, names: Sequence[str] | None = None, *, unit
 
 
 def _contact(ax, trajectory, name, units):
-    """Shades the times at which a contact is closed and draws the impulses of its impacts; whether there are any."""
+    """Shades the times at which a contact is closed and draws the impulses of its impacts; returns whether there are any."""
     ts, contact = np.asarray(trajectory.ts), trajectory.contacts[name]
     closed = _intervals(ts, contact.closed)
     for i, interval in enumerate(closed):

@@ -116,7 +116,7 @@ def root_locus(locus: RootLocus, *, units: Units = None, axes: Any = None) -> An
     values, eigenvalues = np.asarray(locus.values), np.asarray(locus.eigenvalues)
     for i, branch in enumerate(branch for branch in eigenvalues.T if np.any(branch)):
         growth.plot(values, branch.real, color=colour(i))
-        frequency.plot(values, np.where(branch.imag > 0, branch.imag, np.nan), color=colour(i))  # of a pair the upper one
+        frequency.plot(values, np.where(branch.imag > 0, branch.imag, np.nan), color=colour(i))  # the upper one of a pair
     growth.axhline(0, color=GREY, linewidth=0.5)
     for crossing in locus.crossings:
         at = float(crossing.value)

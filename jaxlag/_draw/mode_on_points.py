@@ -1,4 +1,4 @@
-"""Modes of a linear system, by what they do to points of the mechanism."""
+"""Modes of a linear system as displacements of points of the mechanism."""
 
 import dataclasses
 from collections.abc import Callable, Mapping
@@ -14,14 +14,14 @@ from .._model.injection import call
 from .axes import Units, units_of
 
 FAINT = "#C8C8C8"
-SHARE = 0.1  # of the size of the mechanism: how far the point moves that moves most
+SHARE = 0.1  # of the size of the mechanism: displacement of the point that moves most
 
 
 @dataclasses.dataclass(frozen=True)
 class ModesOnPoints:
-    """Points at rest, (p, 2), and how far each moves in each mode, Re(d e^{iφ}): d complex, (k, p, 2); zero of a mode that moves none.
+    """Points at rest, (p, 2), and their displacements in each mode, Re(d e^{iφ}): d complex, (k, p, 2); zero for a mode that moves none.
 
-    To first order, and so the same in whatever coordinates the system is written.
+    Displacements are of first order, and so independent of the coordinates of the system.
     """
 
     names: tuple[str, ...]
@@ -30,7 +30,7 @@ class ModesOnPoints:
 
     @classmethod
     def of(cls, modes: Modes, points: Mapping[str, Callable], links: tuple, amplitude: Any) -> "ModesOnPoints":
-        """With an amplitude that can be seen, or the one given: how far the point moves that moves most."""
+        """The points with a visible amplitude, or the given one: the displacement of the point that moves most."""
         if modes.origin is None:
             raise ValueError(
                 "`modes` must be those near one state, which is known, but are those along a trajectory. Linearise at one of its states."
@@ -49,16 +49,16 @@ class ModesOnPoints:
         return self.rest + np.real(self.displacements[:, None] * np.exp(1j * phases)[..., None, None])
 
     def extreme_phases(self) -> np.ndarray:
-        """Where all points together are farthest from rest, of each mode."""
+        """The phase of each mode at which all points together are farthest from rest."""
         return -0.5 * np.angle(np.sum(self.displacements**2, axis=(1, 2)))
 
     def by_name(self, x: np.ndarray) -> dict[str, np.ndarray]:
-        """Positions of points, their last axis but one, by name."""
+        """Positions by name of the points, which are the last axis but one."""
         return {name: x[..., i, :] for i, name in enumerate(self.names)}
 
 
 def as_many(mode: Modes) -> Modes:
-    """One mode as the only one of many."""
+    """One mode as a batch of one."""
     many = jax.tree.map(lambda x: x[None], dataclasses.replace(mode, origin=None))
     return dataclasses.replace(many, origin=mode.origin)
 
@@ -73,12 +73,12 @@ def draw_at_rest(ax: Any, rest: Mapping[str, np.ndarray], links: tuple) -> None:
 
 
 def units_of_modes(modes: Modes, units: Units) -> dict[str, str]:
-    """Those that the system states, and those given in their place."""
+    """The units that the system states, overridden by the given ones."""
     return units_of(() if modes.origin is None else modes.origin.units, units)
 
 
 def titles(modes: Modes, units: Mapping[str, str]) -> list[str]:
-    """Frequency and damping of each mode, or how it grows."""
+    """Frequency and damping of each mode, or λ if it does not oscillate."""
     unit = units.get("t", "")
     per = f" 1/{unit}" if unit else ""
     lines = []
@@ -97,7 +97,7 @@ def _along(modes):
     """q̂ and λ q̂ of each mode, (k, 2n), in the order of `ravel_pytree`."""
     q = np.asarray(jax.vmap(lambda shape: ravel_pytree(shape)[0])(modes.shapes)).astype(complex)
     values = np.asarray(modes.eigenvalues)
-    return np.concatenate([q, np.where(np.isfinite(values), values, 0)[:, None] * q], axis=1)  # λ = −∞ of what is gone after one sample
+    return np.concatenate([q, np.where(np.isfinite(values), values, 0)[:, None] * q], axis=1)  # λ = −∞ for modes gone after one sample
 
 
 def _positions(points, origin, q, qdot):
@@ -112,7 +112,7 @@ def _positions(points, origin, q, qdot):
 
 
 def _slopes(origin, points):
-    """The points at rest, and their derivatives by q and q̇."""
+    """The points at rest, and their derivatives with respect to q and q̇."""
     q, unravel = ravel_pytree(origin.q)
     state = jnp.concatenate([q, ravel_pytree(origin.qdot)[0]])
     position = lambda state: _positions(points, origin, *map(unravel, jnp.split(state, 2)))
@@ -125,7 +125,7 @@ def _reach(d):
 
 
 def _size(rest, links):
-    """The diagonal of the mechanism; 1 of a single point."""
+    """The diagonal of the mechanism; 1 for a single point."""
     fixed = [np.asarray(end, float)[None] for link in links for end in link if not isinstance(end, str)]
     return np.linalg.norm(np.ptp(np.concatenate([rest, *fixed]), axis=0)) or 1.0
 

@@ -1,4 +1,4 @@
-"""Mode shapes on the mechanism, still."""
+"""Still pictures of mode shapes on the mechanism."""
 
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
@@ -11,7 +11,7 @@ from .axes import COLOURS, Units, label, panels
 from .mode_on_points import ModesOnPoints, as_many, draw_at_rest, titles, units_of_modes
 from .moving_picture import MARGIN
 
-CYCLE = 72  # phases of a path; half of it is the other extreme
+CYCLE = 72  # phases of a path; the other extreme is half a cycle later
 MOST_COLUMNS = 4
 
 
@@ -107,8 +107,8 @@ def _corners(visible: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _panels(axes: Any, count: int, size: np.ndarray) -> tuple[Any, int | None]:
-    """A panel for each mode, and in how many columns they stand, long mechanisms above each other, high ones next to each other; None of
-    panels that were given.
+    """A panel for each mode, and the number of columns, so that long mechanisms are stacked and tall ones stand side by side; None if
+    panels were given.
     """
     if axes is not None:
         return panels(axes, (count, 1), "one for each mode")[:, 0], None

@@ -24,7 +24,7 @@ from .axes import (
     zero_line,
 )
 
-THIN = 1e-3  # of the largest area, below which an area is invisible
+THIN = 1e-3  # of the largest area: a smaller one is invisible
 
 
 def motion(trajectory: Trajectory, names: Sequence[str] | None = None, *, units: Units = None, axes: Any = None) -> Any:
@@ -227,7 +227,7 @@ def balance(trajectory: Trajectory, *, units: Units = None, ax: Any = None) -> A
 
 
 def _shown_works(trajectory):
-    """The work of each term where it is visible relative to the largest change of energy."""
+    """The work of each term that is visible relative to the largest change of energy."""
     works = {name: np.asarray(work) for name, work in trajectory.work().items()}
     h, exchanged = map(np.asarray, energies(trajectory))
     sizes = {name: np.nanmax(np.abs(work)) for name, work in works.items()}

@@ -41,7 +41,7 @@ class MovingPicture:
         ax: Any,
         title: str | None = None,
     ) -> "MovingPicture":
-        """The picture laid out once, so that frames only move what is on it."""
+        """Lays out the picture once, so that frames only move its contents."""
         fixed = [np.asarray(end, float) for link in links for end in link if not isinstance(end, str)]
         arrows, largest, lower, upper = _scaled(tracks, fixed, forces)
         is_own, size = ax is None, upper - lower
@@ -90,7 +90,7 @@ class MovingPicture:
 
 
 def _scaled(tracks, fixed, forces):
-    """The forces as arrows in lengths of the picture, the largest force of each constraint, and the corners of the picture."""
+    """The forces as arrows in the picture's units of length, the largest force of each constraint, and the corners of the picture."""
     visible = np.concatenate([*tracks.values(), *(end[None] for end in fixed)])
     length = np.linalg.norm(np.ptp(visible, axis=0)) or 1.0
     largest = {name: max(np.max(np.linalg.norm(F, axis=1)) for F in on.values()) for name, on in forces.items()}

@@ -1,4 +1,4 @@
-"""Where over two parameters a steady state is stable."""
+"""Pictures of the stability of a steady state over two parameters."""
 
 from typing import Any
 

@@ -65,7 +65,7 @@ def information(
     system: System,
     experiments: Experiment | LinearTest | Sequence[Experiment | LinearTest],
     params: PyTree,
-    free: Sequence[str],
+    free: str | Sequence[str],
     **numerics: Any,
 ) -> Information:
     r"""The Fisher information of planned experiments, and the standard errors that a fit of them will have.
@@ -217,6 +217,7 @@ class Comparison:
     - `correlated`: the number of samples over which the residuals of the best model are correlated, 0 if they are white. Both criteria
       assume independent residuals, and otherwise overstate the evidence.
     - `unconverged`: names of the models whose fits have not converged, which may be better than they look.
+    - `priors`: by name of a model, the numbers on which its fit had priors; they are no part of the likelihood.
 
     ```python
     import jaxlag as jl
@@ -231,6 +232,7 @@ class Comparison:
     parameters: dict[str, int]
     correlated: int
     unconverged: tuple[str, ...] = ()
+    priors: Mapping[str, tuple[str, ...]] = dataclasses.field(default_factory=dict)
 
     def __repr__(self) -> str:
         width = max(map(len, self.names))
@@ -240,10 +242,13 @@ class Comparison:
         ]
         best, second = self.names[:2]
         strength = next(word for limit, word in EVIDENCE if self.bic[second] >= limit)
+        if {best, second} & set(self.unconverged):
+            strength = "none, until both fits have converged"
         evidence = [f"  evidence for {best!r} against {second!r}: {strength}"]
         if self.correlated:
             evidence.append(f"  ! overstated: residuals of {best!r} are correlated over {self.correlated} samples")
         evidence += [f"  ! the fit of {name!r} has not converged: the model may be better than it looks" for name in self.unconverged]
+        evidence += [f"  {name!r} had priors on {', '.join(numbers)}; only data count here" for name, numbers in self.priors.items()]
         return "\n".join(["Comparison: smaller is better", *rows, *evidence])
 
 
@@ -256,7 +261,7 @@ def compare(fits: Mapping[str, Fit]) -> Comparison:
 
     $$ \mathrm{AIC} = -2 \ln L + 2 p, \qquad \mathrm{BIC} = -2 \ln L + p \ln N $$
 
-    with the likelihood L, p unknowns and N measurements; all dimensionless.
+    with the likelihood L of the data alone, p unknowns and N measurements; all dimensionless.
 
     **Arguments:** `fits`: at least two, by name, of the same measurements. **Returns:** a `Comparison`.
 
@@ -284,7 +289,9 @@ def compare(fits: Mapping[str, Fit]) -> Comparison:
     least = {which: min(getattr(f, which) for f in fits.values()) for which in ("aic", "bic")}
     above = lambda which: {name: getattr(fits[name], which) - least[which] for name in names}
     counts, unconverged = {name: fits[name].unknown_count for name in names}, tuple(name for name in names if not fits[name].converged)
-    return Comparison(names, above("aic"), above("bic"), counts, fits[names[0]].correlated, unconverged)
+    known = lambda f: [n for n, s in zip(f.names, np.asarray(f.problem.free.prior_deviation), strict=True) if np.isfinite(s)]
+    priors = {name: tuple(known(fits[name])) for name in names if known(fits[name])}
+    return Comparison(names, above("aic"), above("bic"), counts, fits[names[0]].correlated, unconverged, priors)
 
 
 def _fingerprint(f):

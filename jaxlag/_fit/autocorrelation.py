@@ -1,4 +1,4 @@
-"""Autocorrelation of residuals: a test for it, its length in samples, and its effect on the covariance of the estimates."""
+"""Autocorrelation of residuals: a test for it, its length in samples, its effect on the covariance of the estimates; their spectrum."""
 
 import functools
 
@@ -6,6 +6,7 @@ import numpy as np
 
 LAGS = 20
 COLOURED = 0.01  # p-value below which residuals are taken as correlated
+FREQUENCIES = 500  # of a spectrum, at most
 NEGLIGIBLE = 0.1  # a smaller correlation is ignored
 COMMON_SAMPLES = 10  # that two channels need for an estimate of their correlation
 
@@ -125,3 +126,15 @@ def _correlations(shocks):
                 found[c, d] = found[d, c] = both[:, 0] @ both[:, 1] / np.sqrt(power)
     values, vectors = np.linalg.eigh(found)
     return vectors * np.maximum(values, 0) @ vectors.T
+
+
+def spectrum(ts: np.ndarray, r: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
+    """Frequencies, in one over the unit of time, and the periodogram of what was measured there; None for less than four samples."""
+    from scipy.signal import lombscargle  # imported here because that takes a while
+
+    there = np.isfinite(r)
+    ts, r = ts[there], r[there] - np.mean(r[there]) if there.any() else r[there]
+    if ts.size < 4 or not np.any(r):
+        return None
+    frequencies = np.linspace(0, (ts.size - 1) / (2 * (ts[-1] - ts[0])), min(ts.size // 2, FREQUENCIES) + 1)[1:]
+    return frequencies, lombscargle(ts - ts[0], r, 2 * np.pi * frequencies)

@@ -1,6 +1,5 @@
 """Experiments: recordings of a motion with noise and missing samples, and what is known about them."""
 
-import csv
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -14,6 +13,7 @@ from jaxtyping import Array, Float, PyTree
 from .._model.injection import check_function
 from .._model.numbers import number, numbers
 from .._model.paths import entry_names, is_within
+from .._model.tables import of_frame, of_text, scaled
 from .._model.validation import is_vector, parameters, sample_times, state
 from .._program.jit import is_concrete, numpy_for
 
@@ -119,38 +119,55 @@ class Experiment(eqx.Module):
 
     @classmethod
     def from_csv(
-        cls, file: str | Path, q0: PyTree, qdot0: PyTree, *, time: str, channels: Any = None, delimiter: str = ",", **more: Any
-    ) -> "Experiment":
+        cls,
+        file: str | Path | Sequence[str | Path],
+        q0: PyTree,
+        qdot0: PyTree,
+        *,
+        time: str | tuple[str, float],
+        columns: Any = None,
+        from_zero: bool = False,
+        delimiter: str | None = None,
+        decimal: str | None = None,
+        encoding: str = "utf-8-sig",
+        **more: Any,
+    ) -> Any:
         """An experiment from a text file with a table, whose first line names the columns; an empty cell is a missing sample.
 
         **Arguments:**
 
-        - `file`: its path; `delimiter`: between the cells.
-        - `time`: the name of the column of times.
-        - `channels`: names of the columns to use, or a mapping from channels to columns. Default: all others.
+        - `file`: its path, or a list of paths, of which a list of experiments is made.
+        - `time`: the column of times: its name, or (name, factor), `("time_ms", 1e-3)`. Dates, by ISO 8601 or with the day first, become
+          seconds from the first one.
+        - `columns`: those to use: names, or a mapping from channels to names or (name, factor): `{"x": ("laser_mm", 1e-3)}`. Default: all.
+        - `from_zero`: whether times count from the first sample, as those of a Unix clock should.
+        - `delimiter`: between the cells; by default a tab, a semicolon or a comma, whichever the first line holds. `decimal`: "." or ",";
+          by default both are read, unless commas separate the cells. `encoding`: of the text. A second line of units is skipped.
         - `q0`, `qdot0`, `**more`: as for `Experiment`.
 
-        **Returns:** an `Experiment` with `values` by channel, each of shape (T,).
+        **Returns:** an `Experiment` with `values` by channel, each of shape (T,); or a list of them.
 
         **Raises:** `ValueError` if a column does not exist or a cell is not a number.
         """
-        with open(file, newline="", encoding="utf-8-sig") as lines:
-            reader = csv.DictReader(lines, delimiter=delimiter, skipinitialspace=True)
-            rows = list(reader)
-        column = lambda name: np.array([_number(row[name], name, i + 2) for i, row in enumerate(rows)])
-        ts, values = _from_columns([name for name in reader.fieldnames or () if name], column, time, channels)
+        if not isinstance(file, (str, Path)):
+            how = {"time": time, "columns": columns, "from_zero": from_zero, "delimiter": delimiter, "decimal": decimal}
+            return [cls.from_csv(one, q0, qdot0, **how, encoding=encoding, **more) for one in file]
+        name = time if isinstance(time, str) else time[0]
+        ts, values = scaled(*of_text(file, name, delimiter, decimal, encoding), time, columns, from_zero)
         return cls(ts, values, q0, qdot0, **more)
 
     @classmethod
-    def from_dataframe(cls, frame: Any, q0: PyTree, qdot0: PyTree, *, time: str, channels: Any = None, **more: Any) -> "Experiment":
+    def from_dataframe(
+        cls, frame: Any, q0: PyTree, qdot0: PyTree, *, time: Any, columns: Any = None, from_zero: bool = False, **more: Any
+    ) -> "Experiment":
         """An experiment from a data frame.
 
         **Arguments:** `frame`: of pandas, polars, or any class with `columns` and `frame[name].to_numpy()`; `q0`, `qdot0`, `time`,
-        `channels` and `**more` as for `from_csv`.
+        `columns`, `from_zero` and `**more` as for `from_csv`.
 
         **Returns:** an `Experiment` with `values` by channel, each of shape (T,). **Raises:** `ValueError` if a column does not exist.
         """
-        ts, values = _from_columns(list(frame.columns), lambda name: np.asarray(frame[name].to_numpy()), time, channels)
+        ts, values = scaled(*of_frame(frame), time, columns, from_zero)
         return cls(ts, values, q0, qdot0, **more)
 
 
@@ -256,9 +273,12 @@ class Coordinates(eqx.Module):
         structure: Any = jax.tree.structure(values)
         if values is None or structure == jax.tree.structure(q0):
             return cls(None)
+        channel = next(iter(values), "x") if isinstance(values, Mapping) else "x"
+        entry = f"q[{next(iter(q0))!r}]" if isinstance(q0, Mapping) and q0 else "q"
+        example = f'lambda q: {{"{channel}": {entry}}}' if isinstance(values, Mapping) else f"lambda q: {entry}"
         raise ValueError(
             f"`observe` must say what the sensors see, but was left out, and `{label}` does not name coordinates of q. "
-            'Write e.g. `observe=lambda q: {"x": q["x"]}`.'
+            f"Write e.g. `observe={example}`."
         )
 
     def __call__(self, q):
@@ -272,25 +292,3 @@ def start_entries(experiment: Experiment) -> tuple[str, ...]:
         for which, tree in (("q0", experiment.q0), ("qdot0", experiment.qdot0))
         for name in entry_names(tree)
     )
-
-
-def _from_columns(columns, column, time, channels):
-    channels = [channels] if isinstance(channels, str) else channels
-    if channels is None:
-        channels = [name for name in columns if name != time]
-    chosen = dict(channels) if isinstance(channels, Mapping) else {name: name for name in channels}
-    for name in (time, *chosen.values()):
-        if name not in columns:
-            raise ValueError(f"the table must have a column {name!r}, but has {', '.join(map(repr, columns))}. Name it in the first line.")
-    return column(time), {channel: column(name) for channel, name in chosen.items()}
-
-
-def _number(text, column, line):
-    if text is None or text.strip() == "":
-        return np.nan
-    try:
-        return float(text)
-    except ValueError:
-        raise ValueError(
-            f"line {line}, column {column!r} must be a number, but is {text!r}. Leave the cell empty where it is missing."
-        ) from None

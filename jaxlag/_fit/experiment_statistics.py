@@ -13,7 +13,7 @@ from jaxtyping import PyTree
 from .._mechanics.surfaces import surfaces
 from .._model.paths import is_within
 from .._model.signal import is_signal
-from .experiment import Experiment, with_own
+from .experiment import Experiment, start_entries, with_own
 from .identifiability import Determined
 from .minimum import Minimum
 
@@ -48,11 +48,20 @@ def _own_estimates(minimum, k, row, e, known, scale):
     if part.ends_jacobian is None:
         start_errors = jax.tree.map(lambda x: jnp.full_like(x, jnp.nan), start)
     else:
-        start_errors = unravel(jnp.asarray(errors(np.asarray(part.ends_jacobian[row, :half]))))
+        J = np.asarray(part.ends_jacobian[row, :half])
+        unseen = (
+            ~np.any(J, axis=1) & (not minimum.problem.model.system.constraints) & _is_named(e)
+        )  # as a velocity at which friction sticks
+        start_errors = unravel(jnp.asarray(np.where(unseen, np.inf, errors(J))))
     for which, value, error in zip(("q0", "qdot0"), start, start_errors, strict=True):
         if any(is_within(name, which) for name in e.unknown):
             values[which], deviations[which] = value, error
     return values, deviations
+
+
+def _is_named(e):
+    """Which numbers of the start are unknown."""
+    return np.array([any(is_within(entry, name) for name in e.unknown) for entry in start_entries(e)])
 
 
 def with_estimates(e: Any, own: dict[str, Any]) -> Any:

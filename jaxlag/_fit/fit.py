@@ -15,7 +15,7 @@ from .._model.system import System
 from .._model.validation import without_contacts, without_events
 from .._motion.progress import Steps, compiling
 from .experiment import Experiment, measured
-from .lead_in import Regress, inside_bounds, led_in
+from .lead_in import MultiStart, Regress, inside_bounds, led_in
 from .linear_test import LinearTest, apart
 from .minimise import each_apart, minimise, minimise_each
 from .multiple_shooting import Segments, cut
@@ -33,12 +33,11 @@ def fit(
     experiments: Experiment | LinearTest | Sequence[Experiment | LinearTest],
     params: PyTree,
     *,
-    free: Sequence[str],
+    free: str | Sequence[str],
     bounds: Mapping[str, Any] | None = None,
     priors: Mapping[str, Any] | None = None,
     loss: Huber | None = None,
     method: Any = None,
-    starts: int = 1,
     segments: int = 1,
     start: Any = None,
     max_steps: int | None = None,
@@ -59,19 +58,18 @@ def fit(
       or stand alone: their weighted squares are added, and recordings then need a `sigma`.
     - `params`: all parameters, a mapping or any pytree with named parts, of numbers and arrays of any shape. Those in `free` are starting
       values; `jaxlag.regress` replaces a NaN, and an estimate at its bound is moved inside.
-    - `free`: names of the entries of `params` to be identified, or paths to parts of them, `"arm.length"`, `"joints[0]"`.
+    - `free`: name or names of the entries of `params` to be identified, or paths to parts of them, `"arm.length"`, `"joints[0]"`.
     - `bounds`: (lower, upper) by name, None where there is none: `{"b": (0, None)}` keeps b from being negative. Estimates and starting
       values may lie on a bound. If an estimate does, a remark says whether the measurements favour values beyond it.
     - `priors`: (mean, standard deviation) by name, for prior knowledge; the experiments need their `sigma` then.
     - `loss`: `Huber()` limits the influence of outliers.
     - `method`: an optax optimiser instead of Levenberg–Marquardt, for thousands of parameters; it takes `max_steps` steps, each projected
       onto the bounds.
-    - `starts`: number of starting points, tried in one batch: the given one and random ones, between the bounds or, without both bounds,
-      typically a factor of two away.
     - `segments`: number of segments that each record is cut into (multiple shooting), for long or chaotic records.
-    - `start`: `jaxlag.Regress()` finds a better start from a poor one: by `regress`, and by segments if that is not enough.
-    - `max_steps`: step limit, by default 100, or 1000 with `method`. `tolerance`: the iteration ends when the next step would change no
-      parameter by more than this part of its standard error.
+    - `start`: what to do about a poor start. `jaxlag.Regress()` finds a better one, by `regress`, and by segments if that is not enough;
+      `jaxlag.MultiStart(16)` tries several in one batch.
+    - `max_steps`: step limit, by default 100, or 1000 with `method`; 0 reports the start.
+    - `tolerance`: the iteration ends when the next step would change no parameter by more than this part of its standard error.
     - `progress`: shows step, cost and remaining time on standard error (one line on a terminal, otherwise a line now and then), and what is
       being compiled if that takes more than two seconds.
     - `**numerics`: passed on to `simulate`: `solver`, `rtol`, `atol`, `stabilisation`, `friction`.
@@ -97,11 +95,9 @@ def fit(
     ```
     """
     segments = count(segments, "`segments`", cure="Use 1 for single shooting, some tens for a long or chaotic record.")
-    starts = count(starts, "`starts`", cure="Use 1 for a single start, some tens for a poor initial guess.")
-    if (segments > 1) + (method is not None) + (starts > 1) + (start is not None) > 1:
-        raise ValueError(
-            "`segments`, `start`, `starts` and `method` must be used one at a time, but more than one was given. Omit the others."
-        )
+    if (segments > 1) + (method is not None) + (start is not None) > 1:
+        raise ValueError("`segments`, `start` and `method` must be used one at a time, but more than one was given. Omit the others.")
+    starts, start = (start.count, None) if isinstance(start, MultiStart) else (1, start)
     experiments, params = measured(experiments, params, tests=(LinearTest,))
     recordings, tests = apart(experiments)
     if tests:
@@ -109,10 +105,10 @@ def fit(
     common: dict[str, Any] = {"free": free, "bounds": bounds}
     if start is not None:
         fit_from = partial(fit, system, priors=priors, loss=loss, tolerance=tolerance, progress=progress, **common, **numerics)
-        return _led_in(fit_from, system, experiments, params, start, max_steps or 100, **common)
+        return _led_in(fit_from, system, experiments, params, start, 100 if max_steps is None else max_steps, **common)
     params, done = _without_nan(system, experiments, params, **common)
     problem, experiments = _checked_problem(system, experiments, params, free, bounds, priors, loss, method is None, numerics)
-    steps = max_steps or (100 if method is None else 1000)
+    steps = (100 if method is None else 1000) if max_steps is None else max_steps
     line = Steps(steps) if progress else None
     if segments > 1:
         without_contacts(system, "`fit` with `segments`")
@@ -155,11 +151,13 @@ def _check_options(recordings, loss, segments, start):
 def _led_in(fit_from, system, experiments, params, start, max_steps, **common):
     """The fit that `start` leads to."""
     if not isinstance(start, Regress):
-        raise ValueError(f"`start` must be a `Regress` or None, but is a {type(start).__name__}. Write `start=jl.Regress()`.")
+        raise ValueError(f"`start` must be `Regress()`, `MultiStart()` or None, but is {start!r}. Write `start=jl.Regress()`.")
     experiments, params = measured(experiments, params)
     found = regress(system, experiments, params, width=start.width, **common)
-    params, done = inside_bounds(found, **common)
-    return led_in(fit_from, start, experiments, params, done, max_steps)
+    inside, done = inside_bounds(found, **common)
+    chosen = Free.of(params, **common)
+    given = chosen.insert(jnp.where(np.isnan(chosen.start), Free.of(inside, **common).start, chosen.start))
+    return led_in(fit_from, start, experiments, inside, given, done, max_steps)
 
 
 def _without_nan(system, experiments, params, free, bounds):
@@ -186,7 +184,7 @@ def fit_each(
     experiments: Sequence[Experiment],
     params: PyTree,
     *,
-    free: Sequence[str],
+    free: str | Sequence[str],
     bounds: Mapping[str, Any] | None = None,
     priors: Mapping[str, Any] | None = None,
     max_steps: int = 100,
@@ -259,7 +257,8 @@ def _checked_problem(system, experiments, params, free, bounds, priors, loss, re
     problem = Problem.of(Model(system, tuple(sorted(numerics.items())), loss), chosen, *apart(experiments))
     if problem.size == 0:
         raise ValueError("`free` must name at least one entry of params, but is empty. Say which parameters to identify.")
-    _check_enough_measured(problem, experiments, alone)
+    if relative:  # optimisers of optax, which stop early, are for networks, which have more weights than there are samples
+        _check_enough_measured(problem, experiments, alone)
     return problem, experiments
 
 

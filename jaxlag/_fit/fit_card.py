@@ -101,8 +101,9 @@ def _correlation_rows(fit):
 def _inflation_rows(fit):
     if not fit.correlated:
         return []
-    factors = dict.fromkeys(f"{x:.2g}" for x in (np.min(fit.inflation, initial=np.inf), np.max(fit.inflation, initial=0)))
-    larger = f": {' to '.join(factors)} times those for white residuals" if fit.names else ""
+    known = fit.inflation[np.isfinite(fit.inflation) & np.isfinite(np.diag(fit.covariance))]
+    factors = dict.fromkeys(f"{x:.2g}" for x in (np.min(known), np.max(known))) if known.size else ()
+    larger = f": {' to '.join(factors)} times those for white residuals" if known.size else ""
     return [f"  standard errors account for residuals correlated over {fit.correlated} samples{larger}"]
 
 
@@ -123,6 +124,8 @@ def _quality(c):
 
 def _sigma(fit):
     """In units of the given sigma, or of each channel by name."""
+    if fit.freedom == 0:
+        return "not known: no measurement is left over"
     if fit.absolute:
         return f"{fit.sigma:.4g}  (1 where the stated noise level is right)"
     relative = sigmas_of(fit.problem)

@@ -33,6 +33,8 @@ class Regress:
     The most likely of these fits is returned, and its card says what was done. An estimate of `regress` at a bound is moved inside by its
     standard error.
 
+    Where the motion from there does not explain the measurements, the given start is tried, too.
+
     - `segments`: the number of segments of each record; by default 20, or fewer if they would have less than ten samples.
     - `width`: of the windows of `regress`, a time in the unit of the samples; by default chosen from the data.
 
@@ -58,6 +60,33 @@ class Regress:
             count(self.segments, "`segments`", least=2, cure="Use some tens for a long or chaotic record.")
 
 
+@dataclasses.dataclass(frozen=True)
+class MultiStart:
+    """Several starts for a fit (`start=`), tried in one batch: the given one and random ones.
+
+    They are uniform between two bounds; without both, they are typically a factor of two away and keep their sign. The fit with the lowest
+    cost is returned.
+
+    - `count`: how many, the given one among them.
+
+    **Raises:** `ValueError` if `count` is not a whole number from 2 on.
+
+    ```python
+    import jax.numpy as jnp
+    import jaxlag as jl
+    oscillator = jl.System(lambda q, qdot, c: 0.5 * qdot**2 - 0.5 * c * q**2)
+    ts = jnp.linspace(0.0, 3.0, 50)
+    record = jl.Experiment(ts, jnp.cos(2.0 * ts), q0=1.0, qdot0=0.0)
+    jl.fit(oscillator, record, {"c": 30.0}, free=("c",), bounds={"c": (0, 60)}, start=jl.MultiStart(16)).estimates["c"]  # 4.0
+    ```
+    """
+
+    count: int = 16
+
+    def __post_init__(self) -> None:
+        count(self.count, "`count`", least=2, cure="Use some tens for a poor initial guess.")
+
+
 def _segments(start, experiments):
     """Their number; 1 where the records are too short, or cannot be cut."""
     if any(whole(e) for e in experiments):
@@ -66,9 +95,17 @@ def _segments(start, experiments):
 
 
 def led_in(
-    fit_from: Callable[..., Fit], start: Regress, experiments: Sequence[Experiment], params: PyTree, done: str, max_steps: int
+    fit_from: Callable[..., Fit],
+    start: Regress,
+    experiments: Sequence[Experiment],
+    params: PyTree,
+    given: PyTree,
+    done: str,
+    max_steps: int,
 ) -> Fit:
-    """The best of the fits on the way. `fit_from(experiments, params, max_steps, segments)` is a fit; `done`: what was done before."""
+    """The best of the fits on the way. `fit_from(experiments, params, max_steps, segments)` is a fit; `given`: the parameters of the user,
+    which may be the better start; `done`: what was done before.
+    """
     steps, fits = [done], []
 
     def stage(name, *where, **more):
@@ -84,6 +121,9 @@ def led_in(
 
     segments, most = _segments(start, experiments), max_steps
     found = stage("whole motion", experiments, params, max_steps=min(most, FIRST_STEPS))
+    if not (found and _explains(found)):
+        other = stage("whole motion from the given start", experiments, given, max_steps=min(most, FIRST_STEPS))
+        found = other if other and _explains(other) else found
     if segments > 1 and not (found and _explains(found)):
         found = stage(f"{segments} segments", experiments, params, max_steps=most, segments=segments)
         if found:
@@ -102,10 +142,10 @@ def _explains(fit):
     return np.mean([channel.r_squared for channel in fit.channels]) >= EXPLAINED
 
 
-def inside_bounds(found: Regression, free: Sequence[str], bounds: Any) -> tuple[PyTree, str]:
+def inside_bounds(found: Regression, free: str | Sequence[str], bounds: Any) -> tuple[PyTree, str]:
     """The parameters found, those at a bound moved inside; and words for what was done."""
     chosen = Free.of(found.params, free, bounds)
-    flat = lambda tree: np.concatenate([np.ravel(np.asarray(x)) for name in free for x in jax.tree.leaves(tree[name])])
+    flat = lambda tree: np.concatenate([np.ravel(np.asarray(x)) for name in chosen.names for x in jax.tree.leaves(tree[name])])
     errors, theta, moves = flat(found.standard_errors), np.array(chosen.start), []
     for i, name in enumerate(chosen.entries):
         lower, upper = float(chosen.lower[i]), float(chosen.upper[i])

@@ -23,15 +23,19 @@ REASONS = (
     "the predictions are unrelated to the measurements, and no step brings them near",
     "the segments do not join, however heavily the gaps are weighted; use more segments, or start from other parameters",
     "the cost has a kink here, as where dry friction comes to stick or begins to slip, and steps along it lower it by next to nothing; "
-    "the standard errors hold on one side of the kink; see whether `starts=` or a model that misses less finds a lower cost",
+    "the standard errors hold on one side of the kink; see whether `start=jl.MultiStart()` or a model that misses less finds a lower cost",
 )
 FIRST_DAMPING = 1e-2
 DAMPING_LIMITS = 1e-14, 1e14
 NEWTON_LIKE = 0.5  # damping below which a step is close to that of Gauss and Newton
+HALVINGS = 60  # of the interval in which the logarithm of the damping is searched
+ENOUGH, WELL = 0.25, 0.75  # parts of the expected decrease, from which the region of trust stays as it is, and from which it grows
+GROWTH, SHRINKAGE = 2, 4  # of its radius, from the length of the last step
 CLOSE = 10  # tolerances; so short a step is trusted where the cost rises by no more than one of that length could lower it
 HOPELESS = 1e8  # damping from which on no step is expected to lower the cost
 SHORT = 0.3  # standard errors; the cost of so short a step is as expected, unless there is a kink
 SLIGHT = 0.1  # standard errors; a cost that falls less than by such a step has not fallen
+WIDER = 8  # times the radius when the cost last fell
 PATIENCE = 5  # short damped steps without such a fall, after which the iteration ends
 CLEAR = 0.375  # exponent of eps (1.3e-6 in double precision): singular values of the Jacobian, its columns of norm one, that count
 FLAT = 1e-4  # cosine of residuals and columns of the Jacobian below which the gradient counts as zero, or that of a `SLIGHT` step
@@ -45,10 +49,11 @@ class Iterate(NamedTuple):
     jacobian: Any
     aux: Any
     cost: Any  # ½|r|²
-    damping: Any
+    radius: Any  # of the region in which the linear model is trusted, in columns scaled to norm one
     scale: Any  # largest norm that each column of the Jacobian has had
     across: Any  # the Jacobian beyond a kink, where there is one; otherwise the same
     mark: Any  # the cost when it last fell by what counts
+    reach: Any  # the radius then
     slow: Any  # short damped steps since then
     status: Any
 
@@ -58,6 +63,8 @@ class Trial(NamedTuple):
 
     y: Any
     change: Any  # J Δy of the step to y
+    length: Any  # of the step, in columns scaled to norm one
+    damping: Any  # that makes the step so short
     free_change: Any  # |J Δy|² of the undamped step that is held back only by the active bounds
     active: Any  # bounds at which y lies and towards which the cost falls
 
@@ -80,11 +87,13 @@ def levenberg_marquardt(
     bounds: tuple[Any, Any] | None = None,
     progress: Callable[[int, float], None] | None = None,
     size: Any = np.inf,
+    noise: float = 0.0,
 ) -> Outcome:
     """Minimises ½|r(y)|² within `bounds`. `linearise(y)` returns r, its Jacobian, and anything else that is wanted at the best y.
 
     Ends where the next step of Gauss and Newton would change no parameter by more than `tolerance` of its standard error: |J Δy| ≤
-    tolerance · σ̂, with σ̂² = |r|² / `freedom`; or by no more than rounding, a part of the `size` of what r is a difference of. Where y has a
+    tolerance · σ̂, with σ̂² = |r|² / `freedom`; or by no more than rounding, a part of the `size` of what r is a difference of. `noise`: the
+    part of the cost that is due to the errors of what is integrated; a step that promises no more, and fails, is the last. Where y has a
     batch axis, so has all that `linearise` takes and returns.
 
     **Source:** Moré, The Levenberg-Marquardt algorithm, Lecture Notes in Mathematics 630 (1978); Madsen, Nielsen & Tingleff,
@@ -94,7 +103,7 @@ def levenberg_marquardt(
     box = [np.broadcast_to(np.asarray(bound, y.dtype), y.shape) for bound in bounds or (-np.inf, np.inf)]
     now, trial = initialise(y, linearise(y), box)
     costs = [now.cost]
-    step, limits = 0, [np.broadcast_to(np.asarray(limit, y.dtype), y.shape[:-1]) for limit in (tolerance, freedom, size)]
+    step, limits = 0, [np.broadcast_to(np.asarray(limit, y.dtype), y.shape[:-1]) for limit in (tolerance, freedom, size, noise)]
     try:
         for step in range(1, max_steps + 1):
             now, trial = update(now, trial, linearise(trial.y), box, *limits)
@@ -122,7 +131,8 @@ def _norms(J):
 @compiled
 def _initialise(y, linearised, bounds):
     r, J, aux = linearised
-    now = Iterate(y, r, J, aux, _cost(r), jnp.asarray(FIRST_DAMPING, y.dtype), _norms(J), J, _cost(r), jnp.asarray(0), jnp.asarray(RUNNING))
+    cost, first, infinite = _cost(r), jnp.asarray(jnp.nan, y.dtype), jnp.asarray(jnp.inf, y.dtype)
+    now = Iterate(y, r, J, aux, cost, first, _norms(J), J, cost, infinite, jnp.asarray(0), jnp.asarray(RUNNING))
     return now, _propose(now, bounds)
 
 
@@ -145,13 +155,15 @@ def _propose(now, bounds):
     J, slope = _across_the_kink(now) / scale[None, :], now.residuals @ now.jacobian
     active = ((lower >= 0) & (slope > 0)) | ((upper <= 0) & (slope < 0))
     Q, R = jnp.linalg.qr(J)
-    step, free_change = undifferentiated(_damped, in_turn=True)(R, now.residuals @ Q, now.damping, active, lower, upper)
-    return Trial(jnp.clip(now.y + step / scale, *bounds), J @ step, free_change, active)
+    step, damping, free_change = undifferentiated(_damped, in_turn=True)(R, now.residuals @ Q, now.radius, active, lower, upper)
+    return Trial(jnp.clip(now.y + step / scale, *bounds), J @ step, jnp.linalg.norm(step), damping, free_change, active)
 
 
-def _damped(R, r, damping, active, lower, upper):
+def _damped(R, r, radius, active, lower, upper):
     """The damped step within the bounds, and the square of the part of r that R can take away without the `active` columns."""
     descent = optx.DampedNewtonDescent()
+    U, values, _ = jnp.linalg.svd(jnp.where(active[None], 0, R), full_matrices=False)
+    damping = _damping_within(radius, values, r @ U)
 
     def solve_anew(last):
         step, fixed, _ = last
@@ -163,19 +175,32 @@ def _damped(R, r, damping, active, lower, upper):
         return jnp.clip(step, lower, upper), fixed | crossing, jnp.any(crossing)
 
     step, _, _ = jax.lax.while_loop(lambda last: last[2], solve_anew, (jnp.zeros_like(lower), active, jnp.asarray(True)))
-    U, values, _ = jnp.linalg.svd(jnp.where(active[None], 0, R), full_matrices=False)
     clear = values > jnp.finfo(r.dtype).eps ** CLEAR * jnp.max(values, initial=0.0)
-    return step, jnp.sum(jnp.where(clear, r @ U, 0) ** 2)  # however slowly a damped step takes it away along a valley of the cost
+    return step, damping, jnp.sum(jnp.where(clear, r @ U, 0) ** 2)  # however slowly a damped step takes it away along a valley of the cost
+
+
+def _damping_within(radius, values, along):
+    """The least damping λ with |p(λ)| ≤ radius, p_i = s_i g_i / (s_i² + λ); at the start, where there is no radius, the first one."""
+    least, most = jnp.log(jnp.asarray(DAMPING_LIMITS, values.dtype))
+
+    def halved(_, ends):
+        low, high = ends
+        middle = (low + high) / 2
+        is_long = jnp.sum((values * along / (values**2 + jnp.exp(middle))) ** 2) > radius**2
+        return jnp.where(is_long, middle, low), jnp.where(is_long, high, middle)
+
+    low, high = jax.lax.fori_loop(0, HALVINGS, halved, (least, most))
+    return jnp.where(jnp.isnan(radius), FIRST_DAMPING, jnp.exp(high))
 
 
 @compiled
-def _update(now, trial, linearised, bounds, tolerance, freedom, size):
-    """Takes the trial where it is better, adapts the damping, and proposes the next."""
+def _update(now, trial, linearised, bounds, tolerance, freedom, size, noise):
+    """Takes the trial where it is better, adapts the region of trust, and proposes the next."""
     r, J, aux = linearised
     before, after = now.cost, _cost(r)
     # Expected decrease: ½|r|² − ½|r + J step|². Where it is below the rounding of what is integrated, the step is trusted.
     expected = -trial.change @ now.residuals - 0.5 * trial.change @ trial.change
-    newton_like, rounding = now.damping < NEWTON_LIKE, jnp.finfo(r.dtype).eps ** 0.5 * before
+    newton_like, rounding = trial.damping < NEWTON_LIKE, jnp.maximum(jnp.finfo(r.dtype).eps ** 0.5, noise) * before
     better = after <= before
     per_error = 2 * before / jnp.maximum(freedom, 1)  # σ̂²: the |J Δy|² of a step by one standard error
     last = (CLOSE * tolerance) ** 2 * per_error  # within this, the cost changes with the steps of the motion too
@@ -183,20 +208,26 @@ def _update(now, trial, linearised, bounds, tolerance, freedom, size):
     trusted |= (jnp.sum(trial.change**2) <= last) & (after - before <= last / 2)
     taken = better | (newton_like & trusted)
     take = lambda new, old: jax.tree.map(lambda a, b: jnp.where(taken, a, b), new, old)
-    as_expected = (before - after) > 0.25 * expected
-    damping = now.damping * jnp.where(better, jnp.where(as_expected, 0.1, 1.0), 10.0)
-    damping = jnp.clip(damping, *DAMPING_LIMITS)
+    as_expected = (before - after) > ENOUGH * expected
+    well = (before - after) > WELL * expected
+    radius = jnp.where(jnp.isnan(now.radius), trial.length, now.radius)
+    larger = jnp.where(well, jnp.maximum(radius, GROWTH * trial.length), radius)
+    radius = jnp.where(better & as_expected, larger, trial.length / SHRINKAGE)
     status = _status(now, trial, taken, newton_like, tolerance, freedom, size)
+    drowned = ~better & newton_like & (trial.free_change <= 2 * rounding)  # in the errors of what is integrated
+    status = jnp.where((status == RUNNING) & drowned, CONVERGED, status)
     short = (jnp.sum(trial.change**2) <= SHORT**2 * per_error) & jnp.isfinite(after)
     across = jnp.where(taken, jnp.where(short & ~as_expected, now.jacobian, J), jnp.where(short, J, now.across))
     fell = now.mark - jnp.where(taken, after, before) > SLIGHT**2 / 2 * per_error
+    fell |= radius > WIDER * now.reach  # in a curved valley, which has no kink, steps become longer and longer
     slow = jnp.where(fell, 0, now.slow + (taken & ~newton_like))
     within = trial.free_change <= last  # no kink that matters: the last of the steps are rounding of the motion
     status = jnp.where((status == RUNNING) & (slow >= PATIENCE), jnp.where(within, CONVERGED, KINKED), status)
     mark = jnp.where(fell, jnp.where(taken, after, before), now.mark)
+    reach = jnp.where(fell | jnp.isinf(now.reach), radius, now.reach)
     chosen = take((trial.y, r, J, aux, after), now[:5])
     scale = jnp.maximum(now.scale, _norms(jnp.where(taken, J, 0)))
-    chosen = Iterate(*chosen, damping, scale, across, mark, slow, status)
+    chosen = Iterate(*chosen, radius, scale, across, mark, reach, slow, status)
     now = jax.tree.map(lambda a, b: jnp.where(now.status != RUNNING, b, a), chosen, now)
     return now, _propose(now, bounds)
 
@@ -210,7 +241,7 @@ def _status(now, trial, taken, newton_like, tolerance, freedom, size):
     cosines = jnp.where((norms > 0) & ~trial.active, now.residuals @ now.jacobian / jnp.where(norms > 0, norms, 1), 0)
     flat = jnp.linalg.norm(cosines) <= jnp.maximum(FLAT, SLIGHT / jnp.sqrt(jnp.maximum(freedom, 1))) * jnp.sqrt(2 * now.cost)
     status = jnp.where((short & newton_like) | (now.cost == 0), CONVERGED, RUNNING)
-    status = jnp.where(~taken & (now.damping >= HOPELESS), jnp.where(flat, CONVERGED, STALLED), status)
+    status = jnp.where(~taken & (trial.damping >= HOPELESS), jnp.where(flat, CONVERGED, STALLED), status)
     status = jnp.where(jnp.isfinite(now.cost), status, FAILED)
     return jnp.where(now.status == RUNNING, status, now.status)
 

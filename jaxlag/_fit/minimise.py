@@ -73,7 +73,7 @@ def minimise_each(problem: Problem, *, estimate_sigma: bool, **limits: Any) -> t
             return found.residuals, found.jacobian, found
 
         sizes = np.sqrt(sum(part**2 for part in sizes_of_each(problem.batches[0])))
-        return levenberg_marquardt(residuals, xs, bounds=bounds, size=sizes, **limits)
+        return levenberg_marquardt(residuals, xs, bounds=bounds, size=sizes, noise=_noise_of(problem), **limits)
 
     if estimate_sigma:
         problem = _each_weighted(problem, [weighted_by_spread(one) for one, _ in each_apart(problem)])
@@ -120,14 +120,27 @@ def _minimise(problem, x, method, starts, limits):
     return _from_one_start(problem, x, limits), problem
 
 
+def _noise_of(problem):
+    """The part of the cost that is due to the errors of the motion: its tolerance, where one was asked for."""
+    tolerance = dict(problem.model.numerics).get("rtol")
+    return 0.0 if tolerance is None else float(tolerance)
+
+
 def _from_one_start(problem, x, limits):
-    held = held_by_jax(problem)
+    held, computed = held_by_jax(problem), []
 
     def residuals(x):
-        found = linearise(held, x)
+        try:
+            found = linearise(held, x)
+            found.residuals.block_until_ready()
+            computed[:] = [found]
+        except jax.errors.JaxRuntimeError as error:  # an implicit solver, differentiated where the motion has left all bounds
+            if not computed:
+                raise ValueError(f"{AT_THE_START}, but ended with: {error} Start from other parameters.") from None
+            found = jax.tree.map(lambda leaf: leaf * jnp.nan if eqx.is_inexact_array(leaf) else leaf, computed[0])
         return found.residuals, found.jacobian, found
 
-    outcome = levenberg_marquardt(residuals, x, bounds=problem.bounds, size=size_of(problem), **limits)
+    outcome = levenberg_marquardt(residuals, x, bounds=problem.bounds, size=size_of(problem), noise=_noise_of(problem), **limits)
     reason = failure_of(outcome.best.aux)
     if reason:
         raise ValueError(f"{AT_THE_START}, but ended with: {reason} Start from other parameters.")
@@ -143,10 +156,10 @@ def _from_many_starts(problem, starts, limits):
         found = linearise_starts(problem, xs)
         return found.residuals, found.jacobian, found
 
-    outcome = levenberg_marquardt(residuals, xs, bounds=problem.bounds, size=size_of(problem), **limits)
+    outcome = levenberg_marquardt(residuals, xs, bounds=problem.bounds, size=size_of(problem), noise=_noise_of(problem), **limits)
     cost = np.nan_to_num(outcome.costs[-1], nan=np.inf)
     if not np.isfinite(cost).any():
-        raise ValueError("`starts` must include one whose motion can be computed, but none can. Narrow the bounds.")
+        raise ValueError("`start` must include one whose motion can be computed, but none can. Narrow the bounds.")
     best = int(np.argmin(cost))
     chosen = jax.tree.map(lambda leaf: leaf[best], outcome.best)
     if np.any(outcome.best.status == INTERRUPTED):  # another start might have come to a better end
@@ -176,7 +189,7 @@ def _by_optax(problem, method, x, limits):
         raise ValueError(f"{AT_THE_START}, but was not. Start from other parameters.")
     found = linearise(problem, best) if problem.size <= FORWARD_LIMIT else without_jacobian(problem, best)
     none = jnp.zeros(0)
-    iterate = Iterate(best, found.residuals, found.jacobian, found, lowest, *[none] * 5, np.asarray(ended))
+    iterate = Iterate(best, found.residuals, found.jacobian, found, lowest, *[none] * 6, np.asarray(ended))
     return Outcome(iterate, len(costs), np.array(costs))
 
 

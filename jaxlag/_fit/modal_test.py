@@ -32,11 +32,12 @@ class ModalTest(LinearTest):
 
     - `frequency`: (k,), natural frequencies f (of the undamped oscillation) of k modes in 1/time, in Hz where times are in s.
     - `q`, `qdot`: a guess of the equilibrium, or where `qdot` is given, of the steady motion, structured as for `simulate`.
-    - `sigma`: their standard deviation in 1/time, a number or (k,).
+    - `sigma`: their standard deviation in 1/time, a number or (k,); if the report states none, the resolution of its spectra.
     - `damping_ratio`, `damping_sigma`: ζ, (k,), and its standard deviation, a number or (k,).
     - `shapes`: what the sensors see of each mode: a pytree like the one that `observe` returns, with the modes as first axis; real or
       complex, of any scale. Each is paired with the predicted mode of the most similar shape, by the modal assurance criterion MAC; sensors
-      should have one unit. Without shapes, modes are paired in ascending order, the first with the lowest that oscillates.
+      should have one unit. Shapes only pair modes: they are no measurements. Without shapes, modes are paired in ascending order, the first
+      with the lowest that oscillates.
     - `observe`: the sensors, as for `Experiment`; by default the coordinates named in `shapes`.
     - `params`: parameters of this test only, which override those of the fit: an added mass. `fixed`, `fixed_rates`: as for `steady`.
 
@@ -66,7 +67,7 @@ class ModalTest(LinearTest):
         q: PyTree,
         qdot: PyTree = None,
         *,
-        sigma: Any,
+        sigma: Any = None,
         damping_ratio: Any = None,
         damping_sigma: Any = None,
         shapes: PyTree = None,
@@ -186,7 +187,10 @@ def _each_mode(given, label, count=None):
 
 def _deviation(given, label, count):
     if given is None:
-        raise ValueError(f"`{label}` must say how exact the measurements are, but is missing. Give their standard deviation.")
+        raise ValueError(
+            f"`{label}` must say how exact the measurements are, but is missing. "
+            "Give their standard deviation; if the report states none, the resolution of its spectra, 1/(duration of a record)."
+        )
     sigma = np.asarray(numbers(given, f"`{label}`"))
     if sigma.shape not in ((), (count,)) or not np.all((sigma > 0) & np.isfinite(sigma)):
         raise ValueError(f"`{label}` must be positive, one number or one for each of {count} modes, but is {given}. Give deviations.")

@@ -39,7 +39,7 @@ class Free:
     def of(
         cls,
         params: PyTree,
-        free: Sequence[str],
+        free: str | Sequence[str],
         bounds: Mapping[str, Any] | None = None,
         priors: Mapping[str, Any] | None = None,
         relative: bool = True,
@@ -48,8 +48,7 @@ class Free:
 
         With `relative`, y is in units of |θ₀|; otherwise θ = θ₀ + y.
         """
-        if isinstance(free, str):
-            raise ValueError(f"`free` must be a list of names, but is the string {free!r}. Write `free=({free!r},)`.")
+        free = (free,) if isinstance(free, str) else free
         every, names = jax.tree.leaves(params), leaf_names(params, "")
         chosen = [i for name in free for i in _leaves_within(name, names, every)]
         if len(set(chosen)) < len(chosen):
@@ -86,7 +85,9 @@ class Free:
         return (self.lower - self.start) / self.scale, (self.upper - self.start) / self.scale
 
     def random_starts(self, key: Array, count: int) -> Array:
-        """y of random starts, (count, p): uniform between two bounds; otherwise log-normal, typically off by a factor of two."""
+        """y of random starts, (count, p): uniform between two bounds; otherwise log-normal, typically off by a factor of two, with the
+        sign that they have.
+        """
         share = jax.random.uniform(key, (count, self.size), self.start.dtype, 0.02, 0.98)
         factor = 2 ** jax.scipy.special.ndtri(share)
 
@@ -94,15 +95,17 @@ class Free:
             lower, upper = jnp.isfinite(self.lower), jnp.isfinite(self.upper)
             bound = jnp.where(lower, self.lower, self.upper)
             away = jnp.where(self.start == bound, jnp.where(lower, self.scale, -self.scale), self.start - bound)
-            one_sided = jnp.where(lower | upper, bound + away * factor, self.start + self.scale * jnp.log(factor))
+            free = jnp.where(self.start == 0, self.scale * jnp.log(factor), self.start * factor)
+            one_sided = jnp.where(lower | upper, bound + away * factor, free)
             return jnp.where(lower & upper, self.lower + (self.upper - self.lower) * share, one_sided)
 
         return (jax.vmap(start)(share, factor) - self.start[None]) / self.scale[None]
 
-    def with_default_starts(self) -> PyTree:
-        """All parameters, where a free one that is NaN starts at some value within its bounds."""
+    def with_default_starts(self, unbounded: float = 1.0) -> PyTree:
+        """All parameters, where a free one that is NaN starts at some value within its bounds: at this one, where it has none."""
         a, b = (jnp.where(jnp.isfinite(bound), bound, jnp.nan) for bound in (self.lower, self.upper))
-        default = jnp.where(jnp.isnan(a), jnp.where(jnp.isnan(b), 1.0, b - 1), jnp.where(jnp.isnan(b), a + 1, (a + b) / 2))
+        beside = jnp.where(jnp.isnan(a), b - unbounded, a + unbounded)
+        default = jnp.where(jnp.isnan(a) & jnp.isnan(b), unbounded, jnp.where(jnp.isnan(a) | jnp.isnan(b), beside, (a + b) / 2))
         return self.insert(jnp.where(jnp.isnan(self.start), default, self.start))
 
     def slope(self, y: Any) -> Array:

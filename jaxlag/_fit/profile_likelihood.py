@@ -17,7 +17,7 @@ def profile_end(
     $$ \sqrt{2 (S(\theta_i) - S(\hat\theta))} = t \, \sigma \cdot \text{inflation} $$
 
     The root is nearly linear in θ_i. `deviation`: of x_i over σ. An end that is not found within `FAR` times the linearised interval
-    is the bound of the parameter, infinite where it has none.
+    is the bound of the parameter, infinite where it has none; NaN is an end that was lost on the way.
 
     **Source:** Bates & Watts, Nonlinear Regression Analysis and Its Applications (1988), section 6.1.
     """
@@ -47,15 +47,12 @@ def profile_end(
     bound_of_theta = float((free.lower if side < 0 else free.upper)[i])
     first = side * quantile * sigma * deviation
     limit = float(problem.bounds[side > 0][i]) - x[i]
-    if np.isfinite(limit):
-        inner, outer = 0.0, side * min(abs(first), abs(limit))  # outwards: from far away others would come to another minimum
-        while (below := outer == 0 or excess(outer) <= 0) and abs(outer) < min(abs(limit), FAR * abs(first)):
-            inner, outer = outer, side * min(2 * abs(outer), abs(limit))
-        if below:
-            return bound_of_theta
-        found = optimize.root_scalar(excess, bracket=(inner, outer), method="brentq", rtol=1e-4)
-    else:
-        found = optimize.root_scalar(excess, x0=0.0, x1=first, method="secant", rtol=1e-4, maxiter=20)
-    if not (found.converged and 0 < found.root * side < FAR * abs(first)):
+    inner, outer = 0.0, side * min(abs(first), abs(limit))  # outwards: from far away others would come to another minimum
+    while (below := outer == 0 or excess(outer) <= 0) and abs(outer) < min(abs(limit), FAR * abs(first)):
+        inner, outer = outer, side * min(2 * abs(outer), abs(limit))
+    if below:
         return bound_of_theta
+    found = optimize.root_scalar(excess, bracket=(inner, outer), method="brentq", rtol=1e-4)
+    if not found.converged:
+        return np.nan
     return float(free.theta(jnp.asarray(x).at[i].add(found.root)[: free.size])[i])

@@ -76,7 +76,7 @@ def regress(
     experiments: Experiment | Sequence[Experiment],
     params: PyTree,
     *,
-    free: Sequence[str],
+    free: str | Sequence[str],
     bounds: Mapping[str, Any] | None = None,
     width: float | None = None,
 ) -> Regression:
@@ -132,13 +132,13 @@ def regress(
     without_contacts(system, "`regress`")
     without_events(system, "`regress`")
     experiments, params = measured(experiments, params)
-    params = Free.of(params, free, bounds).with_default_starts()
-    chosen = Free.of(params, free, bounds)
-    if chosen.size == 0:
+    given = Free.of(params, free, bounds)
+    if given.size == 0:
         raise ValueError("`free` must name at least one entry of params, but is empty. Say which parameters to identify.")
+    params = given.with_default_starts()
     half = None if width is None else _half(width, experiments)
     records = [Record.of(system, e, params) for e in experiments]
-    linear = _is_linear(records, Free.of(params, free))
+    chosen, linear = _start(records, given, free, bounds)
     problem = Problem.of(records, chosen, linear)
     found = best_estimate(problem, half_widths(records) if half is None else np.array([half]))
     if found is None:
@@ -163,6 +163,17 @@ def _half(width, experiments):
     return width / 2
 
 
+def _start(records, given, free, bounds):
+    """The free parameters, and whether the equations are linear in them: then those that are not given start at zero, which has no unit."""
+    from_zero = Free.of(given.with_default_starts(0.0), free)
+    with np.errstate(all="ignore"):
+        finite = all(np.all(np.isfinite(part)) for record in records for part in record.form.linearised(from_zero, jnp.zeros(given.size)))
+    if finite and _is_linear(records, from_zero):
+        return Free.of(from_zero.params, free, bounds), True
+    params = given.with_default_starts()
+    return Free.of(params, free, bounds), _is_linear(records, Free.of(params, free))
+
+
 def _is_linear(records, free):
     """Whether the Jacobian is the same at another point; refuses linear equations without a known term."""
     y = jnp.zeros(free.size)
@@ -173,8 +184,8 @@ def _is_linear(records, free):
             return False
     to_zero = -np.asarray(free.theta(y) / free.slope(y))
     known = sum(_sizes(record, terms + J @ to_zero) for record, (terms, J) in zip(records, here, strict=True))
-    free_terms = sum(_sizes(record, np.abs(J) @ np.abs(to_zero)) for record, (_, J) in zip(records, here, strict=True))
-    if np.all((known <= LINEAR * free_terms) | (free_terms == 0)):
+    of_free = lambda sizes: sum(_sizes(record, np.abs(J) @ sizes) for record, (_, J) in zip(records, here, strict=True))
+    if np.all((known <= LINEAR * of_free(np.abs(to_zero))) | (of_free(np.ones(free.size)) == 0)):
         raise ValueError(
             f"`free` must leave a known term in the equations of motion, but every term has a factor out of {', '.join(free.names)}: "
             "only their ratios are determined. Fix one of them."

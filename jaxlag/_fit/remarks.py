@@ -91,6 +91,13 @@ def on_too_short(names: Sequence[str]) -> list[str]:
     return [f"{shown} {have} too few measurements for {own}: each channel is weighted by its spread; give `sigma`"]
 
 
+def on_no_freedom(measurements: int, unknowns: int) -> list[str]:
+    """At least as many unknowns as measurements."""
+    if unknowns < measurements:
+        return []
+    return [f"there are {unknowns} unknowns for {measurements} measurements: none is left over that could contradict the model"]
+
+
 def on_exact(channels: Mapping[str, int]) -> list[str]:
     """Channels without noise, with the number of their measurements."""
     return [
@@ -104,12 +111,19 @@ def on_inputs(ended: Mapping[str, tuple[float, float]]) -> list[str]:
 
 
 def on_misfit(
-    relative_size: float, times_noise: float, independent: float, halves: str, channels: Sequence[Channel], explained: bool
+    relative_size: float,
+    times_noise: float,
+    independent: float,
+    halves: str,
+    channels: Sequence[Channel],
+    explained: bool,
+    recorded: bool,
 ) -> Iterator[str]:
     """Measurements that the model does not explain.
 
     `relative_size`: residuals over measurements; `times_noise`: residuals over the stated sigma, from so many `independent` samples;
-    `halves`: what differs between the halves of the records, if anything; `explained`: whether another remark already gives a reason.
+    `halves`: what differs between the halves of the records, if anything; `explained`: whether another remark already gives a reason;
+    `recorded`: whether there are recordings in time.
     """
     if relative_size > UNRELATED_SIZE:
         yield f"the residuals are {relative_size:.2g} times as large as the measurements: check the units, and start from other parameters"
@@ -119,8 +133,8 @@ def on_misfit(
         yield f"{halves}: the model misses something, and the errors above do not account for that"
     if times_noise > UNEXPLAINED:
         yield (
-            f"the model does not explain the measurements; the residuals are {times_noise:.2g} times the noise: try another start or "
-            "`segments=`, or look for what the model lacks; the errors above mean little"
+            f"the model does not explain the measurements; the residuals are {times_noise:.2g} times the noise: try another start"
+            f"{' or `segments=`' if recorded else ''}, or look for what the model lacks; the errors above mean little"
         )
     elif times_noise > LARGER and times_noise**2 - 1 > CERTAIN * np.sqrt(2 / independent):
         yield (

@@ -82,7 +82,8 @@ class Fit:
     - `led_in`: the steps by which the start was found, if it was not `params` (`Regress`).
     - `problem`, `x`, `x_covariance`: the least-squares problem, all its unknowns at the minimum, and their covariance divided by σ̂².
 
-    Quantities have the units of the parameters and measurements, any consistent set. `fit.plot()` draws it, with all that `plot.fit` takes.
+    Quantities have the units of the parameters and measurements, any consistent set. `fit.plot()` draws it, with all that `plot.fit` takes;
+    `fit.report("report.html")` writes it as one page for a colleague.
 
     **Source:** Ljung, System Identification, 2nd ed., sections 7.2, 9.2 to 9.4 and 16; Seber & Wild, Nonlinear Regression (1989),
     chapter 5; Newey & West, Econometrica 55 (1987) 703.
@@ -132,6 +133,7 @@ class Fit:
 
     if TYPE_CHECKING:  # put here by `jaxlag.plot`
         plot: ClassVar[Callable[..., Any]]
+        report: ClassVar[Callable[..., None]]
 
     @property
     def units(self) -> tuple[tuple[str, str], ...]:
@@ -150,8 +152,8 @@ class Fit:
 
     @property
     def misfit(self) -> float:
-        """−2 ln L, up to a constant that depends on the data only."""
-        squares = 2 * self.cost
+        """−2 ln L, up to a constant that depends on the data only. Priors are no part of the likelihood."""
+        squares = 2 * self.cost - float(np.sum(np.asarray(self.problem.free.prior_residual(self.x[: len(self.names)])) ** 2))
         return squares if self.absolute else self.measurements * float(np.log(squares / self.measurements))
 
     @property

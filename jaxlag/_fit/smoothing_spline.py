@@ -13,7 +13,7 @@ from .._program.jit import jitted
 from .experiment import Experiment, start_entries, with_own
 
 DEGREE = 5  # accelerations are twice differentiable
-MOST_INTERVALS = 2000
+MOST_INTERVALS = 0.65  # of the samples
 MOST_COEFFICIENTS = 0.7  # of the measurements
 ITERATIONS = 8  # of Gauss and Newton, where sensors are not linear in the motion
 START_WEIGHT = 1e3  # of the known start, relative to the sensors
@@ -56,7 +56,7 @@ def smooth(experiment: Experiment, params: Any, at: np.ndarray | None = None) ->
 def _cross_validated(sensors, ts):
     """The splines with the least score, and their coefficients."""
     measured = int(np.sum(np.isfinite(sensors.measured)))
-    most = max(4, min(len(ts) // 2, measured // (2 * sensors.n), MOST_INTERVALS))
+    most = max(4, int(MOST_INTERVALS * min(len(ts), measured / sensors.n)))
     found = {}
 
     def attempt(intervals):
@@ -71,7 +71,7 @@ def _cross_validated(sensors, ts):
         splines = _Splines(ts, 1)
         return splines, _fitted(sensors, splines)[0]
     best = found[min(found)][0].intervals
-    for between in (best / 2**0.5, best * 2**0.5):
+    for between in (best / 2**0.5, min(best * 2**0.5, most)):
         if 4 <= between <= most:
             attempt(int(between))
     return found[min(found)]

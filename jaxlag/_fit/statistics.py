@@ -12,17 +12,30 @@ import numpy as np
 from .autocorrelation import independent_samples
 from .channel_sigma import predicted_exactly, too_short
 from .channels import channels_of
+from .doubt import PARTNERS, doubt_of
 from .experiment import Experiment
 from .experiment_statistics import deciding, ended_inputs, own_estimates, predictions_of, with_estimates
 from .identifiability import correlation_of
-from .levenberg_marquardt import CONVERGED, INTERRUPTED, REASONS, STEP_LIMIT, UNRELATED, Outcome
+from .levenberg_marquardt import CONVERGED, INTERRUPTED, KINKED, REASONS, STEP_LIMIT, UNRELATED, Outcome
 from .linear_test import in_given_order
 from .linear_test_statistics import channels_of_test, doubts, predicted_tests
 from .minimum import Minimum
 from .multiple_shooting import Segments
 from .parameter_stability import different_halves
 from .problem import Problem
-from .remarks import NO_ERRORS, UNRELATED_SIZE, on_bounds, on_exact, on_halves, on_inputs, on_misfit, on_too_short, on_undetermined
+from .remarks import (
+    NO_ERRORS,
+    UNEXPLAINED,
+    UNRELATED_SIZE,
+    on_bounds,
+    on_exact,
+    on_halves,
+    on_inputs,
+    on_misfit,
+    on_no_freedom,
+    on_too_short,
+    on_undetermined,
+)
 from .result import Fit
 from .uncertainty import Uncertainty, uncertainty_of, undetermined_parameters
 
@@ -36,15 +49,19 @@ def report(problem: Problem, experiments: Sequence[Any], outcome: Outcome, segme
     noise = _noise(minimum, uncertainty)
     scale = 1.0 if minimum.absolute and problem.model.loss is None else noise["sigma"]
     predictions = _predictions(minimum, uncertainty, scale)
+    parameters = _parameters(minimum, uncertainty, scale)
+    freedom = noise["measurements"] - noise["exact"] - noise["unknown_count"]
+    is_noise = minimum.absolute and noise["sigma"] <= UNEXPLAINED
+    doubt = doubt_of(parameters, minimum.theta, minimum.problem.free.start, predictions["channels"], is_noise)
     return Fit(
         problem=problem,
         x=minimum.x,
         **noise,
-        **_parameters(minimum, uncertainty, scale),
+        **parameters,
         **_unknowns(minimum, uncertainty, scale),
         **predictions,
-        **_end(minimum),
-        remarks=[*_on_sigma(minimum), *_remarks(minimum, uncertainty, noise["sigma"], predictions["channels"])],
+        **_end(minimum, doubt),
+        remarks=[*_on_sigma(minimum), *_remarks(minimum, uncertainty, noise["sigma"], predictions["channels"], freedom)],
     )
 
 
@@ -133,7 +150,7 @@ def _predictions(minimum: Minimum, uncertainty: Uncertainty, scale: float) -> Fi
     }
 
 
-def _remarks(minimum, uncertainty, sigma, channels):
+def _remarks(minimum, uncertainty, sigma, channels, freedom):
     """What the reader of the card should know."""
     free, p = minimum.problem.free, minimum.size
     remarks, at_bounds = [], []
@@ -149,8 +166,15 @@ def _remarks(minimum, uncertainty, sigma, channels):
     unfinished = int(minimum.outcome.best.status) in (STEP_LIMIT, INTERRUPTED)  # halves are compared at a minimum
     different = None if unfinished else different_halves(minimum, uncertainty)
     halves = on_halves(free.entries, different, len(minimum.recordings))
-    misfit = on_misfit(_relative_size(minimum), times_noise, independent, halves, channels, explained=bool(at_bounds))
-    return [*remarks, *at_bounds, *doubts(minimum), *on_inputs(ended_inputs(minimum.recordings, free.params)), *misfit]
+    misfit = on_misfit(_relative_size(minimum), times_noise, independent, halves, channels, bool(at_bounds), bool(minimum.recordings))
+    return [
+        *remarks,
+        *on_no_freedom(minimum.measurements, minimum.measurements - freedom),
+        *at_bounds,
+        *doubts(minimum),
+        *on_inputs(ended_inputs(minimum.recordings, free.params)),
+        *misfit,
+    ]
 
 
 def _on_sigma(minimum):
@@ -159,13 +183,14 @@ def _on_sigma(minimum):
     return [*on_too_short(too_short(minimum.problem)), *on_exact(predicted_exactly(minimum.problem, minimum.found))]
 
 
-def _end(minimum: Minimum) -> Fields:
-    """How the iteration ended."""
+def _end(minimum: Minimum, doubt: str) -> Fields:
+    """How the iteration ended; where it did at what is hardly a fit, the `doubt` is the reason."""
     outcome = minimum.outcome
     status = int(outcome.best.status)
     if status in (CONVERGED, STEP_LIMIT) and _relative_size(minimum) > UNRELATED_SIZE:
         status = UNRELATED
-    return {"converged": status == CONVERGED, "reason": REASONS[status], "steps": outcome.steps, "costs": outcome.costs}
+    reason = doubt if status == CONVERGED and doubt else PARTNERS if status == KINKED and not minimum.recordings else REASONS[status]
+    return {"converged": status == CONVERGED and not doubt, "reason": reason, "steps": outcome.steps, "costs": outcome.costs}
 
 
 def _relative_size(minimum):

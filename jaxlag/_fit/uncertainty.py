@@ -33,6 +33,7 @@ def uncertainty_of(minimum: Minimum) -> Uncertainty:
         return Uncertainty(known, None, np.ones(p), 0)
     known = determined_by(J, np.asarray(minimum.found.gaps_jacobian))
     covariance, correlated = sandwich(minimum, J, known.covariance, _influences(minimum))
+    np.fill_diagonal(covariance, np.maximum(np.diag(covariance), 0))  # where nothing is determined, rounding may leave less
     after, before = (np.diag(c)[:p] for c in (covariance, known.covariance))
     inflation = np.sqrt(np.where(before > 0, after / np.where(before > 0, before, 1), 1))
     return Uncertainty(known._replace(covariance=covariance), J, inflation, correlated)

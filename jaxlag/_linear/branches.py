@@ -1,4 +1,4 @@
-"""Branches of eigenvalues followed over a parameter, and where they cross the imaginary axis."""
+"""Eigenvalue branches followed over a parameter, and their crossings of the imaginary axis."""
 
 import functools
 import itertools
@@ -11,7 +11,7 @@ FINER = 8  # steps between two values that a user asks for
 
 
 class Spectrum(NamedTuple):
-    """Eigenvalues at one value of the parameter, with eigenvectors as columns and what rounding does to each."""
+    """Eigenvalues at one value of the parameter, with eigenvectors as columns and the rounding error of each eigenvalue."""
 
     at: float
     values: np.ndarray
@@ -19,16 +19,16 @@ class Spectrum(NamedTuple):
     rounding: np.ndarray
 
     def taken(self, order: np.ndarray) -> "Spectrum":
-        """In another order."""
+        """The spectrum in another order."""
         return Spectrum(self.at, self.values[order], self.vectors[:, order], self.rounding[order])
 
     def growing(self, least: np.ndarray) -> np.ndarray:
-        """Which eigenvalues grow by more than rounding, and than `least`; of a pair both or none."""
+        """Mask of eigenvalues that grow by more than rounding and `least`; both of a conjugate pair or neither."""
         return self.values.real > np.maximum(least, self.rounding_of_pairs)
 
     @property
     def rounding_of_pairs(self) -> np.ndarray:
-        """What rounding does to each eigenvalue or to its conjugate, whichever is more."""
+        """The rounding error of each eigenvalue or of its conjugate, whichever is larger."""
         if not self.values.size:
             return self.rounding
         other = np.argmin(np.abs(self.values[:, None].conj() - self.values[None, :]), axis=1)
@@ -36,22 +36,22 @@ class Spectrum(NamedTuple):
 
 
 class Transition(NamedTuple):
-    """Where an eigenvalue begins or ceases to grow, with the spectrum just on the growing side, and which of it that is."""
+    """The point at which an eigenvalue begins or ceases to grow, the spectrum just on the growing side, and its index there."""
 
     at: float
     which: int
     grows: bool  # beyond this value
     spectrum: Spectrum
-    far: float  # the farther end of the step in which it lies
+    far: float  # the farther end of the step that contains it
 
     @property
     def eigenvalue(self) -> complex:
-        """The one that begins or ceases to grow."""
+        """The eigenvalue that begins or ceases to grow."""
         return self.spectrum.values[self.which]
 
 
 def continued(before: Spectrum, after: Spectrum) -> Spectrum:
-    """The eigenvalues in the order of those before: near them, with eigenvectors that are alike."""
+    """The spectrum `after` in the order of `before`, matched by nearby eigenvalues and similar eigenvectors."""
     from scipy.optimize import linear_sum_assignment  # imported here because that takes a while
 
     size = max(np.max(np.abs(before.values), initial=0.0), np.finfo(float).tiny)
@@ -62,7 +62,7 @@ def continued(before: Spectrum, after: Spectrum) -> Spectrum:
 
 
 def finer(values: np.ndarray) -> list[float]:
-    """The values, and others between them."""
+    """The values and intermediate ones."""
     between = [np.linspace(*ends, FINER + 1)[1:] for ends in itertools.pairwise(values)]
     return [float(at) for at in np.concatenate([values[:1], *between])]
 
@@ -72,7 +72,7 @@ def _unit(vectors):
 
 
 def followed(spectrum_at: Callable[[float], Spectrum], values: np.ndarray) -> tuple[list[Spectrum], list[Transition]]:
-    """The spectra at the values, their branches in one order, and the transitions in between."""
+    """The spectra at the values, with branches in one order throughout, and the transitions in between."""
     spectrum_at = functools.cache(spectrum_at)
     first, *others = finer(values)
     spectra = [spectrum_at(first)]
@@ -84,20 +84,20 @@ def followed(spectrum_at: Callable[[float], Spectrum], values: np.ndarray) -> tu
 
 
 def _transitions(spectrum_at: Callable, before: Spectrum, after: Spectrum) -> list[Transition]:
-    """Those of all branches between two spectra, in their order; of a pair once.
+    """Transitions of all branches between two spectra, in order; one for each conjugate pair.
 
-    With bounds of rounding for each branch that are those of both ends at least: in between they flicker, and would be crossed twice.
+    The rounding bound of each branch is at least the bound at both ends: in between it flickers and would be crossed twice.
     """
     bound = np.maximum(before.rounding_of_pairs, after.rounding_of_pairs)
     changed = np.flatnonzero(before.growing(bound) != after.growing(bound))
     found = [of for which in changed if (of := _transition(spectrum_at, before, after, bound, int(which))) is not None]
-    if len(found) < len(changed):  # branches that meet, as in flutter without damping, are not told apart: they are counted
+    if len(found) < len(changed):  # branches that meet, as in flutter without damping, cannot be told apart: count them
         return list(_by_number(spectrum_at, before, after, bound))
     return sorted((of for of in found if of.eigenvalue.imag >= -bound[of.which]), key=lambda of: of.at)
 
 
 def _by_number(spectrum_at: Callable, before: Spectrum, after: Spectrum, bound: np.ndarray) -> Iterator[Transition]:
-    """Transitions one after the other: each where the number of growing eigenvalues changes."""
+    """Transitions in sequence, at each change in the number of growing eigenvalues."""
     count = lambda spectrum: np.sum(spectrum.growing(bound))
     ends = before.at, after.at
     while count(before) != count(after):
@@ -114,7 +114,7 @@ def _by_number(spectrum_at: Callable, before: Spectrum, after: Spectrum, bound: 
 
 
 def _transition(spectrum_at: Callable, before: Spectrum, after: Spectrum, bound: np.ndarray, which: int) -> Transition | None:
-    """Where one branch begins or ceases to grow, by bisection along it; None where it was mistaken for another at the far end."""
+    """The transition of one branch, by bisection along it; None if the branch was mistaken for another at the far end."""
     grows = lambda spectrum: bool(spectrum.growing(bound)[which])
     low, high = before, after
     while (middle := (low.at + high.at) / 2) not in (low.at, high.at):

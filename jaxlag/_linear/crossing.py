@@ -1,4 +1,4 @@
-"""Where an eigenvalue crosses the imaginary axis: the value of the parameter to rounding, and how it moves with all others."""
+"""Crossings of the imaginary axis: the value of the parameter to rounding, and its derivative with respect to all others."""
 
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -16,9 +16,9 @@ from .branches import Transition
 from .matrices import Choice, matrices
 from .zero_eigenvalues import Core
 
-STEPS = 5  # of Newton's method, from a crossing that was bracketed to where rounding decides
+STEPS = 5  # of Newton's method, from a bracketed crossing down to rounding
 MEET = 1e-5  # yᴴx of unit vectors below which two eigenvalues meet in one eigenvector
-FEW = 256  # numbers by which A is differentiated forward; of more, backward
+FEW = 256  # most variables for which A is differentiated in forward mode; with more, in reverse mode
 
 
 class Crossing(eqx.Module):
@@ -35,8 +35,8 @@ class Crossing(eqx.Module):
 def located(matrix: Callable[[float], np.ndarray], transition: Transition) -> tuple[float, complex]:
     """The parameter p at a transition and the eigenvalue there: Newton's method on Re(yᴴ A(p) x/yᴴx).
 
-    Bracketing ends where Re λ is what rounding may make of it. The quotient has the square of the errors of x and y, so that what is left
-    is a hundredth of this and less. Where two eigenvalues meet in one eigenvector it is not smooth, and the bracket is what there is.
+    Bracketing ends when Re λ is within rounding of zero. The error of the quotient is quadratic in the errors of x and y, so a hundredth of
+    this or less remains. Where two eigenvalues meet in one eigenvector, the quotient is not smooth, and the bracket is the result.
     """
     at, value = transition.at, transition.eigenvalue
     for _ in range(STEPS):
@@ -56,7 +56,7 @@ def located(matrix: Callable[[float], np.ndarray], transition: Transition) -> tu
 
 
 def _eigenvectors(A: np.ndarray, value: complex) -> tuple[np.ndarray, np.ndarray]:
-    """yᴴ and x of the eigenvalue next to a value, of length 1."""
+    """Left and right unit eigenvectors yᴴ and x of the eigenvalue nearest to a value."""
     import scipy.linalg  # imported here because that takes a while
 
     values, left, right = scipy.linalg.eig(A, left=True, right=True)
@@ -73,7 +73,8 @@ def moving(
     state: Callable[[Any], PyTree],
     moved: PyTree,
 ) -> Float[Array, ""]:
-    """The parameter at a crossing, differentiable once in what is `moved`, on which A depends; `state` gives that by the parameter alone.
+    """The parameter at a crossing, differentiable once in `moved`, on which A depends; `state` gives the state as a function of the
+    parameter alone.
 
     dp = −Re(yᴴ dA x/yᴴx)/Re(yᴴ A' x/yᴴx). Where two eigenvalues meet in one eigenvector, yᴴx = 0, and yᴴ (dA + A' dp) x = 0 keeps them
     together.
@@ -91,7 +92,7 @@ def moving(
 
 @compiled
 def _projected(weights: Float[Array, "k d d"], choice: Choice, system: System, t: Any, state: PyTree) -> list[Float[Array, "k ..."]]:
-    """Derivatives of Σ W A for each W, by each array of a state; of A itself nothing is left to compile."""
+    """Derivatives of Σ W A for each W with respect to each array of a state; A itself needs no compilation of its own."""
     leaves, structure = jax.tree.flatten(state)
     moves = [_is_number(leaf) for leaf in leaves]
     flat, unravel = ravel_pytree(_numbers(state))
@@ -110,13 +111,13 @@ def _is_number(leaf):
 
 
 def _numbers(tree: PyTree) -> Sequence[Any]:
-    """The arrays that can be moved."""
+    """The arrays that can vary."""
     return [leaf for leaf in jax.tree.leaves(tree) if _is_number(leaf)]
 
 
 @jax.custom_jvp
 def _moving(at, gradient, numbers):
-    """The value at a crossing, which moves with numbers: differentiable once."""
+    """The value at a crossing, differentiable once in `numbers`."""
     return at
 
 

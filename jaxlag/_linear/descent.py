@@ -1,4 +1,4 @@
-"""Minima of a potential on the constraints, by Newton's method that goes downhill."""
+"""Minima of a potential on the constraints, by a descending Newton method."""
 
 from collections.abc import Callable
 from typing import Any
@@ -15,10 +15,10 @@ STEPS = 200
 
 
 def minimum_near(V: Callable, g: Callable, q: Float[Array, " n"], moving: Any, units: Float[Array, " n"]) -> Float[Array, " n"]:
-    """A minimum of V on g = 0, in which only `moving` coordinates move: good to some digits, for a root of the equations to go on from.
+    """A minimum of V on g = 0 in the `moving` coordinates alone, accurate to some digits: a start for the root of the equations.
 
-    On the tangent space of g, Newton's step with the sizes of the curvatures, also of negative ones; from a saddle or a maximum along
-    the most negative one. A step is put back on the constraints, and halved until V is lower. All is measured in `units`.
+    Newton's step on the tangent space of g uses the absolute values of the curvatures; from a saddle or a maximum, the step follows the
+    most negative curvature. Each step is projected onto the constraints and halved until V decreases. Everything is measured in `units`.
 
     Source: Absil, Mahony & Sepulchre, Optimization Algorithms on Matrix Manifolds, section 4.1; Gill & Murray, Math. Programming 7 (1974).
     """
@@ -69,14 +69,14 @@ def minimum_near(V: Callable, g: Callable, q: Float[Array, " n"], moving: Any, u
 
 
 def _inverse(G: Float[Array, "m n"]) -> Float[Array, "n m"]:
-    """G⁺, each row in its own unit."""
+    """G⁺, with each row of G in its own unit."""
     size = jnp.linalg.norm(G, axis=1, keepdims=True)
     unit = jnp.where(size > 0, 1 / jnp.where(size > 0, size, 1), 1)
     return jnp.linalg.pinv(unit * G, rtol=jnp.finfo(G.dtype).eps ** CLEAR) * unit.T
 
 
 def far_down(V: Callable, h: Float[Array, ""]) -> Float[Array, ""]:
-    """How far to go down from a saddle: h, or, where that is zero since the saddle is at zero, as far as V falls, found by doubling."""
+    """The distance to descend from a saddle: h, or, if h is zero because the saddle is at zero, as far as V falls, found by doubling."""
     limits = jnp.finfo(h.dtype).tiny ** 0.25, jnp.finfo(h.dtype).max ** 0.25
     going_on = lambda h: (h > 0) & (h < limits[1]) & (V(2 * h) <= V(h))
     found = repeated(lambda h: 2 * h, jnp.where(h > 0, 0, limits[0] / 2).astype(h.dtype), going_on)

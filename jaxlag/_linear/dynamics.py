@@ -1,4 +1,4 @@
-"""Motion, constraints and outputs of a system as functions of its whole state and of its inputs, as vectors."""
+"""Motion, constraints and outputs of a system as vector functions of its whole state and inputs."""
 
 import dataclasses
 from collections.abc import Callable
@@ -25,7 +25,7 @@ from .inputs import Input, Motion, moved_forces, moved_params, moved_states
 
 
 class Whole(NamedTuple):
-    """The whole state: q, q̇ and the states z of first order."""
+    """The whole state: q, q̇ and the first-order states z."""
 
     q: Float[Array, " n"]
     v: Float[Array, " n"]
@@ -41,7 +41,7 @@ class Forces(NamedTuple):
 
 
 class Balance(NamedTuple):
-    """What a state, q̈ and λ make: M q̈ − f − Gᵀλ and G q̈ + γ, ż, the outputs, and what sampled states would become."""
+    """The quantities that follow from a state, q̈ and λ: M q̈ − f − Gᵀλ, G q̈ + γ, ż, the outputs, and the updates of sampled states."""
 
     imbalance: Float[Array, " n"]
     constraint_rate: Float[Array, " l"]
@@ -52,7 +52,7 @@ class Balance(NamedTuple):
 
 @dataclasses.dataclass(frozen=True)
 class Dynamics:
-    """A system with its parameters at one time, around which state and inputs are moved."""
+    """A system with its parameters at one time, whose state and inputs are moved."""
 
     system: System
     like: Layout  # of q
@@ -74,7 +74,7 @@ class Dynamics:
         return moved_params(self.inputs, self.params, self.t, motion)
 
     def constraints(self, y: Whole, motion: Motion) -> tuple[Float[Array, " h"], Float[Array, " l"]]:
-        """g and ψ, where dry friction sticks with its slip among them, and behind them how far ż of what has no inertia is off."""
+        """g and ψ, including the slip of dry friction that sticks, followed by the velocity errors of coordinates without inertia."""
         flat = self.at(y, motion)
         mode = in_current_mode(flat, self.t, y.q, y.v)
         z, _ = first_order(mode, self.t, y.q, y.v)
@@ -87,14 +87,14 @@ class Dynamics:
         return Forces(*scalarised(lambda t, q, v: constrained_acceleration(mode, t, q, v))(self.t, y.q, y.v))
 
     def balance(self, y: Whole, qddot: Array, multipliers: Array, motion: Motion) -> Balance:
-        """The equations of motion and all that goes with them."""
+        """The equations of motion and the quantities that go with them."""
         flat = self.at(y, motion)
         mode = in_current_mode(flat, self.t, y.q, y.v)
         off, constraint_rate = imbalance(mode, self.t, y.q, y.v, qddot, multipliers)
         return Balance(off, constraint_rate, *self.driven(y, qddot, multipliers, motion))
 
     def driven(self, y: Whole, qddot: Array, multipliers: Array, motion: Motion) -> tuple[Array, Array, Array]:
-        """ż of states, the outputs, and what sampled states would become."""
+        """ż, the outputs, and the updates of sampled states."""
         flat = self.at(y, motion)
         z, updates = (ravelled(of(self.t, y.q, y.v), y.q.dtype) for of in (flat.state_rates, flat.updates))
         return z, self._outputs(flat, y, qddot, multipliers, motion), updates
@@ -122,7 +122,7 @@ class Dynamics:
         )
 
     def output_shapes(self, y: Whole, rows: int) -> PyTree:
-        """What the outputs return, in shapes alone."""
+        """The shapes that the outputs return."""
         nothing = jnp.zeros(rows, y.q.dtype)
         return jax.eval_shape(lambda y: self._seen(self.at(y, self.still()), y, y.v, nothing, self.still()), y)
 

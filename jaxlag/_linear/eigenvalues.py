@@ -1,4 +1,4 @@
-"""Eigenvalues and eigenvectors that are differentiated to any order, repeated ones as one."""
+"""Eigenvalues and eigenvectors, differentiable to any order; repeated ones are treated as one."""
 
 from typing import Any, NamedTuple
 
@@ -12,7 +12,7 @@ TURNS = 60  # of the scaling of a matrix
 
 
 class Eigen(NamedTuple):
-    """Eigenvalues and, as columns, eigenvectors, of each the largest entry 1."""
+    """Eigenvalues, and eigenvectors as columns, each with largest entry 1."""
 
     values: Complex[Array, " d"]
     vectors: Complex[Array, "d d"]
@@ -20,7 +20,8 @@ class Eigen(NamedTuple):
 
 @jax.custom_jvp
 def eigen(A: Float[Array, "d d"]) -> Eigen:
-    """Those of A, sorted by |λ|. Where A is block triangular to rounding, as with coordinates on which nothing depends, it is so exactly.
+    """Eigenvalues and eigenvectors of A, sorted by |λ|. If A is block triangular to rounding, as with coordinates on which nothing depends,
+    it is made so exactly.
 
     Derivatives of repeated eigenvalues are those of their mean, which alone is smooth.
 
@@ -40,10 +41,10 @@ def eigen(A: Float[Array, "d d"]) -> Eigen:
 
 @eigen.defjvp
 def _eigen_rule(primals: Any, tangents: Any) -> Any:
-    """dλ = tr(P dA)/k, of the k eigenvalues that are λ, and dx = Q dA x, but so that the largest entry of x stays 1.
+    """dλ = tr(P dA)/k for the k eigenvalues equal to λ, and dx = Q dA x, normalised so that the largest entry of x stays 1.
 
-    P projects on the eigenspace of λ and Q is (λ − A)⁻¹ on all others: integrals of (z − A)⁻¹ around λ, which do not ask whether there are
-    enough eigenvectors. Source: Kato, Perturbation Theory for Linear Operators, sections II.1.4 and II.2.
+    P projects onto the eigenspace of λ, and Q is (λ − A)⁻¹ on all others: integrals of (z − A)⁻¹ around λ, which exist even if there are
+    too few eigenvectors. Source: Kato, Perturbation Theory for Linear Operators, sections II.1.4 and II.2.
     """
     (A,), (dA,) = primals, tangents
     found = values, vectors = eigen(A)
@@ -52,7 +53,7 @@ def _eigen_rule(primals: Any, tangents: Any) -> Any:
     fixed = jax.lax.stop_gradient(values)
     same = are_repeated(fixed, rounding(A, vectors))
     gap = jnp.min(jnp.where(same, jnp.inf, jnp.abs(fixed[None, :] - fixed[:, None])), axis=1)
-    radius = jnp.where(jnp.isfinite(gap), gap / 3, 1 + jnp.abs(fixed))  # what lies three radii away counts 3⁻³² of itself
+    radius = jnp.where(jnp.isfinite(gap), gap / 3, 1 + jnp.abs(fixed))  # an eigenvalue three radii away contributes 3⁻³² of itself
     circle = jnp.exp(2j * jnp.pi * (np.arange(POINTS) + 0.5) / POINTS).astype(values.dtype)
 
     def of(one):
@@ -69,7 +70,7 @@ def _eigen_rule(primals: Any, tangents: Any) -> Any:
 
 @jax.custom_jvp
 def symmetric_eigen(A: Float[Array, "d d"]) -> tuple[Float[Array, " d"], Float[Array, "d d"]]:
-    """Those of a symmetric matrix, ascending, with orthonormal eigenvectors of which the largest entry is positive."""
+    """Eigenvalues of a symmetric matrix, ascending, and orthonormal eigenvectors whose largest entry is positive."""
     values, vectors = jnp.linalg.eigh(A)
     values = jnp.where(jnp.abs(values) <= _symmetric_rounding(A), 0, values)
     return values, vectors * jnp.sign(jnp.take_along_axis(vectors, _largest(vectors), axis=0)) if len(A) else vectors
@@ -85,19 +86,19 @@ def _symmetric_rule(primals: Any, tangents: Any) -> Any:
 
 
 def are_repeated(values: Array, bound: Array) -> Array:
-    """Which eigenvalues are the same, as far as can be told."""
+    """Mask of pairs of eigenvalues that are equal to rounding."""
     return jnp.abs(values[None, :] - values[:, None]) <= 2 * jnp.minimum(bound[None, :], bound[:, None])
 
 
 def rounding(A: Float[Array, "d d"], vectors: Complex[Array, "d d"]) -> Float[Array, " d"]:
-    """How far rounding moves each eigenvalue: what it moves A, times the sensitivity of the eigenvalue, ‖y‖ ‖x‖/|yᴴx|."""
+    """The rounding error of each eigenvalue: the rounding error of A times the sensitivity of the eigenvalue, ‖y‖ ‖x‖/|yᴴx|."""
     A, vectors = jax.lax.stop_gradient((A, vectors))
     scale, size = balanced(A)
     vectors = vectors / scale[:, None]
     vectors = vectors / jnp.linalg.norm(vectors, axis=0, keepdims=True)
     U, s, Vh = jnp.linalg.svd(vectors)
     left = (Vh.conj().T / jnp.maximum(s, jnp.finfo(s.dtype).eps)[None, :]) @ U.conj().T
-    sensitivity = jnp.minimum(jnp.linalg.norm(left, axis=1), jnp.finfo(s.dtype).eps ** -0.5)  # as of a double one with one eigenvector
+    sensitivity = jnp.minimum(jnp.linalg.norm(left, axis=1), jnp.finfo(s.dtype).eps ** -0.5)  # as for a double one with one eigenvector
     return 10 * len(A) * jnp.finfo(A.dtype).eps * size * sensitivity
 
 
@@ -107,15 +108,16 @@ def _symmetric_rounding(A):
 
 
 def _largest(vectors):
-    """Where each column is largest; the first of several places."""
+    """The row of the largest entry in each column; the first of several."""
     size = jnp.abs(vectors)
     return jnp.argmax(size >= (1 - 1e-6) * jnp.max(size, axis=0, keepdims=True), axis=0)[None, :]
 
 
 def balanced(A: Float[Array, "d d"]) -> tuple[Float[Array, " d"], Float[Array, ""]]:
-    """A diagonal scaling D, in powers of two, after which rows and columns of D⁻¹AD are about the same size, and the largest entry.
+    """A diagonal scaling D, in powers of two, for which rows and columns of D⁻¹AD have about the same size, and the largest entry.
 
-    With their diagonal: what is coupled one way only could be scaled for ever, and is until the coupling is no larger than that.
+    Sizes include the diagonal: a one-way coupling could be scaled down for ever, but is only scaled until it is no larger than the
+    diagonal.
     """
     A = jnp.abs(jax.lax.stop_gradient(A))
 

@@ -1,4 +1,4 @@
-"""Equilibria and steady motions: where nothing accelerates."""
+"""Equilibria and steady motions: states in which nothing accelerates."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -65,7 +65,7 @@ class Equilibrium(eqx.Module):
 
 
 def _listed(tree: PyTree) -> str:
-    """The numbers by name: of many the first."""
+    """The numbers by name; if there are many, only the first ones."""
     numbers = [f"{name} = {x:.6g}" for name, x in zip(entry_names(tree, "q"), without_dust(np.asarray(ravel_pytree(tree)[0])), strict=True)]
     return ", ".join(numbers if len(numbers) <= MOST_LISTED else [*numbers[: MOST_LISTED // 2], f"… ({len(numbers)} in all)"])
 
@@ -74,7 +74,7 @@ MOST_LISTED = 24
 
 
 def without_dust(x: np.ndarray) -> np.ndarray:
-    """With 0 for what is zero within rounding, as the search sees it: in parts of 1 + |x|."""
+    """x with 0 for entries that are zero within rounding, relative to 1 + |x| as in the search."""
     return np.where(np.abs(x) <= 8 * np.finfo(x.dtype).eps * (1 + np.max(np.abs(x), initial=0.0)), 0.0, x)
 
 
@@ -170,7 +170,7 @@ def steady(
 
 
 def _entries(q, names, label):
-    """The numbers of q that the names stand for."""
+    """Indices of the entries of q that the names stand for."""
     names, entries = listed(names, label), entry_names(q, "q")
     for name in names:
         if not any(is_within(entry, name) for entry in entries):
@@ -179,7 +179,7 @@ def _entries(q, names, label):
 
 
 def _found(system: System, q: PyTree, qdot: PyTree, params: PyTree, t: Any, states: PyTree, search: Search) -> Equilibrium:
-    """The result of a search, and of one in which friction holds, where there is no other."""
+    """The result of a search or, if it fails, of a search in which friction holds."""
     without_contacts(system, "`equilibrium` and `steady`")
     if search.stable and system.force:
         terms = ", ".join(repr(name) for name, _ in system.force)
@@ -205,7 +205,7 @@ def _found(system: System, q: PyTree, qdot: PyTree, params: PyTree, t: Any, stat
 
 
 def _near(search, *given):
-    """Of many coordinates in their structure, where they have one; where that finds none and they are not too many, as of few."""
+    """The sparse search for many coordinates, if they have structure; if it finds nothing and they are not too many, the dense search."""
     _, _, q, *_ = given
     found = many_at_rest(search, *given) if sum(np.size(leaf) for leaf in jax.tree.leaves(q)) >= MANY else None
     if found is None:
@@ -220,7 +220,7 @@ def _near(search, *given):
 
 
 def _refuse(found, names):
-    """Raises where nothing was found."""
+    """Raises if nothing was found."""
     if found.succeeded and found.uniform:
         return
     if found.succeeded:

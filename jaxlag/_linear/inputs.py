@@ -14,11 +14,11 @@ from .._model.paths import entry_names, is_within, labels, leaf_names, listed
 from .._model.signal import is_signal
 from .._model.states import Flowing
 
-Motion = tuple[Float[Array, " m"], Float[Array, " m"], Float[Array, " m"]]  # w, ẇ, ẅ: inputs move, as constraints feel it
+Motion = tuple[Float[Array, " m"], Float[Array, " m"], Float[Array, " m"]]  # w, ẇ, ẅ: inputs and their rates, which constraints feel
 
 
 class Input(NamedTuple):
-    """One number that is moved: which one of what `where` names."""
+    """One number that is moved: entry `number` of the object at `where`."""
 
     name: str
     kind: str  # "parameter", "signal", "force on a coordinate", "force", "holonomic", "nonholonomic" or "sampled"
@@ -27,7 +27,7 @@ class Input(NamedTuple):
 
 
 def find_inputs(names: Sequence[str], params: PyTree, q: PyTree, flat: Flat, sampled: PyTree) -> tuple[Input, ...]:
-    """What the names stand for, one for each number."""
+    """The inputs that the names stand for, one for each number."""
     names, known = listed(names, "inputs"), list(_candidates(params, q, flat, sampled))
     found: list[Input] = []
     for name in names:
@@ -62,7 +62,7 @@ def _candidates(params: PyTree, q: PyTree, flat: Flat, sampled: PyTree) -> Itera
 
 
 def moved_params(inputs: tuple[Input, ...], params: PyTree, t: Any, motion: Motion) -> PyTree:
-    """`params` with its inputs moved: each as it flows from t on."""
+    """`params` with its inputs moved, each as a flow from t on."""
     leaves, structure = jax.tree.flatten(params, is_leaf=is_signal)
     for i in {entry.where for entry in inputs if entry.kind in ("parameter", "signal")}:
         own = [(number, entry) for number, entry in enumerate(inputs) if entry.where == i and entry.kind in ("parameter", "signal")]
@@ -99,7 +99,7 @@ def moved_forces(inputs: tuple[Input, ...], flat: Flat, t: Any, motion: Motion) 
 
 
 def moved_states(inputs: tuple[Input, ...], sampled: Float[Array, " s"], motion: Motion) -> Float[Array, " s"]:
-    """The sampled states, as if they were given from outside."""
+    """The sampled states with their inputs moved, as if given from outside."""
     for i, entry in enumerate(inputs):
         sampled = sampled.at[entry.where].add(motion[0][i]) if entry.kind == "sampled" else sampled
     return sampled

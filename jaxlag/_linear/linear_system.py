@@ -29,7 +29,7 @@ from .tangent_space import Partition
 
 
 class Coordinates(eqx.Module):
-    """How vectors of a linear system are those of the system it was made of."""
+    """The map from vectors of a linear system to vectors of the original system."""
 
     partition: Partition = eqx.field(static=True)
     q: Layout = eqx.field(static=True)
@@ -108,7 +108,7 @@ class LinearSystem(eqx.Module):
         n, mass = self.coordinates.q.size, self.mass if normalise == "mass" else None
         scaled = lambda found: found._replace(vectors=normalised(found.vectors, self.basis[:n, : len(found.vectors)] @ found.vectors, mass))
         found = scaled(found)
-        if conservative and not is_concrete(order):  # differentiated: by what would damp or turn them, too
+        if conservative and not is_concrete(order):  # differentiated, also with respect to damping, gyroscopic and circulatory terms
             found = with_derivatives_of(found, scaled(undamped(of_first_order(self.A, None))))
         d, vectors = len(found.vectors), found.vectors
         q, z, forces = self.basis[:n, :d] @ vectors, self.basis[2 * n :, :d] @ vectors, self.constraint_forces[:, :d] @ vectors
@@ -243,7 +243,7 @@ def _halves(x):
 
 @compiled
 def _eigenvalues(A):
-    """Those of a matrix, or of each of many."""
+    """Eigenvalues of a matrix, or of each in a batch."""
     of = lambda A: eigen(A).values
     for _ in range(A.ndim - 2):
         of = jax.vmap(of)
@@ -251,7 +251,7 @@ def _eigenvalues(A):
 
 
 def _unravelled(layout, x):
-    """A pytree like the one laid out, of numbers that may be complex."""
+    """A pytree of the given layout, with numbers that may be complex."""
     sizes = [int(np.prod(shape)) for shape, _ in layout.leaves]
     parts = jnp.split(x, np.cumsum(sizes)[:-1]) if sizes else []
     return jax.tree.unflatten(layout.structure, [part.reshape(shape) for part, (shape, _) in zip(parts, layout.leaves, strict=True)])

@@ -112,14 +112,14 @@ def linearise(
 
 
 def _with_constraints(system: System, t: Any, q: PyTree, qdot: PyTree, params: PyTree, states: PyTree) -> tuple[PyTree, PyTree]:
-    """The state as it is given, with derivatives that keep it on its constraints."""
+    """The given state, with derivatives that keep it on its constraints."""
     nearest = consistent_state(system, q, qdot, params, t=t, states=states)
     fixed = jax.lax.stop_gradient
     return jax.tree.map(lambda x, nearest: fixed(x) + (nearest - fixed(nearest)), (q, qdot), nearest)
 
 
 class _Near:
-    """A state of a system, its names, and what can be chosen near it."""
+    """A state of a system, its names, and the choices near it."""
 
     def __init__(self, system: System, at: Any, params: PyTree):
         t, q, qdot, states = at
@@ -132,11 +132,11 @@ class _Near:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Those of the coordinates, then of the states."""
+        """Names of the coordinates, then of the states."""
         return (*self.entries, *entry_names(self.first_order), *entry_names(self.sampled))
 
     def choice(self, inputs: Sequence[str], outputs: Callable | None, independent: Any) -> Choice:
-        """What is moved, what is seen, and which coordinates are independent."""
+        """The inputs, the outputs and the independent coordinates."""
         if outputs is not None:
             check_function(outputs, "`outputs`")
         _, q, _, params, _ = self.given
@@ -179,7 +179,7 @@ HIDDEN = (
 
 
 def _linear_system(near: _Near, choice: Choice, found: Matrices, q: PyTree, qdot: PyTree, origin: Origin | None) -> LinearSystem:
-    """What was found, with its names; in discrete time where sampled states update themselves."""
+    """The matrices as a `LinearSystem` with names; in discrete time if sampled states update themselves."""
     _, like, _, params, _ = near.given
     dynamics, y = dynamics_of(near.system, like, params, near.at, choice.inputs, choice.outputs)
     at = choice.partition

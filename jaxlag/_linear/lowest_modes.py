@@ -1,4 +1,4 @@
-"""The lowest modes of many coordinates, each coupled to a few: no array of all by all."""
+"""The lowest modes of many coordinates, each coupled to a few, without dense matrices."""
 
 from typing import Any, NamedTuple
 
@@ -23,7 +23,7 @@ from .origin import Origin
 from .pencil import CURE, along_modes, left_over, pencil
 from .sparse_modes import Found, Matrices, modes_near
 
-STILL = 0.375  # exponent of eps: forces that are left at rest, in parts of their terms
+STILL = 0.375  # exponent of eps: tolerance on residual forces at rest, relative to their terms
 
 
 def lowest_modes(system: System, q: Any, params: PyTree = None, *, count: int = 10, shift: float = 0.0, t: Any = 0.0) -> Modes:
@@ -79,7 +79,7 @@ def lowest_modes(system: System, q: Any, params: PyTree = None, *, count: int = 
 
 
 def _refuse(system: System) -> None:
-    """Raises where a system has more than forces and positions."""
+    """Raises if a system has contacts, nonholonomic constraints, states or events."""
     without_contacts(system, "`lowest_modes`")
     for what in ("nonholonomic", "states", "events"):
         if getattr(system, what):
@@ -87,7 +87,7 @@ def _refuse(system: System) -> None:
 
 
 def _at_rest(system: System, known: tuple, names: tuple[str, ...]) -> tuple[np.ndarray, Matrices]:
-    """λ, which balances the forces best, and the pencil with it; refused where forces are left."""
+    """The λ that best balances the forces, and the pencil with it; raises if forces are left."""
     n, dtype = len(names), jax.tree.leaves(known[1])[0].dtype
     of = lambda multipliers: Matrices.of(pencil(system, *known, multipliers), n)
     loose = of(np.zeros(bind(system, *known[1:]).rows, dtype))
@@ -116,7 +116,7 @@ class _Slopes(NamedTuple):
     found: Found
 
     def values(self) -> Complex[Array, " k"]:
-        """Those of the modes, with derivatives where they are asked for."""
+        """Eigenvalues of the modes, with derivatives if they are asked for."""
         found, dtype = self.found, jnp.result_type(self.multipliers.dtype, self.matrices.pencil.left.dtype, jnp.complex64)
         values = jnp.asarray(found.values, dtype)
         if is_concrete(self.given):
@@ -124,13 +124,13 @@ class _Slopes(NamedTuple):
         slopes = self._slopes(dtype) @ jnp.asarray(found.same / np.sum(found.same, axis=1), dtype)
         if not found.conservative:
             return _with_slopes(values, slopes * np.where(np.sum(found.same, axis=1) > 1, np.nan, 1.0))
-        squares = _with_slopes(-(values**2), -slopes)  # complex: they may come to be damped
+        squares = _with_slopes(-(values**2), -slopes)  # complex: they may become damped
         there, grows = squares != 0, squares.real < 0
         omega = jnp.sqrt(jnp.where(there, jnp.where(grows, -squares, squares), 1)) * there
         return jnp.where(grows, omega, 1j * omega)
 
     def _slopes(self, dtype: Any) -> Complex[Array, " k"]:
-        """−yᵀ P(λ) x, which has the derivatives of the eigenvalues; by λ, too: with c = ∂(yᵀ P x)/∂λ and G w = c it is c dλ = wᵀ dE."""
+        """−yᵀ P(λ) x, whose derivatives are those of the eigenvalues, also through λ: with c = ∂(yᵀ P x)/∂λ and G w = c, c dλ = wᵀ dE."""
         values, vectors, left = (jnp.asarray(x, dtype) for x in self.found[:3])
         by = lambda multipliers, given: jnp.einsum("ik,ik->k", left, along_modes(self.system, *given, multipliers, values, vectors))
         slopes = by(self.multipliers, self.given)
@@ -156,7 +156,7 @@ def _described(system: System, given: tuple, values: Array, found: Found) -> Mod
 
 @compiled
 def _taken_apart(system: System, q: PyTree, params: PyTree, vectors: Array) -> tuple[PyTree, PyTree]:
-    """Shapes and constraint forces, scaled; their derivatives are not known: NaN."""
+    """Scaled shapes and constraint forces; their derivatives are unknown: NaN."""
     flat, n = bind(system, q, params), len(vectors) - bind(system, q, params).rows
     vectors = without_derivative(normalised(vectors, vectors[:n], None), (q, params))
     return jax.vmap(flat.unravel, in_axes=1)(vectors[:n]), jax.vmap(flat.unravel_multipliers, in_axes=1)(vectors[n:])
@@ -164,7 +164,7 @@ def _taken_apart(system: System, q: PyTree, params: PyTree, vectors: Array) -> t
 
 @jax.custom_jvp
 def _with_slopes(values: Array, of: Array) -> Array:
-    """`values`, whose derivatives are those of something else; their own are not known: NaN."""
+    """`values` with the derivatives of `of`; second derivatives are unknown: NaN."""
     return values
 
 

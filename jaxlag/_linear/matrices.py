@@ -27,28 +27,28 @@ from .inputs import Input
 from .newton import least_change
 from .tangent_space import Partition
 
-STEADY = 0.375  # exponent of eps (1.3e-6 in double precision): what may be left of terms that cancel in a steady state
+STEADY = 0.375  # exponent of eps (1.3e-6 in double precision): tolerance on the residual of terms that cancel in a steady state
 
 
 @dataclasses.dataclass(frozen=True)
 class Choice:
-    """What is moved, what is seen, and in which coordinates."""
+    """The inputs, the outputs and the independent coordinates."""
 
-    inputs: tuple[Input, ...]  # those of the user, then, where the system has them, its sampled states
+    inputs: tuple[Input, ...]  # the user's inputs, then the system's sampled states, if any
     outputs: Callable | None
     partition: Partition
-    loops: int  # sampled states among the inputs, which its own updates move
+    loops: int  # number of sampled states among the inputs, which the system's own updates move
 
 
 class ByInputs(NamedTuple):
-    """How something depends on x, and on u, u̇ and ü."""
+    """Derivatives of a quantity with respect to x, and to u, u̇ and ü."""
 
     by_state: Float[Array, "r d"]
     by_inputs: Float[Array, "3 r m"]
 
 
 class Steadiness(NamedTuple):
-    """What a steady state has none of: q̈, ż and changes of sampled states; and how much of it counts as none."""
+    """Residuals of a steady state: q̈, ż and changes of sampled states; and the tolerances on them."""
 
     left: Float[Array, " y"]
     allowed: Float[Array, " y"]
@@ -56,7 +56,7 @@ class Steadiness(NamedTuple):
 
 
 class Matrices(NamedTuple):
-    """ẋ, outputs, multipliers and updates of sampled states by x and u; δ(q, q̇, z) = T x; M."""
+    """Derivatives of ẋ, outputs, multipliers and updates of sampled states with respect to x and u; δ(q, q̇, z) = T x; M."""
 
     rates: ByInputs
     outputs: ByInputs
@@ -65,15 +65,16 @@ class Matrices(NamedTuple):
     basis: Float[Array, "y d"]
     mass: Float[Array, "n n"]
     steadiness: Steadiness
-    shifted: Bool[Array, ""]  # whether x is not the state itself, but the state less what u and u̇ make of it
+    shifted: Bool[Array, ""]  # whether x is not the state itself, but the state less the contributions of u and u̇
 
 
 @compiled
 def constraint_slopes(system, t, q, qdot, params, states):
-    """G, of coordinates in units in which each has inertia of order one, how many of its rows hold positions (as an array of that length),
-    and how far the state is off the constraints.
+    """G in units in which each coordinate has inertia of order one, the number of its rows that hold positions (as an array of that
+    length), and the deviation of the state from the constraints.
 
-    Below G, what says that velocities of coordinates without inertia depend on the others; rows that hold these hold them alone.
+    Rows below G state that velocities of coordinates without inertia depend on the others; rows of G that hold such velocities hold nothing
+    else.
     """
     flat, t, q, v = checked(system, t, q, qdot, params, states)
     mode = in_current_mode(flat, t, q, v)
@@ -88,7 +89,7 @@ def constraint_slopes(system, t, q, qdot, params, states):
 
 @compiled
 def matrices(choice: Choice, system: System, t: Any, q: PyTree, qdot: PyTree, params: PyTree, states: PyTree) -> Matrices:
-    """The matrices near a state; NaN where an entry of params is."""
+    """The matrices near a state; NaN if an entry of params is NaN."""
     checked(system, t, q, qdot, params, states)
     values = start_values(system, states, t, q, qdot, params)
     at = StatesAt(values, t, ravel_pytree(q)[0], ravel_pytree(qdot)[0])
@@ -112,7 +113,7 @@ def matrices(choice: Choice, system: System, t: Any, q: PyTree, qdot: PyTree, pa
     of_state, of_terms = _sizes(dynamics, y, forces.multipliers, M)
     independent = np.array([*positions, *(n + velocities), *range(2 * n, len(of_state))], int)
     size = by_state @ of_state[independent] + of_terms
-    of_updates = size[size.size - dynamics.held.size :]  # an update that comes to nothing leaves what it rounds
+    of_updates = size[size.size - dynamics.held.size :]  # an update that cancels to zero leaves the rounding of its terms
     size = size + by_held @ jnp.maximum(jnp.abs(dynamics.held), of_updates)[: choice.loops]
     allowed = jnp.finfo(y.q.dtype).eps ** STEADY * size
     left = jnp.concatenate([forces.qddot, found.z, found.updates - dynamics.held])
@@ -125,9 +126,9 @@ def matrices(choice: Choice, system: System, t: Any, q: PyTree, qdot: PyTree, pa
 def _slopes(
     dynamics: Dynamics, at: Partition, y: Whole, forces: Forces, basis: Array, driven: tuple[Array, Array]
 ) -> tuple[list[ByInputs], Array, Balance]:
-    """How q̈, λ, ż, outputs and updates follow the state and the inputs, all of them on the constraints; M; and the balance itself.
+    """Derivatives of q̈, λ, ż, outputs and updates in the state and the inputs, along the constraints; M; and the balance itself.
 
-    One derivative of the balance in all directions: with E = M q̈ − f − Gᵀλ and c = G q̈ + γ,  M δq̈ − Gᵀδλ = −δE,  G δq̈ = −δc.
+    A single derivative of the balance in all directions: with E = M q̈ − f − Gᵀλ and c = G q̈ + γ,  M δq̈ − Gᵀδλ = −δE,  G δq̈ = −δc.
     """
     (n,), d, m, rows = y.q.shape, basis.shape[1], len(dynamics.inputs), forces.multipliers.size
     held = np.array(at.velocity_rows, int)
@@ -152,12 +153,12 @@ def _slopes(
     saddle = jnp.block([[M, by_force[:, held]], [G[held], jnp.zeros((len(held), len(held)), M.dtype)]])
     change = -jnp.linalg.solve(saddle, jnp.concatenate([E, c[held]]))
     qddot, multipliers = change[:n], jnp.zeros((rows, d + 3 * m), M.dtype).at[held].set(change[n:])
-    if redundant:  # the λ of least norm is G times something: what the selected rows lack of it
+    if redundant:  # λ of least norm lies in the range of G: add the part that the selected rows lack
         in_range = _onto_range(G, held)
         multipliers = in_range @ multipliers + spread[:, : d + 3 * m] - in_range @ spread[:, : d + 3 * m]
 
     def followed(J):
-        """Along the state and the inputs, with q̈ and λ as they follow."""
+        """Derivatives along the state and the inputs, with q̈ and λ following."""
         given, by_qddot, by_multipliers = split(J)
         return given + by_qddot @ qddot + by_multipliers @ multipliers
 
@@ -166,7 +167,7 @@ def _slopes(
 
 
 def _onto_range(G: Float[Array, "m n"], held: np.ndarray) -> Float[Array, "m m"]:
-    """The projection on what G reaches, by what its rows `held` reach: G = T G_held, whatever the units of the rows."""
+    """The projection onto the range of G, from its rows `held`: G = T G_held, in any units of the rows."""
     size = jnp.linalg.norm(G, axis=1, keepdims=True)
     size = jnp.where(size > 0, size, 1)
     unit = G / size
@@ -178,7 +179,7 @@ def _onto_range(G: Float[Array, "m n"], held: np.ndarray) -> Float[Array, "m m"]
 def _slopes_of_solution(
     dynamics: Dynamics, y: Whole, forces: Forces, basis: Array, driven: tuple[Array, Array]
 ) -> tuple[list[ByInputs], Array, Balance]:
-    """The same where coordinates have no inertia: q̈ and λ are differentiated as they are computed."""
+    """`_slopes` for coordinates without inertia: differentiates the computation of q̈ and λ."""
     n, d, m = y.q.size, basis.shape[1], len(dynamics.inputs)
 
     def along(c):
@@ -196,7 +197,7 @@ def _slopes_of_solution(
 
 
 def tangent_basis(dynamics: Dynamics, at: Partition, y: Whole) -> tuple[Array, tuple[Array, Array]]:
-    """T, and how the state follows u and u̇ where these move constraints: from ∂(g, ψ) = 0 for the dependent ones."""
+    """T, and the derivatives of the state in u and u̇ if these move constraints: from ∂(g, ψ) = 0 for the dependent entries."""
     (n,), (k,), m = y.q.shape, y.z.shape, len(dynamics.inputs)
     rows_of = lambda given, rows: given[np.array(rows, int)]
 
@@ -223,20 +224,20 @@ def _rows(dynamics, y):
 
 
 def _proper(rates: ByInputs) -> ByInputs:
-    """The same motion in x − B₂ u̇ − (B₁ + A B₂) u, which u alone drives."""
+    """The rates in terms of x − B₂ u̇ − (B₁ + A B₂) u, which u alone drives."""
     A, (B, B1, B2) = rates
     return ByInputs(A, jnp.stack([B + A @ (B1 + A @ B2), 0 * B1, 0 * B2]))
 
 
 def _shifted(rates: ByInputs, of: ByInputs) -> ByInputs:
-    """What depends on x, in terms of the x of `_proper`."""
+    """A quantity that depends on x, in terms of the x of `_proper`."""
     A, (_, B1, B2) = rates
     C, (D, D1, D2) = of
     return ByInputs(C, jnp.stack([D + C @ (B1 + A @ B2), D1 + C @ B2, D2]))
 
 
 def _sizes(dynamics: Dynamics, y: Whole, multipliers: Array, mass: Array) -> tuple[Float[Array, " y"], Float[Array, " r"]]:
-    """Of each number of the state its size, of what is zero by mass; and of q̈, ż and updates that of the terms that cancel in them."""
+    """The size of each entry of the state, with zero entries sized by mass; and the size of the terms that cancel in q̈, ż and updates."""
     mode, G = in_current_mode(dynamics.at(y, dynamics.still()), dynamics.t, y.q, y.v), _rows(dynamics, y)
     light = first_order(mode, dynamics.t, y.q, y.v).coordinates
     stand_in = with_masses(mode, light, dynamics.t, y.q, y.v) if light.size else None

@@ -117,13 +117,13 @@ def _kind(value, stable, repeated):
 
 
 def _size(values):
-    """|λ|, with a derivative where λ = 0."""
+    """|λ|, with a derivative at λ = 0, too."""
     there = values != 0
     return jnp.where(there, jnp.abs(jnp.where(there, values, 1)), 0)
 
 
 class Found(NamedTuple):
-    """Eigenvalues in continuous time, eigenvectors in x as columns, which of them do not grow, and which are repeated."""
+    """Eigenvalues in continuous time, eigenvectors in x as columns, and masks of modes that do not grow and of repeated modes."""
 
     values: Array
     vectors: Array
@@ -148,7 +148,7 @@ def of_second_order(system: SecondOrder) -> Found:
 
 
 def of_first_order(A: Float[Array, "d d"], sample_time: Any) -> Found:
-    """Eigenvalues of A, where Python may look at them: of a conjugate pair the upper one, and of zeros one for each of `at_rest`."""
+    """Modes of A; if the numbers are concrete, only the upper one of each conjugate pair, and one zero for each column of `at_rest`."""
     found = _of_first_order(A, sample_time)
     values = jax.lax.stop_gradient(found.values)
     if not is_concrete(values):
@@ -164,10 +164,11 @@ def of_first_order(A: Float[Array, "d d"], sample_time: Any) -> Found:
 
 
 def at_rest(A: Float[Array, "d d"], zeros: int) -> Float[Array, "d k"]:
-    """A basis of the states that stay where they are put, A N = 0, of which there may be fewer than A has zeros as eigenvalues: a body
-    that moves freely has two, a place and a speed, and one state at rest. Each is 1 at an entry at which the others are 0.
+    """A basis N of the states that stay where they are put, A N = 0. There may be fewer of them than zero eigenvalues of A: a body that
+    moves freely has two zeros, for position and speed, but one state at rest. Each column is 1 at an entry at which the others are 0.
 
-    N solves A N + W s = 0, P N = 1, with P these entries and W that which A does not reach, and is differentiated as that does.
+    N solves A N + W s = 0, P N = 1, where P selects these entries and W spans the directions that A does not reach; derivatives follow from
+    this system.
     """
     import scipy.linalg  # imported here because that takes a while
 
@@ -186,8 +187,8 @@ def at_rest(A: Float[Array, "d d"], zeros: int) -> Float[Array, "d k"]:
 
 
 def undamped(found: Found) -> Found:
-    """Of the modes of first order of an undamped system those that `of_second_order` finds, in its order, by positions alone: of ±ω the
-    growing one.
+    """The first-order modes of an undamped system that `of_second_order` also finds, in its order, with positions alone; the growing one of
+    each real pair ±ω.
     """
     values = np.asarray(jax.lax.stop_gradient(found.values))
     chosen = np.flatnonzero((values == 0) | (values.imag > 0) | (values.real > 0))
@@ -196,8 +197,8 @@ def undamped(found: Found) -> Found:
 
 
 def with_derivatives_of(found: Found, other: Found) -> Found:
-    """Modes without damping, with the derivatives of `other`, which knows what would damp or turn them; shapes stay real."""
-    if found.values.shape != other.values.shape:  # what was told from rounding in one of both was not in the other
+    """Modes without damping, with the derivatives of `other`, which include damping, gyroscopic and circulatory terms; shapes stay real."""
+    if found.values.shape != other.values.shape:  # the two disagree on which values are rounding
         values, vectors = (without_derivative(x, other.values) for x in found[:2])
         return found._replace(values=values, vectors=vectors)
 
@@ -215,7 +216,7 @@ def _of_first_order(A, sample_time):
     again = jnp.sum(are_repeated(values, bound), axis=1) > 1
     if sample_time is not None:
         there = values != 0
-        values = jnp.where(jnp.abs(values - 1) <= bound, 1 + values - jax.lax.stop_gradient(values), values)  # what stays where it is put
+        values = jnp.where(jnp.abs(values - 1) <= bound, 1 + values - jax.lax.stop_gradient(values), values)  # modes that stay put
         values = jnp.where(there, jnp.log(jnp.where(there, values, 1)) / sample_time, -jnp.inf)
         bound = bound / sample_time
         order = jnp.argsort(jnp.abs(values), stable=True)
@@ -225,7 +226,7 @@ def _of_first_order(A, sample_time):
 
 
 def is_conservative(system: SecondOrder) -> bool:
-    """Whether damping, gyroscopic and circulatory terms are nothing but rounding; no where Python may not look."""
+    """Whether damping, gyroscopic and circulatory terms are nothing but rounding; False if the numbers are not concrete."""
     given = jax.lax.stop_gradient(system)
     if not is_concrete(given):
         return False
@@ -237,13 +238,13 @@ def is_conservative(system: SecondOrder) -> bool:
 
 
 def damping_ratios(values: Array) -> Array:
-    """−Re λ/|λ|, and 0 of λ = 0."""
+    """−Re λ/|λ|, and 0 for λ = 0."""
     size = _size(values)
     return 0 - values.real / jnp.where(size > 0, size, 1)
 
 
 def normalised(vectors: Array, shapes: Array, mass: Array | None) -> Array:
-    """Eigenvectors scaled so that the largest entry of each shape is 1, or positive with q̂ᴴ M q̂ = 1; columns."""
+    """Eigenvectors as columns, scaled so that the largest entry of each shape is 1, or positive with q̂ᴴ M q̂ = 1."""
     at = jnp.argmax(jnp.abs(shapes) >= (1 - 1e-6) * jnp.max(jnp.abs(shapes), axis=0, keepdims=True, initial=0.0), axis=0)
     largest = jnp.take_along_axis(shapes, at[None, :], axis=0)
     largest = jnp.where(largest == 0, 1, largest)  # a mode of the states alone

@@ -1,4 +1,4 @@
-"""Roots by Newton's method where the Jacobian may be singular or not square, with derivatives by the implicit function theorem."""
+"""Roots by Newton's method for Jacobians that may be singular or not square, with derivatives by the implicit function theorem."""
 
 import functools
 from collections.abc import Callable
@@ -18,14 +18,14 @@ from .._program.size_of_terms import size_of_terms
 from .._program.sparse_matrix import SparseMatrix
 
 ITERATIONS = 100
-ROUNDING = 64  # eps, of Jacobians
-TIES = 8  # unknowns that a unit is handed on through: a state that follows a state that follows a coordinate
+ROUNDING = 64  # eps: rounding error of Jacobians
+TIES = 8  # longest chain of unknowns that hand on a unit: a state that follows a state that follows a coordinate
 NO_FORCES = np.zeros(0)
 Residual = Callable[[Any, Float[Array, " u"]], Float[Array, " r"]]  # R(args, w)
 
 
 class Root(NamedTuple):
-    """w with R(w) = 0, whether it is one, and the size of what cancels in each equation."""
+    """A candidate w for R(w) = 0, whether it is a root, and the size of the terms that cancel in each equation."""
 
     w: Float[Array, " u"]
     found: Bool[Array, ""]
@@ -41,9 +41,10 @@ def root_near(
     ways: int,
     ease: Float[Array, " u"] | float = 1.0,
 ) -> Root:
-    """The root that Newton's method finds from a guess; of several that nothing decides between, the nearest in these `units`, where to
-    move one unknown costs less the greater its `ease`. Those whose unit is zero take it from the others: `units_beside`. `forces_on`:
-    units of the coordinates whose forces the first equations are; behind the first `ways` unknowns come forces, as multipliers are.
+    """The root that Newton's method finds from a guess. If the equations leave several open, it is the nearest in these `units`, where an
+    unknown costs less to move the greater its `ease`. Unknowns with unit zero take their units from the others: `units_beside`.
+    `forces_on`: units of the coordinates whose forces are the first equations. The unknowns after the first `ways` are forces, such as
+    multipliers.
     """
     fixed, guess = jax.lax.stop_gradient((args, guess))
     slope = lambda w, units: _felt(jax.jacfwd(residual, 1)(fixed, w), forces_on, units)
@@ -62,7 +63,7 @@ def root_near(
 
 
 def _terms(residual: Residual, args: Any, w: Float[Array, " u"]) -> Float[Array, " r"]:
-    """What cancels in the equations at w, also of what args alone decide."""
+    """The size of the terms that cancel in the equations at w, including terms of args alone."""
     numbers, others = eqx.partition(args, eqx.is_inexact_array)
     given, unravel = ravel_pytree((numbers, w))
 
@@ -74,7 +75,7 @@ def _terms(residual: Residual, args: Any, w: Float[Array, " u"]) -> Float[Array,
 
 
 def _reach_of_forces(J: Float[Array, "f u"], terms: Float[Array, " f"], units: Float[Array, " f"]) -> Float[Array, " u"]:
-    """Of what is in forces alone, as multipliers are: what cancels in the forces it is in, where it weighs most."""
+    """The reach of unknowns in forces alone, such as multipliers: the terms that cancel in these forces over the largest weight."""
     share = units[:, None] * jnp.abs(J)
     weight = jnp.max(share, axis=0, initial=0.0)
     cancels = jnp.max(jnp.where(share > 0, (units * terms)[:, None], 0), axis=0, initial=0.0)
@@ -82,8 +83,8 @@ def _reach_of_forces(J: Float[Array, "f u"], terms: Float[Array, " f"], units: F
 
 
 def units_beside(J: Float[Array, "r u"], units: Float[Array, " u"]) -> Float[Array, " u"]:
-    """Units of all unknowns where those of some are known and others are 0: such that in each equation that holds one whose unit is known
-    the other counts for no more than that. They follow all changes of units. Those that no equation ties to others keep 0.
+    """Units of all unknowns, given the units of some and 0 for the others: in each equation with an unknown of known unit, the other counts
+    for no more than that one. The units follow all changes of units. Unknowns that no equation ties to others keep 0.
     """
     size = jnp.abs(J)
 
@@ -97,8 +98,8 @@ def units_beside(J: Float[Array, "r u"], units: Float[Array, " u"]) -> Float[Arr
 
 
 def _units_of_steps(J: Float[Array, "r u"], units: Float[Array, " u"], forces_on: Float[Array, " f"]) -> Float[Array, " u"]:
-    """Units of all unknowns, for the length of a step. Those that nothing ties to a coordinate, as velocities and multipliers where forces
-    depend on no place, are measured by the forces that they make, of which one energy is taken.
+    """Units of all unknowns, for the length of a step. Unknowns that nothing ties to a coordinate, such as velocities and multipliers if
+    forces depend on no position, are measured by the forces they cause: one unit makes one unit of energy.
     """
     energy = jnp.max(forces_on[:, None] * jnp.abs(J[: forces_on.size]), axis=0, initial=0.0)
     units = jnp.where((units > 0) | (energy == 0), units, 1 / jnp.where(energy > 0, energy, 1))
@@ -107,13 +108,13 @@ def _units_of_steps(J: Float[Array, "r u"], units: Float[Array, " u"], forces_on
 
 
 def _felt(J: Float[Array, "r u"], forces_on: Float[Array, " f"], units: Float[Array, " u"]) -> Float[Array, "r u"]:
-    """J `without_rounding`, where its first rows are forces."""
+    """J `without_rounding` in its first rows, which are forces."""
     return without_rounding(J, jnp.pad(forces_on, (0, len(J) - forces_on.size))[:, None], units[None])
 
 
 def without_rounding(J: Array, of_rows: Array, of_columns: Array) -> Array:
-    """Entries of a Jacobian, in any form, but 0 where a force changes with an unknown by rounding alone, compared with the change by
-    another: no equation follows from what is zero by symmetry. In these units of its rows and columns, all are energies.
+    """Entries of a Jacobian, in any form, with 0 where a force changes with an unknown by rounding alone, relative to its change with
+    another: an entry that is zero by symmetry yields no equation. In these units of rows and columns, all entries are energies.
     """
     energies = jnp.abs(J) * of_rows * of_columns
     return jnp.where((energies > 0) & (energies <= ROUNDING * jnp.finfo(J.dtype).eps * jnp.max(energies, initial=0.0)), 0, J)
@@ -122,12 +123,13 @@ def without_rounding(J: Array, of_rows: Array, of_columns: Array) -> Array:
 def newton(
     changes: Callable[[Array], Callable[[Array], Array]], guess: Float[Array, " u"], units: Float[Array, " u"], ways: int
 ) -> tuple[Float[Array, " u"], Float[Array, " u"]]:
-    """Where Newton's method comes to rest, and the reach of each unknown, of which some eps are rounding; `changes(w)` is
-    w' ↦ −J(w)⁻¹ R(w').
+    """The point at which Newton's method stops, and the reach of each unknown, of which some eps are rounding; `changes(w)` is w' ↦ −J(w)⁻¹
+    R(w').
 
-    A step is halved until the step that would follow it is shorter: a test that does not depend on the units of R or w. In these `units`
-    the reach is the largest of the first `ways` unknowns, at the start or now, and at least that of each itself: forces, that constraints
-    which contradict each other make as large as may be, say nothing of how far a state may reach. Rounding of the start is zero.
+    A step is halved until the step that would follow it is shorter: a test that does not depend on the units of R or w. The reach is the
+    largest of the first `ways` unknowns in these `units`, at the start or now, and at least the size of each unknown itself: forces, which
+    contradictory constraints can make arbitrarily large, say nothing about the reach of a state. A result within rounding of the start's
+    reach is set to zero.
 
     Source: Deuflhard, Newton Methods for Nonlinear Problems, section 3.3.2 (natural monotonicity test).
     """
@@ -151,7 +153,7 @@ def newton(
             return jnp.isfinite(after) & (after <= (1 - part / 4) * length(step, w))
 
         part, _ = halved(is_shorter, 1e-3, w.dtype)
-        near = length(step, w) <= eps**0.5  # where rounding decides what is shorter
+        near = length(step, w) <= eps**0.5  # rounding decides which step is shorter
         return w + jnp.where(near, 1.0, part) * step, length(step, w) <= 8 * eps, i + 1
 
     def is_on_its_way(carry):
@@ -164,21 +166,21 @@ def newton(
 
 
 def root_of_size(R: Array, J: Array | SparseMatrix, terms: Array, w: Array, reach: Array) -> Root:
-    """Whether w is a root: what is left is rounding relative to the terms that cancel, or what a change of w by rounding brings about."""
+    """w as a `Root`: found if the residual is rounding of the terms that cancel, or the effect of rounding w."""
     size = abs(J) @ reach + terms
     return Root(w, jnp.all(jnp.isfinite(w)) & is_nothing(R, size), size)
 
 
 def is_nothing(R: Float[Array, " r"], size: Float[Array, " r"]) -> Bool[Array, ""]:
-    """Whether what is left of equations is rounding, relative to the size of what cancels in them."""
+    """Whether the residual of equations is rounding, relative to the size of the terms that cancel in them."""
     return jnp.all(jnp.abs(R) <= jnp.finfo(R.dtype).eps ** 0.5 * size)
 
 
 def differentiable_root(
     residual: Residual, args: Any, w: Float[Array, " u"], units: Float[Array, " u"], forces_on: Float[Array, " f"] = NO_FORCES
 ) -> Float[Array, " u"]:
-    """w, which depends on args as R(args, w) = 0 says; of several ways to change with them, by the shortest in these units. `forces_on` as
-    of `root_near`.
+    """w as the function of args that R(args, w) = 0 defines; if several changes are possible, the shortest in these units. `forces_on` as
+    for `root_near`.
     """
     in_units = lambda given, w: residual(given[0], w)
     return implicit_root(in_units, functools.partial(_change, residual), (args, units, forces_on), w)
@@ -190,7 +192,7 @@ def _change(residual, given, w, R):
 
 
 def least_change(J: Float[Array, "r u"], R: Float[Array, " r"], scale: Any) -> Float[Array, " u"]:
-    """The least x with J x = R, x in units of `scale`, and each row of J in its own."""
+    """The x of least norm with J x = R, with x in units of `scale` and each row of J in its own unit."""
     scale = jnp.broadcast_to(jnp.asarray(scale, J.dtype), J.shape[1:])
     scaled = J * scale[None, :]
     size = jnp.max(jnp.abs(jax.lax.stop_gradient(scaled)), axis=1, initial=0.0)

@@ -1,4 +1,4 @@
-"""Numbers without a derivative, which do not say silently that it is zero."""
+"""Numbers without a derivative, which is NaN and not silently zero."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -9,7 +9,7 @@ from jaxtyping import Array, Num, PyTree
 
 
 def without_derivative(x: Num[Array, "..."], of: PyTree) -> Num[Array, "..."]:
-    """x, which depends on something by a way that is not differentiated: its derivative is NaN."""
+    """x, which depends on `of` in a way that is not differentiated: its derivative is NaN."""
     return _without_derivative(x, [leaf for leaf in jax.tree.leaves(of) if jnp.issubdtype(getattr(leaf, "dtype", int), jnp.inexact)])
 
 

@@ -28,5 +28,5 @@ class Origin(eqx.Module):
 
     @property
     def params(self) -> PyTree:
-        """The params, put together again."""
+        """The params, reassembled."""
         return put_together(self.numbers, self.rest)

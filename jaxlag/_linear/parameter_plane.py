@@ -25,7 +25,7 @@ from .tangent_space import partition
 
 
 class Row(NamedTuple):
-    """States at all values of the second parameter, as first axis; whether they were found, and whether they stay as they are."""
+    """States at all values of the second parameter, along the first axis; whether they were found, and whether they stay as they are."""
 
     q: PyTree
     qdot: PyTree
@@ -53,18 +53,18 @@ class ParameterPlane:
 
     @property
     def shape(self) -> tuple[int, int]:
-        """The numbers of values."""
+        """The number of values of each parameter."""
         return len(self.values[0]), len(self.values[1])
 
     def at(self, x: Any, y: Any) -> PyTree:
-        """`params` with these values of the two."""
+        """`params` with these two values."""
         leaves, structure = jax.tree.flatten(self.params)
         for i, value in zip(self.indices, (x, y), strict=True):
             leaves[i] = jnp.asarray(value, leaves[i].dtype)
         return jax.tree.unflatten(structure, leaves)
 
     def linearised(self) -> tuple[list[list[np.ndarray]], dict[tuple[int, int], str]]:
-        """A at each point, and by (i, j) why there is none."""
+        """A at each point, and the reasons for missing points, by (i, j)."""
         rows, As, missing = self._rows(), [], {}
         choice, names = self._choice(rows)
         for i, (x, row) in enumerate(zip(self.values[0], rows, strict=True)):
@@ -88,7 +88,7 @@ class ParameterPlane:
         return ""
 
     def _rows(self) -> list[Row]:
-        """The steady states: those that functions give, or those found from neighbours."""
+        """The steady states: given by functions, or found from neighbours."""
         count, first = self.shape[1], self.values[0][0]
         if self.is_given:
             there = np.ones(count, bool)
@@ -101,7 +101,7 @@ class ParameterPlane:
         every = lambda tree, j: jax.tree.map(lambda x: np.broadcast_to(x[j], (count, *x.shape[1:])), tree)
         near = every(jax.tree.map(lambda x: np.asarray(x)[None], (q, qdot, values)), 0)
         columns = []
-        for j in range(count):  # of the first row one after the other, by the program that finds a whole row
+        for j in range(count):  # the first row, one state after the other, with the program that finds a whole row
             columns.append(self._found(Search(running=running), first, near))
             near = every(columns[-1][:3], j) if columns[-1].found[j] else near
         rows = [jax.tree.map(lambda *leaves: np.stack([leaf[j] for j, leaf in enumerate(leaves)]), *columns)]
@@ -112,7 +112,7 @@ class ParameterPlane:
         return rows
 
     def _found(self, search: Search, x: float, near: tuple) -> Row:
-        """The steady states of a row, each from a guess of its own."""
+        """The steady states of a row, each from its own guess."""
 
         def one(y, q, qdot, states):
             given = self.system, self.t, q, qdot, self.at(x, y), states
@@ -125,7 +125,7 @@ class ParameterPlane:
         return jax.tree.map(np.asarray, jax.vmap(one)(self.values[1], *near))
 
     def _choice(self, rows: list[Row]) -> tuple[Choice, tuple[str, ...]]:
-        """Independent coordinates, by the first state that was found, and the names of the coordinates and states."""
+        """Independent coordinates, chosen at the first state that was found, and the names of coordinates and states."""
         i, j = next(((i, j) for i, row in enumerate(rows) for j in np.flatnonzero(row.found)), (0, 0))
         q, qdot, states = jax.tree.map(lambda leaf: leaf[j], rows[i][:3])
         params = self.at(self.values[0][i], self.values[1][j])
@@ -135,7 +135,7 @@ class ParameterPlane:
         return Choice((), None, at, 0), (*entry_names(q, "q"), *entry_names(values))
 
     def _near(self, choice: Choice, x: float, row: Row, steps: np.ndarray) -> tuple[Matrices, Float[Array, " b"]]:
-        """The motion near the states of a row, some steps later, and how far they are off the constraints."""
+        """The motion near the states of a row, some time `steps` later, and their deviations from the constraints."""
 
         def one(y, q, qdot, states, step):
             at, params = moved_on((self.t, q, qdot, states), step.astype(self.t.dtype)), self.at(x, y)
@@ -154,7 +154,7 @@ def _where(found, new, old):
 
 
 def _two(over, params):
-    """Names and values of two parameters, and which numbers of `params` they are."""
+    """Names and values of two parameters, and their indices in `params`."""
     names, leaves = leaf_names(params, "params"), jax.tree.leaves(params)
     if not isinstance(over, Mapping) or len(over) != 2:
         raise ValueError(f"`over` must be two names with their values, but is {over!r}. Write e.g. `{{'b1': [0, 1], 'b2': [0, 1, 2]}}`.")

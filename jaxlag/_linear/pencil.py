@@ -1,4 +1,4 @@
-"""The motion near rest as a pencil of sparse matrices, read from the equations in a few directions, however many coordinates there are.
+"""The motion near rest as a pencil of sparse matrices, read from the equations in a few directions, for any number of coordinates.
 
 P(λ) x = Gᵀμ,   G x = 0,   P(λ) = λ² M + λ C + K:    deviations δq = x exp λt, δλ = μ exp λt
 """
@@ -28,7 +28,7 @@ CURE = "Take `linearise(…).modes()`."
 
 
 class Pencil(NamedTuple):
-    """Of (x, μ): [K −Gᵀ; −G 0], C and M, the places of which are the same; −f − Gᵀλ and −g, and the size of the terms that cancel there."""
+    """[K −Gᵀ; −G 0], C and M for (x, μ), with the same places; −f − Gᵀλ and −g, and the size of the terms that cancel there."""
 
     stiffness: SparseMatrix
     damping: SparseMatrix
@@ -38,14 +38,14 @@ class Pencil(NamedTuple):
 
 
 def _deviation(flat: Flat, t: Any, q: Array, multipliers: Array, along: Array, rate: Array, second_rate: Array) -> Float[Array, " w"]:
-    """M q̈ − f − Gᵀλ and −g where q deviates by what is `along`, q̇ and q̈ by what is in its rates, λ by what is along."""
+    """M q̈ − f − Gᵀλ and −g if q and λ deviate by `along`, q̇ by `rate` and q̈ by `second_rate`."""
     moved = lambda given: (given[: q.size], given[q.size :])
     (x, mu), (v, _), (a, _) = map(moved, (along, rate, second_rate))
     return jnp.concatenate([imbalance(flat, t, q + x, v, a, multipliers + mu)[0], -flat.holonomic(t, q + x)])
 
 
 def _deviates(system: System, t: Any, q: PyTree, params: PyTree, multipliers: Array) -> tuple[Callable, Array, int]:
-    """`_deviation` of a system at rest; a deviation of nothing; how many coordinates there are."""
+    """`_deviation` of a system at rest, the zero deviation, and the number of coordinates."""
     flat, t, q, v = checked(system, t, q, jax.tree.map(jnp.zeros_like, q), params, {})
     if find_elements(flat, t, q, v) is not None:
         raise ValueError(f"`dissipation` must have no dry friction in `lowest_modes`, but has. {CURE}")
@@ -55,7 +55,7 @@ def _deviates(system: System, t: Any, q: PyTree, params: PyTree, multipliers: Ar
 
 @compiled
 def pencil(system: System, t: Any, q: PyTree, params: PyTree, multipliers: Array) -> Pencil:
-    """The pencil at rest in q, with constraint forces λ."""
+    """The pencil at rest at q, with constraint forces λ."""
     of, nothing, n = _deviates(system, t, q, params, multipliers)
     pattern = _pattern(lambda w: of(w, w, w), nothing)
     color, places = colors(pattern), Places.of(pattern, n)
@@ -69,7 +69,7 @@ def pencil(system: System, t: Any, q: PyTree, params: PyTree, multipliers: Array
 
 
 def _pattern(function: Callable, w: Array) -> scipy.sparse.csr_matrix:
-    """Where a Jacobian may have entries, and its diagonal."""
+    """The places of possible entries of a Jacobian, and its diagonal."""
     try:
         found = dependence(function, w)
     except TooLong:
@@ -88,7 +88,7 @@ def left_over(system: System, t: Any, q: PyTree, params: PyTree, multipliers: Ar
 def along_modes(
     system: System, t: Any, q: PyTree, params: PyTree, multipliers: Array, values: Complex[Array, " k"], vectors: Complex[Array, "w k"]
 ) -> Complex[Array, "w k"]:
-    """P(λ) x − Gᵀμ and −G x of each mode, to be differentiated: columns."""
+    """P(λ) x − Gᵀμ and −G x of each mode as columns, to be differentiated."""
     of, nothing, _ = _deviates(system, t, q, params, multipliers)
     push = lambda *directions: jax.jvp(of, (nothing,) * 3, directions)[1]
 

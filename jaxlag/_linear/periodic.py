@@ -159,7 +159,7 @@ def periodic(
 
 
 def _given(section, longest, t, dtype):
-    """The time at the start, and that in which the first two passages are looked for."""
+    """The start time, and the time within which the first two passages are looked for."""
     if not isinstance(section, (Event, Every)) or (isinstance(section, Event) and not callable(section.when)):
         raise TypeError(
             f"`section` must be an `Event` with a function, or `Every(period)`, but is {section!r}. "
@@ -175,7 +175,7 @@ def _given(section, longest, t, dtype):
 
 
 def _returning(system, q, states, cyclic):
-    """Which numbers of the state return."""
+    """Indices of the entries of the state that return."""
     entries, beside = entry_names(q, "q"), len(ravel_pytree(states)[0])
     cyclic = listed(cyclic, "cyclic")
     for name in cyclic:
@@ -186,7 +186,7 @@ def _returning(system, q, states, cyclic):
 
 
 def _refuse(found: Orbit, names: list[str]) -> None:
-    """Raises where nothing was found."""
+    """Raises if nothing was found."""
     if not found.passes:
         raise ValueError(
             "`longest` must be a time in which the motion from the guess passes through the section twice, but it does not, or fails "

@@ -30,7 +30,7 @@ def frequencies(omega: Any) -> Array | np.ndarray:
 
 
 def frequency_response(A: Array, B: Array, C: Array, D: Array, omega: Any, sample_time: Any) -> Complex[Array, "w p m"]:
-    """C (s − A)⁻¹ B + D + D₁ s + D₂ s² at s = iω; in discrete time at z = exp(iωT), and D alone."""
+    """C (s − A)⁻¹ B + D + D₁ s + D₂ s² at s = iω; in discrete time, at z = exp(iωT) and with D alone."""
 
     response = _frequency_response(A, B, C, D, jnp.asarray(omega), sample_time)
     if is_concrete(response) and not np.all(np.isfinite(response)):
@@ -73,7 +73,7 @@ def free_motion(A: Array, x0: Float[Array, "d k"], ts: Any) -> Float[Array, "t d
 
 @compiled
 def held(A: Array, B: Array, T: Any) -> tuple[Float[Array, "d d"], Float[Array, "d m"]]:
-    """exp(A T) and ∫ exp(A t) dt B over 0 … T, of inputs that are held: Van Loan, IEEE Trans. Autom. Control 23 (1978) 395."""
+    """exp(A T) and ∫ exp(A t) dt B over 0 … T, for inputs that are held: Van Loan, IEEE Trans. Autom. Control 23 (1978) 395."""
     d, m = B.shape
     both = jnp.block([[A, B], [jnp.zeros((m, d + m), A.dtype)]])
     units = balancing_units(both)
@@ -81,11 +81,11 @@ def held(A: Array, B: Array, T: Any) -> tuple[Float[Array, "d d"], Float[Array, 
     return after[:d, :d], after[:d, d:]
 
 
-SWEEPS = 20  # of balancing: each takes whole decades, and units of 1e-6 … 1e6 in a matrix of 8 rows are even after 5
+SWEEPS = 20  # of balancing: each removes whole decades, and units of 1e-6 … 1e6 in a matrix of 8 rows are even after 5
 
 
 def balancing_units(A: Array) -> Float[Array, " d"]:
-    """Powers of two u in which rows and columns of A u/uᵀ are of the same size: its exponential then loses no digits to units.
+    """Powers of two u for which rows and columns of A u/uᵀ have the same size: its exponential then loses no digits to units.
 
     Source: Parlett & Reinsch, Numerische Mathematik 13 (1969) 293-304.
     """
@@ -102,12 +102,12 @@ def balancing_units(A: Array) -> Float[Array, " d"]:
 
 
 def in_discrete_steps(A: Array, B: Array, C: Array, D: Array, steps: np.ndarray, x0: Array) -> Float[Array, "t p m"]:
-    """y at the given numbers of samples after an input that is 1 from sample 0 on, or after x₀ where B and D are nothing."""
+    """y at the given sample numbers, for an input that is 1 from sample 0 on, or from x₀ if B and D are zero."""
     return jax.lax.scan(lambda x, _: (A @ x + B, C @ x + D), x0, length=int(np.max(steps)) + 1)[1][steps]
 
 
 def spectral_density(given: Any, count: int, inputs: int) -> Complex[Array, "w m m"] | Float[Array, "w m m"]:
-    """That of the inputs at each frequency, from one number or matrix, or one for each."""
+    """The spectral density of the inputs at each frequency, from one number or matrix, or one for each."""
     try:
         density = jnp.asarray(given)
     except (TypeError, ValueError):
@@ -123,7 +123,7 @@ def spectral_density(given: Any, count: int, inputs: int) -> Complex[Array, "w m
 
 
 def zeros(A: Any, B: Any, C: Any, D: Any) -> np.ndarray:
-    """Invariant zeros: where [A − s, B; C, D] loses rank, by reduction to a system of the same zeros with a regular D.
+    """Invariant zeros, at which [A − s, B; C, D] loses rank, by reduction to a system with the same zeros and a regular D.
 
     Source: Emami-Naeini & Van Dooren, Automatica 18 (1982) 415-430.
     """
@@ -136,7 +136,7 @@ def zeros(A: Any, B: Any, C: Any, D: Any) -> np.ndarray:
 
 
 def _in_units(A, B, C, D):
-    """The same system with other units of its states, inputs and outputs, in which rows and columns are about the same size."""
+    """The system in units of states, inputs and outputs in which rows and columns are about the same size."""
     (n, m), p = B.shape, len(C)
     closed = np.block(
         [[A, B, np.zeros((n, p))], [np.zeros((m, n + m)), np.ones((m, p))], [C, D, np.zeros((p, p))]]
@@ -156,7 +156,7 @@ def _or_one(x):
 
 
 def _with_full_rows(A, B, C, D, tolerance):
-    """A system of the same zeros whose D has independent rows."""
+    """A system with the same zeros whose D has independent rows."""
     while len(C):
         U, s, _ = np.linalg.svd(D) if D.size else (np.eye(len(C)), np.zeros(0), None)
         rank = int(np.sum(s > tolerance))

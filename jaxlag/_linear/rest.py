@@ -26,8 +26,8 @@ from .newton import Root, is_nothing, least_change, root_near, units_beside
 
 
 class Search(NamedTuple):
-    """What is looked for: which coordinates are `fixed`, which velocities are found too, a minimum or any equilibrium, and whether
-    dry friction holds.
+    """Settings of a search: the `fixed` coordinates, the velocities to be found too, a minimum or any equilibrium, and whether dry friction
+    holds.
     """
 
     fixed: tuple[int, ...] = ()
@@ -37,16 +37,16 @@ class Search(NamedTuple):
 
 
 class Slopes(NamedTuple):
-    """M, and how the equations depend on q."""
+    """M, and the Jacobian of the equations with respect to q."""
 
     M: Float[Array, "n n"]
     by_q: Float[Array, "r n"]
 
 
 class Curvature(NamedTuple):
-    """What is reported of the second variation of the potential on the constraints where its eigenvalues are not computed: how many are
-    certainly below zero and how many not certainly above, whether that decides, and whether there is a potential; and on which
-    coordinates nothing depends.
+    """The second variation of the potential on the constraints if its eigenvalues are not computed: how many are certainly below zero and
+    how many not certainly above, whether these counts are decisive, whether a potential exists, and the coordinates on which nothing
+    depends.
     """
 
     falling: Int[Array, ""]
@@ -64,17 +64,17 @@ class Rest(NamedTuple):
     states: dict[str, PyTree]
     multipliers: dict[str, PyTree]
     friction: dict[str, tuple[Array, Array]]  # force and bound
-    slips: Bool[Array, ""]  # whether some of it does
+    slips: Bool[Array, ""]  # whether any friction slips
     t: Array
     succeeded: Bool[Array, ""]
-    uniform: Bool[Array, ""]  # whether it stays as it is
-    left: Float[Array, " r"]  # what is left of the equations, in parts of what is allowed
-    force: Float[Array, " n"]  # of these the forces
+    uniform: Bool[Array, ""]  # whether the motion stays as it is
+    left: Float[Array, " r"]  # residuals of the equations, relative to the size of their terms
+    force: Float[Array, " n"]  # the residual forces
     slopes: Slopes | Curvature
 
 
 class Unknowns(NamedTuple):
-    """What is solved for: q and q̇ where they are not given, the states, λ, and the friction forces μ on slip velocities."""
+    """The unknowns: q and q̇ unless they are given, the states, λ, and the friction forces μ on slip velocities."""
 
     q: Float[Array, " a"]
     v: Float[Array, " b"]
@@ -84,7 +84,7 @@ class Unknowns(NamedTuple):
 
 
 class Given(NamedTuple):
-    """On what a steady state depends; `open`: of the velocities that run, those that stay as given."""
+    """The data on which a steady state depends; `open`: mask of the running velocities that stay as given."""
 
     numbers: PyTree  # of params
     t: Float[Array | np.ndarray, ""]
@@ -94,7 +94,7 @@ class Given(NamedTuple):
 
 
 class Equations:
-    """f + Gᵀλ = 0, g = 0, ψ = 0, ż = 0: the equations of a steady state as functions of what is given and unknown."""
+    """f + Gᵀλ = 0, g = 0, ψ = 0, ż = 0: the equations of a steady state as functions of the given data and the unknowns."""
 
     def __init__(self, search: Search, system: System, q: PyTree, params: PyTree, values: PyTree, at: Given, flat: Flat):
         self.search, self.system, self.like = search, system, Layout.of(q).shapes
@@ -114,7 +114,7 @@ class Equations:
         return bind(self.system, self.like, eqx.combine(given.numbers, self.rest), at), q, v, of
 
     def __call__(self, given: Given, w: Float[Array, " u"]) -> Float[Array, " r"]:
-        """What is left of the equations at w."""
+        """The residual of the equations at w."""
         flat, q, v, of = self.taken_apart(given, w)
         g, (psi, _, _) = flat.holonomic(given.t, q), constraint_rows(flat, given.t, q, v)
         rates = ravel_pytree(flat.state_rates(given.t, q, v))[0]
@@ -124,7 +124,7 @@ class Equations:
         return jnp.concatenate([self.force(flat, given, q, v, of), g, psi, rates, changes, kept]).astype(w.dtype)
 
     def force(self, flat: Flat, given: Given, q: Array, v: Array, of: Unknowns) -> Float[Array, " n"]:
-        """f + Gᵀλ with dry friction where it slips; where it does not, without it, or with what it would have to hold."""
+        """f + Gᵀλ with dry friction where it slips; where it sticks, without it or with the force that it would have to hold."""
         t, held = given.t, 0.0
         elements = find_elements(flat, t, q, v)
         if elements is not None:
@@ -138,14 +138,14 @@ class Equations:
 
 
 def left_open(J: Float[Array, "r u"], which: np.ndarray) -> Bool[Array, " b"]:
-    """Which of these unknowns, one after the other, can have any value: J x = 0 then has a solution in which it changes and those before it
-    that are open do not. In units in which rows and columns of J are of one size.
+    """Mask of these unknowns, in turn, that can have any value: J x = 0 then has a solution in which the unknown changes and the open ones
+    before it do not. Units are such that rows and columns of J have the same size.
     """
     eps = jnp.finfo(J.dtype).eps
     for axis in (1, 0, 1, 0):
         size = jnp.max(jnp.abs(J), axis=axis, keepdims=True, initial=0.0)
         J = J / jnp.where(size > 0, size, 1)
-    P = jnp.eye(J.shape[1], dtype=J.dtype) - jnp.linalg.pinv(J, rtol=eps**SEEN) @ J  # on the solutions of J x = 0
+    P = jnp.eye(J.shape[1], dtype=J.dtype) - jnp.linalg.pinv(J, rtol=eps**SEEN) @ J  # projects onto the solutions of J x = 0
     found = []
     for i in which:
         found.append(P[i, i] > eps**FOLLOWS)
@@ -181,7 +181,7 @@ def steady_state(search: Search, system: System, t: Any, q: PyTree, qdot: PyTree
 
 
 def _units(M: Float[Array, "n n"]) -> Float[Array, " n"]:
-    """Of the coordinates, such that the inertia of each is 1; 0 of those without inertia, and 1 of all where none has any."""
+    """Units of the coordinates in which the inertia of each is 1; 0 for coordinates without inertia, and 1 for all if none has any."""
     mass = jax.lax.stop_gradient(jnp.diagonal(M))
     return jnp.where(jnp.any(mass > 0), units_of_mass(mass), 1)
 
@@ -196,7 +196,7 @@ def _described(equations: Equations, given: Given, root: Root) -> Rest:
     uniform = is_nothing(equations(known._replace(t=known.t + step, q=known.q + step * known.v), later), root.size)
     in_terms_of_q = lambda q: equations(known._replace(q=q), at_rest.at[: equations.moving.size].set(q[equations.moving]))
     multipliers = of.multipliers
-    if flat.rows:  # of dependent rows, those of least norm
+    if flat.rows:  # multipliers of least norm, if rows are dependent
         _, G, _ = constraint_rows(flat, t, q, v)
         metric = lx.DiagonalLinearOperator(jax.lax.stop_gradient(unit_lengths(M, G)) ** -2)
         multipliers = saddle_point(metric, G, -(G.T @ multipliers), jnp.zeros_like(multipliers)).multipliers
@@ -221,9 +221,9 @@ def _described(equations: Equations, given: Given, root: Root) -> Rest:
 
 
 def _a_while(units: Array, q: Array, v: Array) -> Array:
-    """A time in which a motion goes some part of its way, in units of mass; of one that starts at zero, a part of what these make one.
+    """A time in which a motion covers a fraction of its coordinates, in units of mass; if these are zero, a fraction of one such unit.
 
-    What drives a motion runs with it; at rest, t is the time at which forces are taken.
+    The drive of a motion runs with it; at rest, t is the time at which forces are evaluated.
     """
     far, fast = (jnp.max(jnp.abs(x) / jnp.where(units > 0, units, jnp.inf)) for x in (q, v))
     return jnp.where(fast > 0, 0.1 * jnp.where(far > 0, far, 1) / jnp.where(fast > 0, fast, 1), 0)
@@ -232,7 +232,7 @@ def _a_while(units: Array, q: Array, v: Array) -> Array:
 def _friction(
     equations: Equations, flat: Flat, given: Given, q: Array, v: Array, of: Unknowns
 ) -> tuple[dict[str, tuple[Array, Array]], Bool[Array, ""], Bool[Array, ""]]:
-    """By dissipation term, the friction force and its bound; whether all forces are within their bounds, and against the slip; and
+    """The friction force and its bound for each dissipation term; whether all forces are within their bounds and oppose the slip; and
     whether anything slips.
     """
     t = given.t
@@ -252,7 +252,7 @@ def _friction(
 
 
 def directions_of_slip(elements: FrictionElements, given: Given) -> Float[Array, " r"]:
-    """Of the rows of each element that slips in the guess, as on a belt that runs; 0 of what rests there."""
+    """The slip direction in the rows of each element that slips in the guess, as on a running belt; 0 for elements at rest there."""
     _, t, q, v, _ = jax.lax.stop_gradient(given)
     slip = elements.slip(t, q, v)
     size = elements.norms(slip)

@@ -20,14 +20,14 @@ from .eigenvalues import eigen
 from .newton import differentiable_root, is_nothing, least_change
 
 ITERATIONS = 30
-SECTION = "the section"  # among the events of the system
-LATER = 0.382  # of a period: whether the motion that returns does so there, too, is looked at
-MANY = 1000  # of the last digits of the clock: what they move is seen relative to the errors of the integration
-BY_STEPS = 10  # of them, what a motion errs by where each of some hundred steps errs by one
+SECTION = "the section"  # its name among the events of the system
+LATER = 0.382  # of a period: a second start, from which the motion is checked to return, too
+MANY = 1000  # last digits of the clock: their effect is visible against the errors of the integration
+BY_STEPS = 10  # last digits: the error of a motion if each of some hundred steps errs by one
 
 
 class Setting(NamedTuple):
-    """What is searched for: the section, which entries of the state return, and how motions are computed."""
+    """Settings of the search: the section, the entries of the state that return, and the computation of motions."""
 
     section: Event | Every
     returning: tuple[int, ...]
@@ -36,7 +36,7 @@ class Setting(NamedTuple):
     max_steps: int
 
     def of_motions(self) -> dict[str, Any]:
-        """The arguments of `simulate` among them."""
+        """The settings that are arguments of `simulate`."""
         return {"friction": self.friction, "solver": self.solver, "max_steps": self.max_steps}
 
 
@@ -51,9 +51,9 @@ class Given(NamedTuple):
 
 
 class Orbit(NamedTuple):
-    """The state at the section, of which the entries that do not return are those of the guess; the period; the change of the state in one
-    period; eigenvalues of the return map. Whether the guess passed through the section twice, the motion returns, and does so whenever it
-    starts; and how far off it is.
+    """The state at the section, with entries of the guess where they do not return; the period; the change of the state in one period; the
+    eigenvalues of the return map. Whether the guess passed through the section twice, whether the motion returns, and whether it does so
+    from any start time; and the residual of the return.
     """
 
     start: dict[str, PyTree]
@@ -67,7 +67,7 @@ class Orbit(NamedTuple):
 
 
 class Frame(NamedTuple):
-    """Numbers of the return map: those given; the state at a passage, the time to the next, and that in which a third is looked for."""
+    """Numbers of the return map: the given ones, the state at a passage, the time to the next, and the time limit for a third."""
 
     given: Given
     first: Float[Array, " s"]
@@ -85,7 +85,7 @@ def orbit_near(system: System, setting: Setting, given: Given) -> Orbit:
     frame = Frame(given, *jax.lax.stop_gradient(passage))
 
     def returned(frame, w, t):
-        """The state at the next passage, and how long it took."""
+        """The state at the next passage, and the time until then."""
         return _passage(system, setting, frame, unravel(frame.first.at[of].set(w)), t)
 
     def residual(frame, w):
@@ -96,7 +96,7 @@ def orbit_near(system: System, setting: Setting, given: Given) -> Orbit:
     w = differentiable_root(residual, frame, near, scales)
 
     def at(t):
-        """The return from a start at another time, and its slope."""
+        """The return from another start time, and its Jacobian."""
 
         def of_w(w):
             after, time = returned(frame, w, t)
@@ -109,7 +109,7 @@ def orbit_near(system: System, setting: Setting, given: Given) -> Orbit:
     starts = jnp.stack([given.t, later, later + MANY * jnp.finfo(later.dtype).eps * jnp.abs(later)])
     ends, times, slopes = jax.lax.map(at, starts)
     left = ends[:, of] - w[None]
-    of_clock = BY_STEPS * jnp.abs(left[2] - left[1]) / MANY  # late clocks tell the phase of a force to few digits
+    of_clock = BY_STEPS * jnp.abs(left[2] - left[1]) / MANY  # a late clock gives the phase of a force to few digits
     sizes = jnp.abs(slopes[0] - jnp.eye(w.size)) @ jnp.maximum(jnp.abs(w), scales)
     finds = [is_nothing(jnp.maximum(jnp.abs(off) - of_clock, 0), sizes) for off in left[:2]]
     values, here = eigen(slopes[0]).values[::-1], frame.first.at[of].set(w)
@@ -118,7 +118,7 @@ def orbit_near(system: System, setting: Setting, given: Given) -> Orbit:
 
 
 def _scales(frame: Frame) -> Float[Array, " s"]:
-    """Of each entry of the state its scale in the course of a period: one that is zero at the section follows from its rate or integral."""
+    """The scale of each entry of the state over a period: if the entry is zero at the section, it follows from its rate or integral."""
     n, period = ravel_pytree(frame.given.start["q"])[0].size, frame.usual
     q, v, states = jnp.split(jnp.abs(frame.first), [n, 2 * n])
     scales = jnp.concatenate([q + period * v, v + q / period, states])
@@ -126,7 +126,7 @@ def _scales(frame: Frame) -> Float[Array, " s"]:
 
 
 def _newton(residual: Callable, w: Float[Array, " k"], rtol: Array, scale: Float[Array, " k"]) -> Float[Array, " k"]:
-    """The root near w. The last step is as small as errors of the integration."""
+    """The root near w. The last step is as small as the errors of the integration."""
 
     def turn(carry):
         w, _, i = carry
@@ -153,14 +153,15 @@ def _motion(system, setting, given, start, t, longest):
 
 
 def _state(q, qdot, states, i):
-    """The flat state at one of some times."""
+    """The flat state at sample i."""
     return ravel_pytree(jax.tree.map(lambda x: x[i], {"q": q, "qdot": qdot, "states": states}))[0]
 
 
 def _first_passage(system, setting, given):
-    """The state at the second passage of the motion from the guess, the time since the first, and that in which a third is looked for.
+    """The state at the second passage of the motion from the guess, the time since the first, and the time within which a third is sought.
 
-    A guess that lies in the section and stays near it for a while passes through it more than once by rounding: these are one.
+    A guess that lies in the section and stays near it for a while passes through it more than once by rounding: these passages count as
+    one.
     """
     passages = _motion(system, setting, given, given.start, given.t, given.longest).events[SECTION]
     since = passages.ts - passages.ts[0]
@@ -178,7 +179,7 @@ def _forced(setting, given):
 
 
 def _passage(system: System, setting: Setting, frame: Frame, start: dict[str, PyTree], t: Any) -> tuple[Array, Array]:
-    """The state after one period of the force, or at the first passage that is not the present one; and the time until then."""
+    """The state after one period of the force, or at the first passage after the present one; and the time until then."""
     if isinstance(setting.section, Every):
         period = _forced(setting, frame.given)
         motion = _motion(system, setting, frame.given, start, t, period)

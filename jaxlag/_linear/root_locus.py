@@ -1,4 +1,4 @@
-"""How eigenvalues move with a parameter, and where the system becomes unstable."""
+"""The motion of eigenvalues with a parameter, and the values at which the system becomes unstable."""
 
 import functools
 from collections.abc import Callable
@@ -112,7 +112,7 @@ def root_locus(
 
 
 class _Family:
-    """A steady state and its linear system, by the value of a parameter."""
+    """A steady state and its linear system as functions of a parameter."""
 
     def __init__(self, system: System, q: Any, qdot: Any, params: PyTree, over: str, t: Any, states: PyTree, first: float):
         without_contacts(system, "`root_locus`")
@@ -145,7 +145,7 @@ class _Family:
         return matrices(self.choice, self.system, self.t, *self.state(value, params)).rates.by_state
 
     def state(self, value: Any, params: PyTree) -> tuple[PyTree, PyTree, PyTree, PyTree]:
-        """q, q̇, `params` and the states of first order, of which A is a function."""
+        """The arguments of A: q, q̇, `params` and the first-order states."""
         moved = self.at(value, params)
         if callable(self.q) or callable(self.qdot):
             return *given_state(self.q, self.qdot, self.t, moved), moved, self.states
@@ -153,7 +153,7 @@ class _Family:
         return found.q, found.qdot, moved, found.states
 
     def refuse_unsteady(self, value: float, params: PyTree) -> None:
-        """Raises where the state is not steady at this value."""
+        """Raises if the state is not steady at this value."""
         self._linearised(value, params)
 
     def _linearised(self, value: Any, params: PyTree) -> LinearSystem:
@@ -183,14 +183,14 @@ def given_state(q: Any, qdot: Any, t: Any, params: PyTree) -> tuple[PyTree, PyTr
 
 
 def _spectrum(at: float, A: np.ndarray, basis: np.ndarray) -> Spectrum:
-    """That of a matrix, in the coordinates of the basis."""
+    """The spectrum of a matrix that is written in the coordinates of `basis`."""
     values, vectors, bound = map(np.asarray, eigen_and_rounding(A)) if A.size else (np.zeros(0, complex), A + 0j, np.zeros(0))
     return Spectrum(at, values, basis @ vectors, bound)
 
 
 @compiled
 def eigen_and_rounding(A: Float[Array, "d d"]) -> tuple[Array, Array, Array]:
-    """Eigenvalues, eigenvectors as columns, and how far rounding moves each eigenvalue."""
+    """Eigenvalues, eigenvectors as columns, and the rounding error of each eigenvalue."""
     values, vectors = eigen(A)
     return values, vectors, rounding(A, vectors)
 

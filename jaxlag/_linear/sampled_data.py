@@ -14,7 +14,7 @@ from .linear_system import LinearSystem
 from .matrices import ByInputs
 from .response import held
 
-ROUNDING = 4  # units in the last place, by which periods that are computed in several ways differ
+ROUNDING = 4  # units in the last place by which periods differ if they are computed in several ways
 
 
 def between_updates(system: System, params: PyTree, states: PyTree, updates: ByInputs, open_loop: LinearSystem) -> LinearSystem:
@@ -48,7 +48,7 @@ def between_updates(system: System, params: PyTree, states: PyTree, updates: ByI
 
 
 def _common_period(system: System, params: PyTree) -> Array:
-    """The one period of all sampled states."""
+    """The common period of all sampled states."""
     periods = [period(system, name, params) for name in sampled(system)]
     if not is_concrete(periods):
         return periods[0]
@@ -63,7 +63,7 @@ def _common_period(system: System, params: PyTree) -> Array:
 
 
 def _refuse_rates(updates, open_loop, loops):
-    """Raises where an update sees the velocity of an input that moves a constraint: held inputs jump."""
+    """Raises if an update sees the velocity of an input that moves a constraint: held inputs jump."""
     rates = updates.by_inputs[1:, :, :-loops], open_loop.D_rates[..., -loops:]
     if is_concrete(rates) and any(np.any(np.asarray(x)) for x in rates):
         raise ValueError(

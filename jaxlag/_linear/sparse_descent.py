@@ -1,4 +1,4 @@
-"""Minima of a potential of many coordinates, each coupled to a few, and how many directions fall from a point."""
+"""Minima of a potential of many coordinates, each coupled to a few, and the number of descending directions at a point."""
 
 from collections.abc import Callable
 
@@ -13,16 +13,16 @@ from .._program.conditions import halved, repeated
 from .._program.sparse_matrix import SparseMatrix, row_sums
 from .descent import STEPS, far_down
 
-FIRST = 1e-6  # of the largest row of the curvature: the least that is added to it
-PROBES = 3  # vectors at random, on which factors are tried
-SAFETY = 10  # times what factors are seen to be wrong by
-WEAKER = 16  # by which what is added shrinks from step to step, where it may
+FIRST = 1e-6  # of the largest row of the curvature: the smallest shift added to it
+PROBES = 3  # random vectors on which factors are tested
+SAFETY = 10  # times the observed error of factors
+WEAKER = 16  # factor by which the shift shrinks from step to step, if possible
 
 
 def sparse_minimum_near(V: Callable, slope_and_curvature: Callable, q: Float[Array, " n"], units: Float[Array, " n"]) -> Float[Array, " n"]:
-    """A minimum of V, good to some digits; `slope_and_curvature(q)` is −∂V/∂q and −∂²V/∂q². All is measured in `units`.
+    """A minimum of V, accurate to some digits; `slope_and_curvature(q)` is −∂V/∂q and −∂²V/∂q². Everything is measured in `units`.
 
-    Newton's step with so much added to the curvature that it is positive; from a saddle or a maximum along what falls there. A step is
+    Newton's step with a shift that makes the curvature positive; from a saddle or a maximum, a step along a descending direction. A step is
     halved until V is lower. A chain of 1000 springs of k = 1e5, started unstretched as an arc, takes 10 steps.
 
     Source: Nocedal & Wright, Numerical Optimization, 2nd ed., section 3.4.
@@ -55,7 +55,7 @@ def sparse_minimum_near(V: Callable, slope_and_curvature: Callable, q: Float[Arr
 
 
 def _made_definite(K: SparseMatrix, added: Array) -> tuple[Array, Factors]:
-    """The factors of K − σ, which is negative definite, and σ."""
+    """The shift σ, and the factors of K − σ, which is negative definite."""
     largest = jnp.max(row_sums(K))
     factors_with = lambda added: factorised(K.plus_diagonal(jnp.full(K.shape[0], -added)))
 
@@ -75,17 +75,17 @@ def _made_definite(K: SparseMatrix, added: Array) -> tuple[Array, Factors]:
 
 
 def eigenvalues_below(J: SparseMatrix, scale: Float[Array, " n"], bound: Array) -> tuple[Int[Array, ""], Float[Array, ""]]:
-    """How many directions x on the constraints have xᵀK x < `bound` · xᵀ diag(`scale`) x, where J = [−K Gᵀ; G 0]; and within what of the
-    bound that is certain, by how well the factors give back J.
+    """The number of directions x on the constraints with xᵀK x < `bound` · xᵀ diag(`scale`) x, where J = [−K Gᵀ; G 0]; and the uncertainty
+    of the bound, from how well the factors reproduce J.
 
-    Source: Gould, Math. Programming 32 (1985) 90: the inertia of J is that of −K on the null space of G, and as many of each sign as rows.
+    Source: Gould, Math. Programming 32 (1985) 90: J has the inertia of −K on the null space of G, plus one of each sign per row.
     """
     n, places = scale.size, J.places
     of_q = np.arange(J.shape[0]) < n
     unit = jnp.append(lax.rsqrt(scale), jnp.ones(J.shape[0] - n, scale.dtype))
     values, within = J.values * unit[places.rows] * unit[places.columns], of_q[places.columns] & of_q[places.rows]
     stiffest = jnp.max(jnp.where(within, jnp.abs(values), 0), initial=0.0)
-    stiffest = jnp.where(stiffest > 0, stiffest, 1)  # in these units no number is far from one, as those are not that stand beside blocks
+    stiffest = jnp.where(stiffest > 0, stiffest, 1)  # in these units no number is far from one, like the numbers next to blocks
     row = jax.ops.segment_max(jnp.abs(values), places.rows, J.shape[0], indices_are_sorted=True)
     unit = jnp.where(of_q | (row <= 0), lax.rsqrt(stiffest), jnp.sqrt(stiffest) / jnp.where(row > 0, row, 1))
     A = SparseMatrix(values * unit[places.rows] * unit[places.columns], places).plus_diagonal(jnp.where(of_q, bound / stiffest, 0))

@@ -1,4 +1,4 @@
-"""Modes near a shift, by sparse matrices: Arnoldi's method, and the inertia of the matrices as the proof that none is left out.
+"""Modes near a shift, with sparse matrices: Arnoldi's method, and the inertia of the matrices as proof that none is left out.
 
 Source: Lehoucq, Sorensen & Yang, ARPACK Users' Guide, SIAM 1998, section 3.2; Tisseur & Meerbergen, SIAM Review 43 (2001) 235.
 """
@@ -18,15 +18,15 @@ from .._program.sparse_matrix import SparseMatrix
 from .pencil import CURE, Pencil
 from .sparse_descent import eigenvalues_below
 
-NOTHING = 1e-10  # of the square of a row, what is left of it where it follows from others
-EQUAL = 0.625  # exponent of eps: values that differ by less, in parts of their size, are one
-BESIDE = 4  # modes that are sought beside those asked for
-ATTEMPTS = 12  # to find the lowest modes, where some lie far below what is sought
+NOTHING = 1e-10  # of the square of a row: largest remainder of a row that follows from others
+EQUAL = 0.625  # exponent of eps: values with a smaller relative difference are equal
+BESIDE = 4  # modes sought in addition to those asked for
+ATTEMPTS = 12  # to find the lowest modes, if some lie far below the first ones found
 
 
 class Matrices(NamedTuple):
-    """A `Pencil`, also as matrices of SciPy, of n coordinates; constraints that follow from others left out, with which a multiplier of
-    zero stands alone; and these, −G x = 0.
+    """A `Pencil` of n coordinates, also as SciPy matrices. Constraints that follow from others are left out: their multipliers are zero and
+    stand alone. These constraints, −G x = 0, are kept apart.
     """
 
     pencil: Pencil
@@ -52,18 +52,18 @@ class Matrices(NamedTuple):
 
     @property
     def equal(self) -> float:
-        """The part of their size by which two values may differ and are one."""
+        """The relative difference up to which two values are equal."""
         return float(np.finfo(self.pencil.left.dtype).eps ** EQUAL)
 
     @property
     def rounding(self) -> float:
-        """That of squares of natural frequencies, by the largest of them."""
+        """The rounding error of squared natural frequencies, from the largest of them."""
         units = scipy.sparse.diags(self.units)
         return 10 * float(np.finfo(self.pencil.left.dtype).eps) * float(abs(units @ self.K[: self.n, : self.n] @ units).sum(axis=1).max())
 
     @property
     def units(self) -> np.ndarray:
-        """Of the coordinates, such that the mass of each is 1; 0 of those that have none."""
+        """Units of the coordinates in which the mass of each is 1; 0 for coordinates without mass."""
         masses = self.M.diagonal()[: self.n]
         return np.where(masses > 0, 1 / np.sqrt(np.where(masses > 0, masses, 1)), 0)
 
@@ -83,12 +83,12 @@ class Matrices(NamedTuple):
             return unit * splu((one + of_q @ self.K + self.K @ of_q).tocsc()).solve(unit * np.concatenate([f, c]))
 
     def shared(self, multipliers: Float[np.ndarray, "m *k"]) -> Float[np.ndarray, "m *k"]:  # noqa: F821
-        """Of multipliers with the same Gᵀλ those of least norm, in the range of G: what follows from others shares their load."""
+        """The multipliers of least norm with the same Gᵀλ, in the range of G: constraints that follow from others share their load."""
         if not self.left_out.size:
             return multipliers
         rows, out = self.rows_left_out.toarray(), self.left_out - self.n
         size = np.linalg.norm(rows, axis=1, keepdims=True)
-        T = self.nearest(rows.T / np.where(size > 0, size, 1).T, np.zeros((len(multipliers), len(rows))))[self.n :].T  # of others
+        T = self.nearest(rows.T / np.where(size > 0, size, 1).T, np.zeros((len(multipliers), len(rows))))[self.n :].T  # in the other rows
         others = np.setdiff1d(np.flatnonzero(np.any(np.abs(T) > NOTHING * np.max(np.abs(T), axis=1, keepdims=True), axis=0)), out)
         which = np.r_[others, out]
         T = np.r_[np.eye(others.size), size * T[:, others]]
@@ -103,7 +103,9 @@ def _scipy(A: SparseMatrix) -> scipy.sparse.csc_matrix:
 
 
 def following_rows(G: scipy.sparse.csc_matrix) -> np.ndarray:
-    """Which rows follow from others: a pivot of G Gᵀ, of rows of length 1, is the square of what those before leave of one."""
+    """Indices of rows that follow from others: with rows of length 1, a pivot of G Gᵀ is the squared remainder of a row after its
+    predecessors.
+    """
     from scipy.sparse.linalg import splu  # imported here because that takes a while
 
     if not G.shape[0]:
@@ -116,7 +118,7 @@ def following_rows(G: scipy.sparse.csc_matrix) -> np.ndarray:
 
 
 def _without(given: Pencil, left_out: np.ndarray) -> Pencil:
-    """The pencil without some of the constraints: −d μ = 0 of each in its place, d as large as its row."""
+    """The pencil without some of the constraints: −d μ = 0 replaces each, with d as large as its row."""
     places, values = given.stiffness.places, np.asarray(given.stiffness.values)
     is_out = np.isin(np.arange(places.shape[0]), left_out)
     taken = is_out[places.rows] | is_out[places.columns]
@@ -128,8 +130,8 @@ def _without(given: Pencil, left_out: np.ndarray) -> Pencil:
 
 
 class Found(NamedTuple):
-    """Eigenvalues λ; (x, μ) of each and, of the transposed pencil, y, scaled such that dλ = −yᵀ dP x (without damping dλ² = −yᵀ dP x);
-    which are the same; whether there is no damping.
+    """Eigenvalues λ; (x, μ) of each, and y of the transposed pencil, scaled so that dλ = −yᵀ dP x (without damping, dλ² = −yᵀ dP x); which
+    eigenvalues are equal; whether damping is absent.
     """
 
     values: Complex[np.ndarray, " k"]
@@ -150,7 +152,7 @@ def modes_near(matrices: Matrices, count: int, shift: float) -> Found:
 
 @contextlib.contextmanager
 def searching() -> Iterator[None]:
-    """What SciPy cannot factorise or find is refused."""
+    """Raises `ValueError` if SciPy cannot factorise a matrix or find modes."""
     try:
         yield
     except RuntimeError as error:
@@ -161,7 +163,7 @@ def searching() -> Iterator[None]:
 
 
 def _undamped(matrices: Matrices, count: int, shift: float) -> Found:
-    """K x = ω² M x + Gᵀμ; as many as asked for, and those that lie lower still."""
+    """Modes of K x = ω² M x + Gᵀμ: as many as asked for, including any that lie lower still."""
     from scipy.sparse.linalg import eigsh  # imported here because that takes a while
 
     sigma, k, most = -(shift**2), count + BESIDE, matrices.freedoms - 1
@@ -175,7 +177,7 @@ def _undamped(matrices: Matrices, count: int, shift: float) -> Found:
         squares, vectors = squares[order], vectors[:, order]
         if not _left_out(matrices, squares, count):
             break
-        sigma, k = min(sigma, 4 * squares[0]), k + 2  # what is left out lies far below, or was missed
+        sigma, k = min(sigma, 4 * squares[0]), k + 2  # modes left out lie far below, or were missed
     else:
         raise ValueError(f"`shift` must be such that the lowest modes are found, but from {shift} lower ones are left out. Give another.")
     squares, vectors = squares[:count], vectors[:, :count]
@@ -192,12 +194,12 @@ def _undamped(matrices: Matrices, count: int, shift: float) -> Found:
 
 
 def _basis(k: int, most: int) -> int:
-    """How many vectors Arnoldi's method keeps: of no more there are where constraints leave few degrees of freedom."""
+    """The number of vectors that Arnoldi's method keeps, at most the number that exist if constraints leave few degrees of freedom."""
     return min(max(2 * k + 1, 20), most)
 
 
 def _left_out(matrices: Matrices, squares: np.ndarray, count: int) -> bool:
-    """Whether modes below the widest gap behind the first `count` of these are not among them, by Sylvester's law of inertia."""
+    """Whether modes below the widest gap after the first `count` are missing from these, by Sylvester's law of inertia."""
     gaps = np.diff(squares[count - 1 :])
     i = count - 1 + int(np.argmax(gaps))
     middle = (squares[i] + squares[i + 1]) / 2
@@ -213,8 +215,8 @@ def _left_out(matrices: Matrices, squares: np.ndarray, count: int) -> bool:
 
 
 def _refuse_unsolved(left: np.ndarray, terms: np.ndarray, vectors: np.ndarray, matrices: Matrices) -> None:
-    """Raises where what is `left` of the equations of a mode is more than the rounding of their terms: of rows that nearly follow from
-    others.
+    """Raises if the residual `left` of the equations of a mode exceeds the rounding error of their terms, as with rows that nearly follow
+    from others.
     """
     rows, x = matrices.rows_left_out, vectors[: matrices.n]
     left, terms = np.concatenate([left, rows @ x]), np.concatenate([terms, abs(rows) @ np.abs(x)])
@@ -224,7 +226,7 @@ def _refuse_unsolved(left: np.ndarray, terms: np.ndarray, vectors: np.ndarray, m
 
 
 def _damped(matrices: Matrices, count: int, shift: float, symmetric: bool) -> Found:
-    """By the linear pencil of (x, λx, μ), twice as large: A z = λ B z; from two starts, which must find the same."""
+    """Modes of the linear pencil of (x, λx, μ), twice as large: A z = λ B z; from two starts, which must agree."""
     from scipy.sparse.linalg import eigs, splu
 
     (_, K, C, M, n, *_), block = matrices, scipy.sparse.block_array

@@ -1,4 +1,4 @@
-"""Rest of many coordinates, each coupled to a few: no array of all by all.
+"""Rest of many coordinates, each coupled to a few, without dense matrices.
 
 F(q, λ) = (f + Gᵀλ, g) = 0,    ∂F/∂(q, λ) = [−K Gᵀ; G 0]
 """
@@ -29,11 +29,11 @@ from .rest import Curvature, Equations, Given, Rest, Search
 from .sparse_descent import eigenvalues_below, sparse_minimum_near
 from .sparse_root import SparseEquations, sparse_root_near, sparse_units_beside
 
-MOST_DENSE = 400  # unknowns that are searched for with all zeros where the structure finds nothing: less than a minute
+MOST_DENSE = 400  # most unknowns of a dense search if the sparse one finds nothing: it takes less than a minute
 
 
 class EquationsOfRest(Equations):
-    """f + Gᵀλ = 0 and g = 0, of derivatives of L and g alone."""
+    """f + Gᵀλ = 0 and g = 0, from derivatives of L and g alone."""
 
     def __call__(self, given: Given, w: Float[Array, " u"]) -> Float[Array, " u"]:
         flat, q, v, of = self.taken_apart(given, w)
@@ -43,7 +43,7 @@ class EquationsOfRest(Equations):
 
 @compiled
 def many_at_rest(search: Search, system: System, t: Any, q: PyTree, qdot: PyTree, params: PyTree, states: PyTree) -> Rest | None:
-    """As `steady_state`; None where there are few coordinates, no structure, or more than forces and positions in the equations."""
+    """As `steady_state`; None if there are few coordinates, no structure, or more than forces and positions in the equations."""
     flat, t, q0, v0 = checked(system, t, q, qdot, params, states)
     beside = search.fixed or search.running or search.held or system.states or system.nonholonomic
     if q0.size < MANY or beside or (search.stable and flat.rows) or find_elements(flat, t, q0, v0) is not None:
@@ -60,8 +60,8 @@ def many_at_rest(search: Search, system: System, t: Any, q: PyTree, qdot: PyTree
 
 
 def _searched(equations: SparseEquations, given: Given, flat: Flat, start: Array, stable: bool, can_descend: bool) -> Root:
-    """By Newton's method from the guess; where it finds nothing, or a minimum is asked for, from a minimum near the guess, where the
-    potential can be followed: springs that are not stretched yet have no stiffness across.
+    """The root from Newton's method, started at the guess. If it finds nothing or a minimum is asked for, it starts at a minimum near the
+    guess, if the potential can be followed: unstretched springs have no lateral stiffness.
     """
     V = lambda q: -flat.lagrangian(given.t, q, given.v)
     of_V = lambda q: (equations.residual(given, q), equations.jacobian(given, q))
@@ -81,7 +81,7 @@ def _searched(equations: SparseEquations, given: Given, flat: Flat, start: Array
 
 
 def _with_multipliers(equations: SparseEquations, given: Given, w: Array) -> Array:
-    """With the multipliers that balance the forces best."""
+    """w with the multipliers that best balance the forces."""
     J, n = equations.jacobian(given, w), given.q.size
     of_q = np.arange(w.size) < n
     within = of_q[J.places.rows] & of_q[J.places.columns]
@@ -96,7 +96,7 @@ def _described(of_rest: EquationsOfRest, equations: SparseEquations, given: Give
     known, at_rest = lax.stop_gradient((given, w))
     J, R = equations.jacobian(known, at_rest), equations.residual(known, at_rest)
     shown, multipliers = lambda x: jnp.where(root.found, x, jnp.nan), of.multipliers
-    if flat.rows:  # of dependent rows, those of least norm
+    if flat.rows:  # multipliers of least norm, if rows are dependent
         _, G = position_rows(flat, given.t, q)
         unit = lx.DiagonalLinearOperator(jnp.ones_like(q))
         multipliers = saddle_point(unit, G, -(G.T @ multipliers), jnp.zeros_like(multipliers)).multipliers
@@ -119,7 +119,7 @@ def _described(of_rest: EquationsOfRest, equations: SparseEquations, given: Give
 
 
 def _curvature(J: SparseMatrix, M: lx.AbstractLinearOperator, alone: Array) -> Curvature:
-    """By the inertia of J beside that of M: how many squares of natural frequencies are below zero, and how many within rounding."""
+    """The number of squared natural frequencies below zero, and within rounding of zero, from the inertia of J relative to M."""
     n, eps, places = alone.size, jnp.finfo(J.values.dtype).eps, J.places
     masses = jnp.append(units_alike(M, []), jnp.zeros(J.shape[0] - n, J.values.dtype))
     units = sparse_units_beside(J, masses)[:n]

@@ -19,12 +19,12 @@ from .._program.sparse_matrix import Places, SparseMatrix, colors
 from .._program.sparse_newton import linear_solution, newton_factors, refined, sparse_places
 from .newton import Residual, Root, newton, root_of_size, without_rounding
 
-BY_VALUES = 2  # as sparse as is of use: the dense search finds singular values of all by all, at twenty times the cost of factors
+BY_VALUES = 2  # least sparsity that pays: the dense search needs all singular values, at twenty times the cost of factors
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class SparseEquations:
-    """R(args, w) = 0, as many equations as unknowns, with the places of J = ∂R/∂w; `alone`: 1 for unknowns on which no equation depends
+    """R(args, w) = 0 with as many equations as unknowns, and the places of J = ∂R/∂w; `alone`: 1 for unknowns on which no equation depends
     and whose equation depends on none, which stay as they are.
     """
 
@@ -34,7 +34,7 @@ class SparseEquations:
 
     @classmethod
     def of(cls, residual: Residual, args: Any, w: Float[Array, " u"], last: int) -> "SparseEquations | None":
-        """None where a dense matrix serves better; the unknowns from `last` on are multipliers."""
+        """The equations, or None if a dense matrix serves better; unknowns from `last` on are multipliers."""
         try:
             pattern = dependence(lambda w: residual(args, w), w)
         except TooLong:
@@ -44,17 +44,17 @@ class SparseEquations:
         return None if places is None else cls(residual, places, (~coupled).astype(float))
 
     def jacobian(self, args: Any, w: Float[Array, " u"]) -> SparseMatrix:
-        """J, with zeros for what is alone."""
+        """J, with zeros for unknowns that are alone."""
         _, push = jax.linearize(lambda w: self.residual(args, w), w)
         pattern = self.places.pattern()
         return SparseMatrix(entries(push, colors(pattern), pattern, w).values, self.places)
 
     def oriented(self, R: Float[Array, " u"]) -> Float[Array, " u"]:
-        """R, the forces the other way around: of J = [−K Gᵀ; G 0] that makes [K −Gᵀ; G 0]."""
+        """R with the forces reversed, which turns J = [−K Gᵀ; G 0] into [K −Gᵀ; G 0]."""
         return jnp.where(np.arange(R.size) < self.places.last, -R, R)
 
     def matrix(self, J: SparseMatrix) -> SparseMatrix:
-        """J, oriented, with ones for what is alone."""
+        """J, oriented, with ones for unknowns that are alone."""
         turned = SparseMatrix(jnp.where(J.places.rows < J.places.last, -J.values, J.values), J.places)
         return turned.plus_diagonal(jnp.asarray(self.alone, J.values.dtype))
 
@@ -64,13 +64,13 @@ class SparseEquations:
         return linear_solution(lambda x: self.oriented(push(x)) + jnp.asarray(self.alone, x.dtype) * x, self.places, -self.oriented(R))
 
     def differentiable_root(self, args: Any, w: Float[Array, " u"]) -> Float[Array, " u"]:
-        """w, which depends on args as R(args, w) = 0 says."""
+        """w as the function of args that R(args, w) = 0 defines."""
         return implicit_root(self.residual, self.change, args, w)
 
 
 def sparse_root_near(equations: SparseEquations, args: Any, guess: Float[Array, " u"], units: Float[Array, " u"]) -> Root:
-    """The root that Newton's method finds from a guess; found only where it is the only one near, but for multipliers of rows that depend
-    on each other. `units` as of `root_near`.
+    """The root that Newton's method finds from a guess; found only if it is the only one nearby, except for multipliers of rows that depend
+    on each other. `units` as for `root_near`.
     """
     fixed = jax.lax.stop_gradient(args)
 
@@ -88,7 +88,7 @@ def sparse_root_near(equations: SparseEquations, args: Any, guess: Float[Array, 
 
 
 def sparse_units_beside(J: SparseMatrix, units: Float[Array, " u"]) -> Float[Array, " u"]:
-    """`units_beside` of a sparse matrix: multipliers have theirs from what they hold."""
+    """`units_beside` for a sparse matrix: multipliers take their units from what they hold."""
     (m, n), rows, columns = J.shape, J.places.rows, J.places.columns
     size = jnp.abs(without_rounding(J.values, units[rows], units[columns]))
     known = jnp.maximum(jax.ops.segment_max(size * units[columns], rows, m, indices_are_sorted=True), 0)[rows]
@@ -98,8 +98,8 @@ def sparse_units_beside(J: SparseMatrix, units: Float[Array, " u"]) -> Float[Arr
 
 
 def is_regular(A: SparseMatrix) -> Bool[Array, ""]:
-    """Whether A⁻¹ makes no huge numbers of numbers at random, and solves with them; where rows of multipliers depend on each other, these
-    numbers are forces alone.
+    """Whether A⁻¹ maps random numbers to none that are huge, and solves the equations; if rows of multipliers depend on each other, the
+    random numbers are forces alone.
     """
     size, eps, factors = abs(A), jnp.finfo(A.values.dtype).eps, newton_factors(A)
     signs = jnp.asarray(np.random.default_rng(0).choice([-1.0, 1.0], A.shape[0]), A.values.dtype)

@@ -1,4 +1,4 @@
-"""What kind of equilibrium it is: by the second variation of the potential energy on the constraints."""
+"""The kind of an equilibrium, by the second variation of the potential energy on the constraints."""
 
 from collections.abc import Sequence
 
@@ -12,12 +12,12 @@ from .._model.system import System
 from .rest import Curvature, Rest
 
 ELSEWHERE = "by the eigenvalues of `linearise`"
-NOISE = 0.75  # exponent of eps (1.8e-12 in double precision): a stiffness, relative to the largest in units of inertia 1, that is none
-TURNS = 30  # each halves what is left of a scaling, in decades
+NOISE = 0.75  # exponent of eps (1.8e-12 in double precision): a stiffness is zero below this part of the largest, in units of inertia 1
+TURNS = 30  # each halves the remaining scaling, in decades
 
 
 def stability(system: System, found: Rest) -> tuple[Array | None, str]:
-    """The second variation, relative to M where it can be, and what it says; None where the forces at rest have no potential."""
+    """The second variation, relative to M if possible, and the kind of equilibrium; None if the forces at rest have no potential."""
     if np.any(ravel_pytree(found.qdot)[0]):
         return None, ELSEWHERE
     if system.nonholonomic or system.states:
@@ -47,19 +47,21 @@ def stability(system: System, found: Rest) -> tuple[Array | None, str]:
 
 
 def _units(M: np.ndarray, K: np.ndarray) -> np.ndarray:
-    """Units of the coordinates in which the inertia of each is 1, and the stiffness of those without inertia as large as the largest."""
+    """Units of the coordinates in which each inertia is 1, and the stiffness of coordinates without inertia is as large as the largest."""
     mass = np.diagonal(M)
     has_mass = mass > 0
     squares = np.abs(np.diagonal(K))[has_mass] / mass[has_mass]
     largest, units = np.max(squares, initial=0.0) or 1.0, 1 / np.sqrt(np.where(has_mass, mass, 1))
-    for _ in range(TURNS):  # what couples those without inertia to others has the units of both
+    for _ in range(TURNS):  # a coupling between coordinates with and without inertia has the units of both
         size = np.max(np.abs(K * np.outer(units, units)), axis=1, initial=0.0)
         units = np.where(has_mass | (size == 0), units, units * np.sqrt(largest / np.where(size > 0, size, 1)))
     return units
 
 
 def _kind(K: np.ndarray, G: np.ndarray, eps: float) -> str:
-    """What the signs of K on the null space of G say. They do not depend on units: a soft coordinate beside a stiff one has its own."""
+    """The kind of equilibrium, by the signs of K on the null space of G. They do not depend on units: a soft coordinate next to a stiff one
+    has its own.
+    """
     K = np.where(np.abs(K) <= eps**NOISE * np.max(np.abs(K), initial=0.0), 0, K)
     units = _equilibrating(K)
     N = tangent_basis(G * units, eps)
@@ -71,7 +73,7 @@ def _kind(K: np.ndarray, G: np.ndarray, eps: float) -> str:
 
 
 def _equilibrating(K: np.ndarray) -> np.ndarray:
-    """D such that the largest number in each row of D K D is one, or zero.
+    """D for which the largest entry in each row of D K D is one, or zero.
 
     Source: Ruiz, A scaling algorithm to equilibrate both rows and columns norms in matrices, RAL-TR-2001-034.
     """
@@ -83,7 +85,7 @@ def _equilibrating(K: np.ndarray) -> np.ndarray:
 
 
 def _by_inertia(found: Curvature) -> str:
-    """What the signs of the pivots say."""
+    """The kind of equilibrium, by the signs of the pivots."""
     if not found.symmetric:
         return f"{ELSEWHERE}: its forces have no potential"
     if not found.certain:

@@ -1,4 +1,4 @@
-"""Where over two parameters a steady state is stable, flutters or diverges."""
+"""Stability, flutter and divergence of a steady state over two parameters."""
 
 import dataclasses
 from collections.abc import Mapping
@@ -105,7 +105,7 @@ def stability_map(
 
 
 def _fastest(grid: list[np.ndarray], idle: int) -> list[complex]:
-    """Of each matrix the eigenvalue that grows fastest, without those that are zero in all matrices."""
+    """The fastest-growing eigenvalue of each matrix, without eigenvalues that are zero in all matrices."""
     core = Core.of(grid)
     reduced = np.stack([core.without_zeros(A)[0] for A in grid])
     if not reduced.shape[1]:

@@ -12,13 +12,13 @@ CURE = "Look for a steady state by `equilibrium` or `steady`, or take it all the
 
 
 def refuse_unsteady(found: Matrices, later: Callable[[float], Matrices], names: Sequence[str]) -> None:
-    """Raises where q̈ or ż is not zero, or A is another one a little later; `names` are those of the coordinates and states."""
+    """Raises if q̈ or ż is not zero, or A changes a little later; `names`: the coordinates and states."""
     if is_concrete(found) and (reason := why_unsteady(found, later, names)):
         raise ValueError(f"{reason} {DEFINED if reason == UNDEFINED else CURE}")
 
 
 def why_unsteady(found: Matrices, later: Callable[[float], Matrices], names: Sequence[str]) -> str:
-    """What is not steady, in a sentence; nothing where all is."""
+    """A sentence that says what is not steady; empty if everything is."""
     left, allowed, A = (np.asarray(x) for x in (found.steadiness.left, found.steadiness.allowed, found.rates.by_state))
     if not (found.steadiness.determined and np.all(np.isfinite(A)) and np.all(np.isfinite(left))):
         return UNDEFINED
@@ -32,7 +32,7 @@ def why_unsteady(found: Matrices, later: Callable[[float], Matrices], names: Seq
 
 
 def a_little(A: np.ndarray) -> float:
-    """A time that is short for the fastest that the system does."""
+    """A time that is short for the fastest motion of the system."""
     fastest = float(np.max(np.abs(np.linalg.eigvals(A)), initial=0.0)) if np.all(np.isfinite(A)) else 0.0
     return 0.1 / fastest if fastest > 0 else 1.0
 

@@ -9,7 +9,7 @@ from .._mechanics.pseudo_inverse import CLEAR, NOISE
 
 
 class Partition(NamedTuple):
-    """Which coordinates and velocities are `independent`, and which `dependent` ones which `rows` of the constraints determine."""
+    """The independent coordinates and velocities, the `dependent` ones, and the `rows` of the constraints that determine these."""
 
     positions: tuple[int, ...]
     velocities: tuple[int, ...]
@@ -20,7 +20,7 @@ class Partition(NamedTuple):
 
 
 def partition(G: np.ndarray, positions: int, preferred: Sequence[int] = ()) -> Partition:
-    """Coordinate partitioning: Gaussian elimination of the rows of G, of which the first hold positions, with complete pivoting.
+    """Coordinate partitioning: Gaussian elimination with complete pivoting of the rows of G, the first of which hold positions.
 
     Coordinates `preferred` as independent become dependent last. Rows that follow from others are left out.
 
@@ -50,7 +50,7 @@ def partition(G: np.ndarray, positions: int, preferred: Sequence[int] = ()) -> P
 
 
 def _pivot(left, rows, among, taken):
-    """The largest entry of the rows and columns that are left; None where these are zero to rounding."""
+    """The largest entry of the remaining rows and columns; None if these are zero to rounding."""
     rows = rows.copy()
     rows[[i for i, _ in taken]] = False
     columns = among.copy()

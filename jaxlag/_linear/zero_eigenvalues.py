@@ -1,4 +1,4 @@
-"""Eigenvalues that are zero whatever a parameter is: taken out, so that one that comes to zero is told from them."""
+"""Removal of eigenvalues that are zero for all parameter values, to tell them from an eigenvalue that comes to zero."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -10,8 +10,8 @@ from .eigenvalues import balanced
 
 
 class Core(NamedTuple):
-    """Of matrices that depend on parameters, in units in which rows and columns are about the same size: the states on which something
-    depends, and how many zeros all matrices have then.
+    """The core of matrices that depend on parameters, in units in which rows and columns are about the same size: the states on which
+    something depends, and the numbers of zero eigenvalues that all matrices then share.
     """
 
     scale: np.ndarray  # units of all states
@@ -20,29 +20,29 @@ class Core(NamedTuple):
 
     @classmethod
     def of(cls, matrices: Sequence[np.ndarray]) -> "Core":
-        """In the units of the largest entries."""
+        """The core, in the units of the largest entries."""
         scale = np.asarray(balanced(jnp.asarray(np.max(np.abs(matrices), axis=0)))[0])
         scaled = [A * scale[None, :] / scale[:, None] for A in matrices]
         states = _coupled(scaled)
         return cls(scale, states, _always_zero([A[np.ix_(states, states)] for A in scaled]))
 
     def taken(self, A: np.ndarray) -> np.ndarray:
-        """These states, in these units."""
+        """A restricted to these states, in these units."""
         return (A * self.scale[None, :] / self.scale[:, None])[np.ix_(self.states, self.states)]
 
     def without_zeros(self, A: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """`taken(A)` in the quotient by its zeros; and a basis of what is left, as columns."""
+        """`taken(A)` in the quotient by its zeros, and a basis of the remainder as columns."""
         return _without_zeros(self.taken(A), self.zeros)
 
     def weights(self, left: np.ndarray, right: np.ndarray) -> np.ndarray:
-        """W such that Σ W A is yᵀ A x of `taken(A)`."""
+        """W for which Σ W A is yᵀ A x of `taken(A)`."""
         weights = np.zeros((len(self.scale), len(self.scale)), complex)
         weights[np.ix_(self.states, self.states)] = np.outer(left, right)
         return weights * self.scale[None, :] / self.scale[:, None]
 
 
 def _coupled(matrices: Sequence[np.ndarray]) -> np.ndarray:
-    """The states on which something depends in one of the matrices: the others have eigenvalues of zero."""
+    """The states on which something depends in at least one matrix; the others have zero eigenvalues."""
     sizes = np.max(np.abs(matrices), axis=0)
     dust = len(sizes) * np.finfo(sizes.dtype).eps * np.max(sizes, axis=1, keepdims=True, initial=0.0)
     matters, core = sizes > dust, np.arange(len(sizes))
@@ -52,7 +52,7 @@ def _coupled(matrices: Sequence[np.ndarray]) -> np.ndarray:
 
 
 def _always_zero(matrices: Sequence[np.ndarray]) -> list[int]:
-    """How many eigenvectors of zero all matrices have; how many then, in the quotient by these; and so on."""
+    """The number of null vectors that all matrices have, then the number in the quotient by these, and so on."""
     counts = []
     while matrices[0].size:
         values = [np.linalg.svd(A, compute_uv=False) for A in matrices]
@@ -65,7 +65,7 @@ def _always_zero(matrices: Sequence[np.ndarray]) -> list[int]:
 
 
 def _without_zeros(A: np.ndarray, counts: Sequence[int]) -> tuple[np.ndarray, np.ndarray]:
-    """A in the quotient by its null space, again and again, with so many dimensions each; and a basis of what is left, as columns."""
+    """A in the quotient by its null space, repeatedly, with `counts` dimensions each, and a basis of the remainder as columns."""
     basis = np.eye(len(A))
     for count in counts:
         _, _, Vh = np.linalg.svd(A)

@@ -6,6 +6,7 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, PyTree
 
@@ -61,24 +62,28 @@ def acceleration(system: System, q: PyTree, qdot: PyTree, params: PyTree = None,
     jl.acceleration(pendulum, *state, {"m": 3.0, "g": 9.81, "l": 2.0}).multipliers["rod"]  # −m l φ̇² − m g cos φ = −35.43
     ```
     """
-    result, sound, agrees = at_state(_acceleration, system, q, qdot, params, t, states)
-    _refuse(sound, agrees, system, q, qdot, params, t, states)
+    result, verdict = at_state(_acceleration, system, q, qdot, params, t, states)
+    _refuse(verdict, system, q, qdot, params, t, states)
     return result
 
 
-def _refuse(sound: Sound, agrees: Bool[Array, ""], *given) -> None:
+def _refuse(verdict: Bool[Array, "3"], *given) -> None:
     """Raises where a solve has no unique solution; under `jit` its result is NaN."""
-    if is_concrete(sound) and not sound.determined:
+    if not is_concrete(verdict):
+        return
+    determined, satisfied, agrees = np.asarray(verdict)
+    if not determined:
         raise ValueError(explained(NO_INERTIA, *given))
-    if is_concrete(sound) and not sound.satisfied:
+    if not satisfied:
         raise ValueError(CONTRADICTION)
-    if is_concrete(agrees) and not agrees:
+    if not agrees:
         raise ValueError(explained(NOT_CONSISTENT, *given))
 
 
-def _agrees(flat: Flat, multipliers) -> Bool[Array, ""]:
-    """Whether λ agrees with the forces that it brings about."""
-    return jnp.all(jnp.isfinite(multipliers)) if flat.needs_multipliers else jnp.array(True)
+def _verdict(flat: Flat, sound: Sound, multipliers) -> Bool[Array, "3"]:
+    """Whether there is one solution, the constraints do not contradict each other, and λ agrees with the forces that it brings about."""
+    agrees = jnp.all(jnp.isfinite(multipliers)) if flat.needs_multipliers else jnp.array(True)
+    return jnp.stack([sound.determined, sound.satisfied, agrees])
 
 
 def _acceleration(flat, t, q, v):
@@ -90,7 +95,7 @@ def _acceleration(flat, t, q, v):
         return jnp.where(known, qddot, jnp.nan), jnp.where(known, multipliers, jnp.nan), sound
 
     qddot, multipliers, sound = scalarised(known)(t, q, v)
-    return Acceleration(flat.unravel(qddot), flat.unravel_multipliers(multipliers)), sound, _agrees(flat, multipliers)
+    return Acceleration(flat.unravel(qddot), flat.unravel_multipliers(multipliers)), _verdict(flat, sound, multipliers)
 
 
 def _is_sound(sound: Sound) -> Bool[Array, ""]:
@@ -125,8 +130,8 @@ def constraint_force(
     """
     if at is not None:
         check_function(at, "`at`")
-    force, sound, agrees = at_state(_ConstraintForce(at), system, q, qdot, params, t, states)
-    _refuse(sound, agrees, system, q, qdot, params, t, states)
+    force, verdict = at_state(_ConstraintForce(at), system, q, qdot, params, t, states)
+    _refuse(verdict, system, q, qdot, params, t, states)
     return force
 
 
@@ -142,7 +147,7 @@ class _ConstraintForce:
         forces = {name: multipliers[rows] @ G[rows] for name, rows in rows_by_name(flat).items()}
         shown = flat.unravel if self.at is None else _force_on_point(flat, self.at, t, q)
         found = {name: shown(jnp.where(_is_sound(sound), Q, jnp.nan)) for name, Q in forces.items()}
-        return found, sound, _agrees(flat, multipliers)
+        return found, _verdict(flat, sound, multipliers)
 
 
 def _force_on_point(flat, at, t, q):

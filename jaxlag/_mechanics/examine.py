@@ -280,9 +280,15 @@ def _redundant_rows(G, rows, eps, least):
 
 
 def _time_constants(found, N, units):
-    """1/|λ| of the nonzero eigenvalues of the motion linearised on the constraints, the fastest and the slowest."""
-    allowed, both = np.kron(np.eye(2), N), np.concatenate([units, units])  # of positions and of velocities
-    reduced = allowed.T @ (found["A"] * both / both[:, None]) @ allowed
+    """1/|λ| of the nonzero eigenvalues of the motion linearised on the constraints, the fastest and the slowest.
+
+    What leaves the constraints, since they are curved, is taken away in the metric of M, as their forces do.
+    """
+    both = np.concatenate([units, units])  # of positions and of velocities
+    metric = N.T @ (found["M"] * np.outer(units, units))
+    has_inertia = N.shape[1] and np.linalg.cond(metric @ N) < 1 / np.sqrt(np.finfo(N.dtype).eps)
+    along = np.linalg.solve(metric @ N, metric) if has_inertia else N.T
+    reduced = np.kron(np.eye(2), along) @ (found["A"] * both / both[:, None]) @ np.kron(np.eye(2), N)
     sizes = np.abs(np.linalg.eigvals(reduced))
     sizes = sizes[sizes > 1e-7 * np.max(sizes, initial=0.0)]  # a double eigenvalue 0 is some √eps of the largest, after rounding
     return (1 / np.max(sizes), 1 / np.min(sizes)) if sizes.size else (float("inf"), float("inf"))

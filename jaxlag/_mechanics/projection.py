@@ -34,7 +34,7 @@ class Projection:
 
     ```python
     import jaxlag as jl
-    jl.Projection(iterations=3)
+    jl.stabilisation.Projection(iterations=3)
     ```
     """
 
@@ -98,7 +98,7 @@ class Baumgarte:
 
     ```python
     import jaxlag as jl
-    jl.Baumgarte(alpha=20.0, beta=20.0)
+    jl.stabilisation.Baumgarte(alpha=20.0, beta=20.0)
     ```
     """
 
@@ -129,7 +129,7 @@ class NoStabilisation:
 
     ```python
     import jaxlag as jl
-    jl.NoStabilisation()
+    jl.stabilisation.NoStabilisation()
     ```
     """
 

@@ -67,7 +67,7 @@ class Event:
     - `stop`: whether the motion ends there. Later samples are NaN, and the motion counts as successful.
     - `direction`: one of `jaxlag.direction`: `Falling()`, `Rising()`, `Either()`, the default, or `Negative()`, which is `Falling()` and
       also happens at the start.
-    - `most`: how many are recorded; one more ends the motion, with a reason that says so.
+    - `most`: how many are recorded, 100 by default, the rest NaN; one more ends the motion, with a reason that says so.
 
     The time is located to rounding and differentiated exactly, as is the state that `then` returns, which is projected onto the constraints
     and out of obstacles. A sample exactly at the time of an event shows the state before or after it, depending on rounding. A sign change

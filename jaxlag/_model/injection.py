@@ -45,6 +45,26 @@ def check_function(function: Any, label: str) -> None:
         if type(function).__hash__ is None:
             cure = "Make it immutable, `@dataclass(frozen=True)`, or a plain function, and put what changes into params."
         raise TypeError(f"{label} must be a hashable function, but is a {kind} that cannot be hashed. {cure}") from None
+    for name in _differentiated(function):
+        raise ValueError(
+            f"{label} must take what is differentiated from params, but closes over {name!r}, which is being differentiated. "
+            f"Make {name!r} an entry of params, and let the function name it."
+        )
+
+
+def _differentiated(function: Any) -> list[str]:
+    """Variables that a function closes over and `jax.grad` or `jax.jvp` is differentiating: no program would see their derivatives."""
+    cells = zip(getattr(getattr(function, "__code__", None), "co_freevars", ()), getattr(function, "__closure__", None) or (), strict=False)
+    traced = lambda x: isinstance(x, jax.core.Tracer) and hasattr(x, "tangent")
+    return [name for name, cell in cells if _is_filled(cell) and any(map(traced, jax.tree.leaves(cell.cell_contents)))]
+
+
+def _is_filled(cell: Any) -> bool:
+    try:
+        cell.cell_contents  # noqa: B018
+    except ValueError:  # of a variable that is defined later
+        return False
+    return True
 
 
 def asks_for(function: Callable, name: str) -> bool:

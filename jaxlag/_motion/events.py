@@ -17,7 +17,7 @@ from .mode_changes import Change, changed
 from .protocol import Arguments
 from .scales import Scales
 from .state_vector import Parts
-from .witnesses import matching, sides
+from .witnesses import matching, sides, sides_of_those_left
 
 
 def behind_end(equations: EquationsOfMotion, t, y, args: Arguments, ended: Bool[Array, " m"], moved: Float[Array, " m"]) -> Change:
@@ -41,11 +41,19 @@ def behind_jump(equations: EquationsOfMotion, t, y0, y, before: Arguments, args:
     return after, consistent & also
 
 
+def behind_step(equations: EquationsOfMotion, t, y, args: Arguments) -> Float[Array, " y"]:
+    """y at the end of a step, where witnesses that stayed at zero may have left it."""
+    if not equations.events:
+        return y
+    parts = equations.parts(y)
+    return parts._replace(sign=sides_of_those_left(equations, t, parts, args)).y
+
+
 def begun(equations: EquationsOfMotion, t, y, args: Arguments) -> tuple[Float[Array, " y"], Bool[Array, ""]]:
     """y at the start, behind the events of witnesses that are `Negative` already and of impacts there; and whether a mode of friction and
     contact is consistent there.
     """
-    return _settled(equations, t, y, y, args, _struck(equations, None, y))
+    return _settled(equations, t, y, y, args, _struck(equations, None, y), at_start=True)
 
 
 def _struck(equations: EquationsOfMotion, before, y) -> Bool[Array, " w"]:
@@ -57,7 +65,7 @@ def _struck(equations: EquationsOfMotion, before, y) -> Bool[Array, " w"]:
 
 
 @jitted
-def _settled(equations: EquationsOfMotion, t, seen, y, args: Arguments, passed: Bool[Array, " w"]):
+def _settled(equations: EquationsOfMotion, t, seen, y, args: Arguments, passed: Bool[Array, " w"], at_start: bool = False):
     """y behind the events whose witnesses `passed` through zero, and behind those whose witnesses these, or a jump before, have taken to
     the other side, each of them once; and whether a mode of friction and contact is consistent there. What is recorded is the state that
     was `seen` before all this.
@@ -67,13 +75,13 @@ def _settled(equations: EquationsOfMotion, t, seen, y, args: Arguments, passed: 
         y, consistent, passed, done, _ = carry
         parts = equations.parts(y)
         side, is_far = sides(equations, t, parts, args)
-        is_new = parts.sign == 0  # at the start
+        is_new = parts.sign == 0
         before = jnp.where(is_new, 1, parts.sign)
         passed = (passed | (is_new & _due(equations) & (side < 0)) | (~is_new & is_far & (side != parts.sign))) & ~done
         done = done | passed
         happens = passed & matching(equations, before)
         stops = jnp.any(happens & np.array([event.stop for _, event in equations.system.events]))
-        sign, stopped = jnp.where(done | is_new, side, parts.sign), jnp.maximum(parts.stopped, stops)
+        sign, stopped = jnp.where(done | (is_new & at_start), side, parts.sign), jnp.maximum(parts.stopped, stops)
         parts = parts._replace(sign=sign, happened=parts.happened + happens, stopped=stopped)
         changing = np.array([event.then is not None for _, event in equations.system.events])
         unmoved = lambda: (parts.y, jnp.array(True))

@@ -5,7 +5,6 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from .._mechanics.contact import roundings
 from .._model.flat import Flat
 
 CLEARLY = 4  # roundings of a witness, from which on a comparison sees its side
@@ -22,7 +21,7 @@ def on_held_sides(flat: Flat, t, parts: Any, args: Any) -> Any:
     given = jax.lax.stop_gradient((parts.q, parts.v))
     at = lambda q, v: flat.witnesses(t, q, v, jnp.zeros(flat.rows, v.dtype))
     value, slopes = at(*given), jax.jacfwd(at, argnums=(0, 1))(*given)
-    size = roundings(parts.q, args.scales.of_q), roundings(parts.v, args.scales.of_v)
+    size = args.scales.roundings(parts.q, parts.v)
     least = CLEARLY * sum(jnp.abs(by) @ of for by, of in zip(slopes, size, strict=True))
     far = least - parts.sign * value
     amount = jnp.where((far > 0) & (parts.sign != 0), parts.sign * far, 0)

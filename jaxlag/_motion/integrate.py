@@ -39,7 +39,10 @@ from .wrapped_solver import ProjectedSolver, SamplingAdjoint
 
 CHOICES: dict[str, tuple[tuple[type, ...], str]] = {  # what may be chosen; the usual kinds first, since diffrax takes long to tell its own
     "solver": ((ExplicitRungeKutta, dfx.AbstractSolver), "`jaxlag.Dop853()` or `diffrax.Kvaerno5()`"),
-    "stabilisation": ((Projection, Baumgarte, NoStabilisation), "`Projection()`, `Baumgarte()` or `NoStabilisation()`"),
+    "stabilisation": (
+        (Projection, Baumgarte, NoStabilisation),
+        "`Projection()`, `Baumgarte()` or `NoStabilisation()`, of `jaxlag.stabilisation`",
+    ),
     "friction": ((StickSlip, Regularised), "`StickSlip()` or `Regularised(width)`"),
     "adjoint": ((type(None), dfx.AbstractAdjoint), "`diffrax.RecursiveCheckpointAdjoint()`, or leave it out"),
 }
@@ -108,7 +111,9 @@ def initialised(equations: EquationsOfMotion, at: StatesAt, params, scales: Scal
     )
     y = start.y
     if equations.events:
-        y, consistent = begun(equations, t0, y, Arguments(params, scales))
+        given = Arguments(params, scales)
+        args = told_of_loads(equations, t0, y, given) if equations.elements else given
+        y, consistent = begun(equations, t0, y, args)
         conditions = (*conditions, (consistent, RESULTS.no_friction))
     if equations.works:  # counted from behind an impact and events at the start
         y = equations.parts(y)._replace(works=jnp.zeros(len(equations.works), y.dtype)).y

@@ -4,7 +4,7 @@ import dataclasses
 import functools
 import math
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -18,6 +18,9 @@ from .._model.signal import CalledElsewhere, Piece, Signal, SinceOrigin, broken_
 from .._model.signal_interpolation import AbstractInterpolation
 from .._model.system import System
 from .._program.walker import used_arguments
+
+SIMULTANEOUS = 1e-3  # of the period of a sampled state: a signal that jumps so close to a tick is meant to jump with it,
+SELDOM = 0.25  # if its samples are no closer than this part of the period, on average
 
 
 class Rows(NamedTuple):
@@ -95,6 +98,18 @@ class Inputs:
     def times(self, following: tuple[Int[Array, ""], ...], t) -> list[Float[Array, ""]]:
         """When the next sample of each comes; what follows in `following` are no signals."""
         return [record.time(i, t) for record, i in zip(self.records, following, strict=False)]
+
+    def at_ticks(self, k: int, time, origin, periods: Sequence[Any]) -> Float[Array, ""]:
+        """The time at which signal k jumps, or that of the tick of a sampled state that it is recorded for: a logger's clock is not quite
+        that of the controller, which would read the old value or the new one at random.
+        """
+        ts, jumps = self.records[k].ts, self.records[k].interpolation.jumps
+        for period in periods if jumps else ():
+            usual = (ts.at(ts.shape[0] - 1)[0] - ts.at(0)[0]) / max(ts.shape[0] - 1, 1)
+            tick = origin + jnp.round((time - origin) / jnp.where(period > 0, period, 1)) * period
+            is_meant = (jnp.abs(time - tick) <= SIMULTANEOUS * period) & (usual >= SELDOM * period) & jnp.isfinite(time)
+            time = time + jax.lax.stop_gradient(jnp.where(is_meant, tick - time, 0).astype(time.dtype))
+        return time
 
     def pieces(self, following: tuple[Int[Array, ""], ...]) -> PyTree:
         """Params with the inputs as they are up to the next sample of each."""

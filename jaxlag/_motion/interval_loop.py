@@ -199,7 +199,8 @@ class IntervalLoop(NamedTuple):
         signals = len(inputs.records)
         ticks = [(origin + i * period).astype(t.dtype) for i, period in zip(steps.following[signals:], periods, strict=True)]
         ticks = [jnp.where(tick > t, tick, jnp.inf) for tick in ticks]  # a period that is not positive has none
-        return [*inputs.times(steps.following, t), *ticks]
+        times = [inputs.at_ticks(k, time, origin, periods) for k, time in enumerate(inputs.times(steps.following, t))]
+        return [*times, *ticks]
 
     def _tried(self, same, moving: Moving, given, steps: Steps, args) -> tuple[Tried, Any]:
         """A step of the solver up to the next node at most; and, not differentiated, its result and the rest of the solver's state.

@@ -3,7 +3,10 @@
 import dataclasses
 
 import equinox as eqx
+import numpy as np
 from jaxtyping import Array, Bool, Float, PyTree
+
+from .._program.jit import is_concrete
 
 
 class FrictionState(eqx.Module):
@@ -34,6 +37,14 @@ class EventState(eqx.Module):
     qdot: PyTree
     states: dict[str, PyTree]
     count: Float[Array, "*members T"]
+
+    def __repr__(self) -> str:
+        """The times alone, without the places that are left."""
+        if not is_concrete(self.ts) or np.ndim(self.ts) != 1:
+            return super().__repr__()
+        times = np.asarray(self.ts)
+        happened = times[np.isfinite(times)]
+        return f"EventState: {happened.size} of at most {times.size}, ts = {np.array2string(happened, threshold=8)}"
 
 
 def with_counts(events: dict[str, EventState], counts: dict[str, Array]) -> dict[str, EventState]:

@@ -13,6 +13,7 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, PyTree
 
+from .._mechanics.contact import roundings
 from .._model.numbers import number, numbers
 from .._model.signal import least_spacing, origin_of
 from .._program.jit import is_concrete
@@ -62,6 +63,23 @@ class Scales(NamedTuple):
         Where elements begin to slide together, a velocity may be off by this much.
         """
         return 1e2 * self._absolute(self.of_v)
+
+    @property
+    def with_what_is_held(self) -> "Scales":
+        """The same, where coordinates have scales that have not moved yet, since forces hold one another."""
+        if self.held is None:
+            return self
+        reach = self.held * self.duration
+        return self._replace(of_q=jnp.maximum(self.of_q, reach * self.duration), of_v=jnp.maximum(self.of_v, reach))
+
+    def roundings(self, q: Array, v: Array) -> tuple[Array, Array]:
+        """What counts as rounding of q and of q̇."""
+        reach = self.with_what_is_held
+        return roundings(q, reach.of_q), roundings(v, reach.of_v)
+
+    def roundings_of_rates(self, qddot: Array) -> Array:
+        """What counts as rounding of q̈, where forces hold one another."""
+        return roundings(qddot, 0.0) if self.held is None else roundings(self.held, 0.0)
 
     def of_positions(self, q: Array, factor: float = 10) -> Array:
         """Of each coordinate, the error of the integration."""

@@ -69,7 +69,8 @@ def simulate(
       coordinate, velocity and state is compared with its own scale, a hundredth of its largest value so far, in any unit; otherwise `atol`
       is a number, or a pytree like `q0` with one for each coordinate and its velocity. Derivatives are as accurate as the motion: their
       errors, compared with their own scales, shorten the steps of a motion that is differentiated.
-    - `stabilisation`: how the constraints are maintained: `Projection()`, `Baumgarte(...)` or `NoStabilisation()`.
+    - `stabilisation`: how the constraints are maintained, one of `jl.stabilisation`: `Projection()`, `Baumgarte(...)` or
+      `NoStabilisation()`.
     - `friction`: treatment of dry friction: `StickSlip()` (exact Coulomb friction) or `Regularised(width)`.
     - `max_steps`: step limit.
     - `adjoint`: a diffrax adjoint, used in place of the derivative rule of this package; with contacts, events, sampled states, and signals

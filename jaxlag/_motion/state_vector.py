@@ -33,7 +33,7 @@ class Parts(NamedTuple):
     changed: Float[Array, " c"]
     flight: Float[Array, " c"]
     impulse: Float[Array, " c"]
-    sign: Float[Array, " w"]  # 1 or −1; 0 where it is not known yet
+    sign: Float[Array, " w"]  # 1 or −1; 0 where it is not known yet, since the witness stays at zero
     happened: Float[Array, " w"]
     seen: Float[Array, " s"]  # t, q, q̇ and states
     stopped: Float[Array, " 0|1"]  # 1 or 0

@@ -11,7 +11,7 @@ import numpy as np
 
 from .._program.jit import jitted
 from .event_record import overflows
-from .events import behind_end
+from .events import behind_end, behind_step
 from .first_order import EquationsOfMotion
 from .mode_changes import approach, at_end, margins
 from .results import RESULTS, under_diffrax
@@ -191,7 +191,7 @@ class StickSlipSolver(ProjectedSolver):
         result = dfx.RESULTS.where(overflows(self.equations, second.y), under_diffrax(RESULTS.too_many_events), result)
         result = dfx.RESULTS.where(first.result == dfx.RESULTS.successful, result, first.result)
         dense = {"cut": jnp.where(ended, cut.time, t1), "first": first.dense, "second": second.dense}
-        return second.y, error, dense, second.state, result
+        return behind_step(self.equations, t1, second.y, args), error, dense, second.state, result
 
     @jitted
     def _seen(self, t0, t1, dense, args, exactly):

@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from .._mechanics.contact import roundings
-from .._model.event import Either, Rising
+from .._model.event import Either, Negative, Rising
 from .._model.flat import Flat
 from .._model.signal import origin_of
 from .first_order import EquationsOfMotion
@@ -19,18 +19,13 @@ def witness_margins(equations: EquationsOfMotion, t, parts: Parts, args: Argumen
     if not equations.events:
         return parts.sign, parts.sign
     parts = equations.decided(t, parts, args)
-    value, scale_of = _value_and_scale(equations, t, parts, args)
-    return parts.sign * value, scale_of(*_roundings(parts, args))
-
-
-def _roundings(parts: Parts, args: Arguments):
-    """What counts as rounding of q and of q̇."""
+    value, _, scale_of = _value_and_scale(equations, t, parts, args)
     assert args.scales is not None  # events are located
-    return roundings(parts.q, args.scales.of_q), roundings(parts.v, args.scales.of_v)
+    return parts.sign * value, scale_of(*args.scales.roundings(parts.q, parts.v))
 
 
 def _value_and_scale(equations, t, parts, args):
-    """Of each witness, its value, and what errors of q and q̇ amount to in it."""
+    """Of each witness, its value, the sizes of its slopes over t, q, q̇ and multipliers, and what errors of q and q̇ amount to in it."""
     flat, _ = equations.contents(t, parts, args)
     multipliers = _multipliers(equations, t, parts, args)(t, parts.q, parts.v)
     largest = jax.lax.stop_gradient(jnp.max(jnp.abs(multipliers), initial=0.0)) * jnp.ones_like(multipliers)
@@ -44,7 +39,7 @@ def _value_and_scale(equations, t, parts, args):
         errors = (of_time + of_times)[:, None], of_q[None], of_v[None], of_loads[None]
         return jax.lax.stop_gradient(sum(jnp.sum(by * of, axis=1) for by, of in zip(slopes, errors, strict=True)))
 
-    return flat.witnesses(*at), scale
+    return flat.witnesses(*at), slopes, scale
 
 
 def _multipliers(equations, t, parts, args):
@@ -58,19 +53,40 @@ def _multipliers(equations, t, parts, args):
 
 
 def sides(equations: EquationsOfMotion, t, parts: Parts, args: Arguments) -> tuple[Float[Array, " w"], Bool[Array, " w"]]:
-    """On which side of zero each witness is, 1 or −1; where it is zero but for errors of the integration, to which side it goes. And
-    whether it is farther away than by rounding.
+    """On which side of zero each witness is, 1 or −1; where it is zero but for errors of the integration, to which side it goes, and 0
+    where it stays, as that of a velocity that friction holds. And whether it is farther away than by rounding.
     """
     assert args.scales is not None  # events are located
     parts = equations.decided(t, parts, args)
-    value, scale_of = _value_and_scale(equations, t, parts, args)
+    value, slopes, scale_of = _value_and_scale(equations, t, parts, args)
     flat, mode, _ = equations.mode(t, parts, args)
     multipliers, qddot = _multipliers(equations, t, parts, args), equations.acceleration(mode, t, parts.q, parts.v).x
     along = lambda t, q, v: flat.witnesses(t, q, v, multipliers(t, q, v))
     rate = jax.jvp(along, (t, parts.q, parts.v), (jnp.ones_like(t), parts.v, qddot))[1]
     is_far = jnp.abs(value) > scale_of(args.scales.of_positions(parts.q), args.scales.of_velocities(parts.v))
-    side = jnp.where(jnp.where(is_far, value, rate) < 0, -1.0, 1.0).astype(value.dtype)
-    return jax.lax.stop_gradient((side, jnp.abs(value) > scale_of(*_roundings(parts, args))))
+    of_q, of_v = args.scales.roundings(parts.q, parts.v)
+    stays = ~is_far & (jnp.abs(rate) <= slopes[1] @ of_v + slopes[2] @ args.scales.roundings_of_rates(qddot)) & _may_stay(equations)
+    side = jnp.where(stays, 0.0, jnp.where(jnp.where(is_far, value, rate) < 0, -1.0, 1.0)).astype(value.dtype)
+    return jax.lax.stop_gradient((side, jnp.abs(value) > scale_of(of_q, of_v)))
+
+
+def sides_of_those_left(equations: EquationsOfMotion, t, parts: Parts, args: Arguments) -> Float[Array, " w"]:
+    """The signs of witnesses at the end of a step, where some that stayed at zero have left it: that is no event."""
+    assert args.scales is not None  # events are located
+
+    def found():
+        there = equations.decided(t, parts, args)
+        value, _, scale_of = _value_and_scale(equations, t, there, args)
+        scales = args.scales.with_what_is_held
+        has_left = (parts.sign == 0) & (jnp.abs(value) > scale_of(scales.of_positions(there.q), scales.of_velocities(there.v)))
+        return jnp.where(has_left, jnp.sign(value), parts.sign)
+
+    return jax.lax.stop_gradient(jax.lax.cond(jnp.any(parts.sign == 0), found, lambda: parts.sign))
+
+
+def _may_stay(equations) -> Bool[np.ndarray, " w"]:
+    """Which witnesses may leave zero without an event: not those that happen wherever they are negative."""
+    return np.array([not isinstance(event.direction, Negative) for _, event in equations.system.events])
 
 
 def matching(equations: EquationsOfMotion, sign: Float[Array, " w"]) -> Bool[Array, " w"]:

@@ -18,7 +18,7 @@ from .derivative import derivative
 
 
 class Program(NamedTuple):
-    """What a program computes: q̈ and λ, which make the residuals zero, by formulas where all have one."""
+    """The contents of a program: q̈ and λ, which make the residuals zero, from formulas if each has one."""
 
     t: Symbol
     q: tuple[Symbol, ...]
@@ -35,7 +35,7 @@ class Program(NamedTuple):
         return (*self.qddot, *self.multipliers)
 
     def formulas(self) -> list[Expr] | None:
-        """Formulas of z; None where some unknown has none."""
+        """Formulas for z; None if an unknown has none."""
         return [self.solution[x] for x in self.unknowns] if all(x in self.solution for x in self.unknowns) else None
 
     def system(self) -> tuple[Matrix, Matrix]:
@@ -125,13 +125,13 @@ def to_c(program: Program) -> str:
 
 
 def identifier(name: str) -> str:
-    """A name as Python reads it: k_2 of k^2, _1k of 1k."""
+    """A name as a Python identifier: k_2 for k^2, _1k for 1k."""
     name = re.sub(r"\W", "_", unicodedata.normalize("NFKC", name))  # as Python does: two spellings may be one identifier
     return name if name.isidentifier() else f"_{name}"
 
 
 def _in_ascii(name: str) -> str:
-    """A name in the letters of C99: phi of φ."""
+    """A name in the letters of C99: phi for φ."""
     return "".join(x if x.isascii() else _letter_in_words(x) for x in unicodedata.normalize("NFKD", name) if not unicodedata.combining(x))
 
 
@@ -141,7 +141,7 @@ def _letter_in_words(letter: str) -> str:
 
 
 class _Writer:
-    """Formulas in a language: names of the symbols, common subexpressions, and with these z, or A and b."""
+    """Formulas in a programming language: names of the symbols, common subexpressions, and z, or A and b, in terms of these."""
 
     def __init__(self, program: Program, printer: CodePrinter, reserved: frozenset[str], spelt: Callable[[str], str]):
         self.printer = printer

@@ -17,7 +17,7 @@ from .symbol_tree import SymbolTree
 
 
 def contact_laws(system: System, gaps: list[Any], multipliers: list[Symbol], params: SymbolTree) -> tuple[ContactLaw, ...]:
-    """Those of a system, with its gaps as formulas and the symbols of its contact forces."""
+    """The contact laws of a system, from its gaps as formulas and the symbols of its contact forces."""
     found = []
     for (name, given), (_, law), formula, multiplier in zip(system.restitution, system.laws, gaps, multipliers, strict=True):
         gap, rate = (Symbol(f"{letter}_{name}", real=True) for letter in ("g", "gdot"))
@@ -32,7 +32,7 @@ def contact_laws(system: System, gaps: list[Any], multipliers: list[Symbol], par
 
 
 def contact_lines(contact: ContactLaw, printer: Any) -> Iterator[tuple[str, ...]]:
-    """Left and right sides and the relation between them: g ≥ 0, λ ≥ 0, g λ = 0; and ġ⁺ = −e ġ⁻ in an impact, or Λ⁺ = e Λ⁻ of the impulses
+    """Left and right sides and the relation between them: g ≥ 0, λ ≥ 0, g λ = 0; and ġ⁺ = −e ġ⁻ in an impact, or Λ⁺ = e Λ⁻ for the impulses
     of expansion and compression.
     """
     text, e = printer.doprint, contact.restitution

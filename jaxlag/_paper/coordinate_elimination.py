@@ -8,9 +8,9 @@ from .simplify import Simplifier
 
 
 def eliminate_coordinates(s: SymbolicSystem, simplify: Simplifier) -> dict[Symbol, Expr]:
-    """Coordinates expressed by others: by holonomic constraints that are linear in them, with a factor free of coordinates.
+    """Coordinates in terms of others, from holonomic constraints that are linear in them, with a factor free of coordinates.
 
-    First come those that appear in the fewest constraints.
+    Coordinates that appear in the fewest constraints come first.
     """
     eliminated: dict[Symbol, Expr] = {}
     left = [simplify(g) for g in s.g]
@@ -32,7 +32,7 @@ def eliminate_coordinates(s: SymbolicSystem, simplify: Simplifier) -> dict[Symbo
 def reduce_system(
     s: SymbolicSystem, steps: Steps, eliminated: dict[Symbol, Expr], simplify: Simplifier
 ) -> tuple[SymbolicSystem, Steps, tuple[Expr, ...], list[Expr]]:
-    """The system in the remaining coordinates, all accelerations by the remaining ones, and residuals that determine the other λ."""
+    """The system in the remaining coordinates, all accelerations in terms of these, and residuals that determine the other λ."""
     if not eliminated:
         return s, steps, s.qddot, []
     remaining = [i for i, x in enumerate(s.q) if x not in eliminated]

@@ -9,7 +9,7 @@ from .simplify import Simplifier
 
 
 class ContactLaw(NamedTuple):
-    """A contact as formulas: symbols of its gap and of the rate of that, the gap, the symbol of its force, and the law of its impacts."""
+    """A contact as formulas: the symbols of its gap and gap rate, the gap, the symbol of its force, and its impact law."""
 
     gap: Symbol
     rate: Symbol
@@ -26,22 +26,22 @@ class SymbolicSystem(NamedTuple):
     q: tuple[Symbol, ...]
     qdot: tuple[Symbol, ...]
     qddot: tuple[Symbol, ...]
-    multipliers: tuple[Symbol, ...]  # those of g, then those of a
+    multipliers: tuple[Symbol, ...]  # for g, then for a
     L: Expr
     D: Expr
     Q: Matrix
     g: Matrix  # and the gaps of contacts, as if all were closed
     a: Matrix
-    z: tuple[Symbol, ...] = ()  # states of first order
+    z: tuple[Symbol, ...] = ()  # first-order states
     zdot: tuple[Symbol, ...] = ()
     rates: tuple[Expr, ...] = ()  # of these
     u: tuple[Symbol, ...] = ()  # sampled states
-    updates: tuple[Expr | None, ...] = ()  # of these; None where they have no formula
+    updates: tuple[Expr | None, ...] = ()  # of these; None if they have no formula
     contacts: tuple[ContactLaw, ...] = ()
 
 
 class Steps(NamedTuple):
-    """The terms of Lagrange's equations, one row for each coordinate, and those of the constraints, one for each row of G."""
+    """The terms of Lagrange's equations, one row for each coordinate, and of the constraints, one for each row of G."""
 
     momentum: Matrix  # ∂L/∂q̇
     momentum_rate: Matrix  # d/dt ∂L/∂q̇
@@ -87,7 +87,7 @@ def equations_of_motion(s: SymbolicSystem, steps: Steps, simplify: Simplifier) -
 
 
 def residuals(s: SymbolicSystem, steps: Steps) -> list[Expr]:
-    """What is zero for the right q̈ and λ: M q̈ − f − Gᵀλ and G q̈ + γ, but for contacts, which may be open."""
+    """Expressions that are zero for the right q̈ and λ: M q̈ − f − Gᵀλ and G q̈ + γ, except for contacts, which may be open."""
     qddot, holonomic = Matrix(len(s.qddot), 1, s.qddot), len(s.g) - len(s.contacts)
     rows = list(steps.G * qddot + steps.gamma)
     return [*(steps.M * qddot - steps.f - steps.reaction), *rows[:holonomic], *rows[len(s.g) :]]

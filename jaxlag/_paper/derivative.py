@@ -40,9 +40,9 @@ class Side(Dummy):
 
 
 def one_sided(formula: Expr, is_zero: Callable[[Expr], bool]) -> Expr:
-    """The formula beside its kinks: |u| as s u and sign u as s, with a `Side` s, where u is zero.
+    """The formula next to its kinks: |u| as s u and sign u as s, with a `Side` s, where u is zero.
 
-    What is smooth there has derivatives without s: |u| u, but not |u|.
+    A term that is smooth there has derivatives without s: |u| u, but not |u|.
     """
     sides: dict[Expr, Side] = {}
     at_kink = lambda e: isinstance(e, (Abs, sign)) and is_zero(e.args[0])

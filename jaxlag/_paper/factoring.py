@@ -10,7 +10,7 @@ from sympy import Add, Expr, Mul, Symbol, cos, sin
 from .sum_of_products import ONE, Atoms, Product, Sum, common_factor, divided, divides
 
 QUOTIENTS = {sympy.tan: (sin, cos), sympy.tanh: (sympy.sinh, sympy.cosh)}
-MANY_TERMS = 30  # above which only single symbols are tried as common factors
+MANY_TERMS = 30  # number of terms above which only single symbols are tried as common factors
 
 Term = tuple[dict[int, Any], Expr]  # powers and their coefficient
 
@@ -40,7 +40,7 @@ class Factoring:
         return Mul(c, *(self.atoms[atom] ** exponent for atom, exponent in powers.items()))
 
     def _factored(self, group: list[Term]) -> Expr:
-        """A sum of terms, the factor that saves most in front of a bracket, and so on within the bracket and outside."""
+        """A sum of terms with the factor that saves most in front of a bracket, repeated inside and outside the bracket."""
         if len(group) == 1:
             return self.of_product(*group[0])
         common = common_factor(*(powers for powers, _ in group))
@@ -56,7 +56,7 @@ class Factoring:
         return Add(self._factored(inside), self._factored([term for term in group if term not in inside]))
 
     def _candidates(self, group: list[Term]) -> list[dict[int, Any]]:
-        """The common factors of each two terms, or in a long sum single symbols, lest the time grow with the third power."""
+        """The common factors of each pair of terms, or single symbols in a long sum, to keep the time from growing with the third power."""
         if len(group) > MANY_TERMS:
             return [
                 {atom: 1}
@@ -71,6 +71,6 @@ class Factoring:
         return (terms - 1) * size, all(self.atoms[a] in self.parameters for a in factor)
 
     def _leading_coefficient(self, group: list[Term]) -> Expr:
-        """That of the first term that is not made of parameters alone."""
+        """The coefficient of the first term that is not made of parameters alone."""
         is_moving = lambda powers: any(self.atoms[atom] not in self.parameters for atom in powers)
         return next((c for powers, c in group if is_moving(powers)), group[0][1])

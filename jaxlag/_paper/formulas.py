@@ -1,6 +1,6 @@
 """Functions of arrays as formulas: jaxprs evaluated over SymPy expressions, with exact numbers.
 
-Imported only where a formula is asked for: SymPy is an extra.
+Imported only when a formula is asked for: SymPy is an extra.
 """
 
 import functools
@@ -23,7 +23,7 @@ from .._program.interpreter import evaluate
 
 
 def formulas(function: Callable, *arguments: PyTree[np.ndarray]) -> PyTree[np.ndarray]:
-    """`function` of pytrees of arrays of expressions or numbers; traced in double precision, whatever the precision of simulations."""
+    """`function` of pytrees of arrays of expressions or numbers; traced in double precision, regardless of the precision of simulations."""
     shapes = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, float if x.dtype.kind in "Of" else x.dtype), arguments)
     with jax.enable_x64(True):
         closed, out = jax.make_jaxpr(function, return_shape=True)(*shapes)
@@ -45,7 +45,7 @@ def exact(x: Any) -> sympy.Basic:
         return sympy.sympify(value)
     if abs(value) <= precision.tiny:  # zero, or a threshold that keeps 0/0 out of a program
         return sympy.Integer(0)
-    simple = 1000 if precision.bits == 64 else 100  # few enough that a float is hardly the nearest to one by chance
+    simple = 1000 if precision.bits == 64 else 100  # few enough that a float is unlikely to be the nearest to one by chance
     near = lambda y: sympy.Rational(*Fraction(y).limit_denominator(simple).as_integer_ratio())
     if x.dtype.type(float(near(value))) == x:
         return near(value)
@@ -61,7 +61,7 @@ class Formulas(Algebra):
     """Scalars are SymPy expressions of real symbols, truth values are SymPy's."""
 
     def number(self, x):
-        """The number, exact where it was meant to be exact."""
+        """The number, exact if it was meant to be exact."""
         return exact(np.asarray(x)[()])
 
     def folds(self, x):
@@ -69,14 +69,14 @@ class Formulas(Algebra):
         return True if x.dtype.kind != "f" else (np.abs(x) < 2**15) & (8 * x == np.round(8 * x))
 
     def function(self, primitive, params, dtype):
-        """From a table. Unknown integers have no division and no bitwise operations."""
+        """The function from a table. Unknown integers have no division and no bitwise operations."""
         if primitive.name == "convert_element_type":
             return _converting(dtype)
         is_whole = np.issubdtype(dtype, np.integer)
         return None if is_whole and primitive.name in ("div", "rem", "and", "or", "xor", "not") else FUNCTIONS.get(primitive.name)
 
     def shortcut(self, equation):
-        """Functions of JAX with a plain formula, whose programs guard against overflow or pivot."""
+        """Plain formulas of JAX functions whose programs guard against overflow or pivot."""
         name = equation.params.get("name")
         if name not in SHORTCUTS:
             return None
@@ -137,7 +137,7 @@ def _determinant(A: np.ndarray) -> list[np.ndarray]:
 
 
 def _interpolated(x: np.ndarray, xp: np.ndarray, fp: np.ndarray, left: Any = None, right: Any = None) -> list[np.ndarray]:
-    """Linear between the points of a table, constant beyond its ends."""
+    """Linear interpolation between the points of a table, constant beyond its ends."""
     points = list(zip(xp, fp, strict=True))
     line = lambda x, a, b: a[1] + (b[1] - a[1]) / (b[0] - a[0]) * (x - a[0])
 

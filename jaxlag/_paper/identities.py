@@ -1,4 +1,4 @@
-"""Trigonometric identities, and that of a sum and its parts: each finds terms that it makes one."""
+"""Trigonometric identities, and the identity of a sum and its parts: each finds terms that it combines into one."""
 
 import itertools
 from collections.abc import Iterable, Iterator
@@ -10,7 +10,7 @@ from .sum_of_products import ONE, Atoms, Product, Sum, added
 
 
 class Expander(Protocol):
-    """What the identities need: atoms, and formulas as sums of their products."""
+    """The interface that the identities need: atoms, and formulas as sums of their products."""
 
     atoms: Atoms
 
@@ -27,7 +27,7 @@ class Expander(Protocol):
         ...
 
 
-Replacement = tuple[Sum, Sum]  # the other terms that an identity needs, relative to the first, and what all of them make
+Replacement = tuple[Sum, Sum]  # the other terms that an identity needs, relative to the first, and their common result
 
 
 def combine(s: Expander, terms: Sum) -> Sum:
@@ -49,7 +49,7 @@ def combine(s: Expander, terms: Sum) -> Sum:
 
 
 def _in_one_function(s: Expander, terms: Sum) -> Sum:
-    """Even powers of sin by those of cos, or of cos by those of sin, for each angle, where that leaves fewer terms."""
+    """The sum with even powers of sin as powers of cos, or of cos as powers of sin, for each angle, if that leaves fewer terms."""
     squares = lambda product, atom: max(e // 2, 0) if isinstance(e := dict(product).get(atom, 0), int) else 0
     angles = dict.fromkeys(s.atoms[a].args[0] for p in terms for a, _ in p if isinstance(s.atoms[a], (sin, cos)) and squares(p, a))
     for angle, (replaced, by) in itertools.product(angles, ((sin, cos), (cos, sin))):
@@ -86,7 +86,7 @@ def _addition_theorem(s: Expander, product: Product) -> Iterator[Replacement]:
 
 
 def _sum_and_its_parts(s: Expander, product: Product) -> Iterator[Replacement]:
-    """The sum (a + b)ⁿ a + (a + b)ⁿ b = (a + b)ⁿ⁺¹, where n is not a positive integer."""
+    """The sum (a + b)ⁿ a + (a + b)ⁿ b = (a + b)ⁿ⁺¹, if n is not a positive integer."""
     for atom, exponent in product:
         if s.atoms[atom].is_Add and not (isinstance(exponent, int) and exponent > 0):
             (first, number), *others = added(map(s.expanded, s.atoms[atom].args)).items()

@@ -1,4 +1,4 @@
-"""Formulas in LaTeX, as much of it as Matplotlib's mathtext knows."""
+"""Formulas in the part of LaTeX that Matplotlib's mathtext knows."""
 
 import re
 from typing import ClassVar

@@ -1,4 +1,4 @@
-"""Linear equations between formulas, solved by elimination where the solution is short enough to be read."""
+"""Linear equations between formulas, solved by elimination if the solution is short enough to read."""
 
 import itertools
 import math
@@ -17,7 +17,7 @@ MOST_TERMS = 100  # of a minor: 31 for a chain of three pendulums, 855 for one o
 
 
 def solve_linear(equations: Iterable[Expr], unknowns: Iterable[Symbol], simplify: Simplifier) -> dict[Symbol, Expr]:
-    """The unknowns that formulas, all zero, determine linearly: first those alone in a formula, then those of coupled formulas."""
+    """The unknowns that formulas, set to zero, determine linearly: first unknowns alone in a formula, then unknowns of coupled formulas."""
     left = [simplify(equation) for equation in equations]
     unknowns = list(unknowns)
     solution: dict[Symbol, Expr] = {}
@@ -62,12 +62,12 @@ def _solve_group(
 
 
 def _eliminate(A: list[list[Expr]], b: list[Expr], simplify: Simplifier) -> list[Expr] | None:
-    """The solution of A x = b in the field of fractions of all atoms; None where A is singular or the solution too long."""
+    """The solution of A x = b in the field of fractions of all atoms; None if A is singular or the solution is too long."""
     if _longest_minor([[len(simplify.terms(entry)) for entry in row] for row in A]) > MOST_TERMS:
         return None
     fractions = _Fractions(simplify, [*itertools.chain(*A), *b])
     rows = [[fractions.of(simplify.terms(entry)) for entry in (*row, right)] for row, right in zip(A, b, strict=True)]
-    row_of: dict[int, int] = {}  # each unknown
+    row_of: dict[int, int] = {}  # for each unknown
     while len(row_of) < len(rows):
         pivot = _pivot({i: row[:-1] for i, row in enumerate(rows) if i not in row_of.values()}, lambda x: len(x.numer) + len(x.denom))
         if pivot is None:
@@ -82,7 +82,7 @@ def _eliminate(A: list[list[Expr]], b: list[Expr], simplify: Simplifier) -> list
 
 
 def _pivot(rows: dict[int, list[Any]], length: Callable[[Any], int]) -> tuple[int, int] | None:
-    """The entry with the least fill-in (Markowitz), and among these the shortest; None where all entries are zero."""
+    """The entry with the least fill-in (Markowitz), and among these the shortest; None if all entries are zero."""
     in_row = {i: sum(map(bool, row)) for i, row in rows.items()}
     in_column = [sum(map(bool, column)) for column in zip(*rows.values(), strict=True)]
     places = [(i, j) for i, row in rows.items() for j, entry in enumerate(row) if entry]
@@ -109,7 +109,7 @@ class _Fractions:
 
     def __init__(self, simplify: Simplifier, formulas: Iterable[Expr]):
         self.simplify = simplify
-        self.roots: dict[Any, Any] = {}  # for each atom the part of an exponent that its generator stands for
+        self.roots: dict[Any, Any] = {}  # for each atom, the part of an exponent that its generator stands for
         for formula in formulas:
             self._register(simplify.terms(formula))
         atoms = sorted(self.roots, key=lambda atom: (self.roots[atom] == 1, not isinstance(atom, sin)))
@@ -164,7 +164,7 @@ class _Fractions:
         return self.field(fraction.numer.rem(self.relations)) / self.field(fraction.denom.rem(self.relations))
 
     def formula(self, fraction: Any) -> Expr:
-        """The fraction as a simplified formula: a sum where the denominator is a product, one quotient elsewhere."""
+        """The fraction as a simplified formula: a sum if the denominator is a product, otherwise one quotient."""
         fraction = self.reduced(fraction)
         meaning = [atom ** self.roots[atom] for atom in self.generators] or [sympy.Integer(1)]
         number, factors = fraction.denom.factor_list()
@@ -177,7 +177,7 @@ class _Fractions:
         return self.simplify(above / below)
 
     def _joined(self, factors: list[tuple[Expr, int]]) -> list[tuple[Expr, int]]:
-        """With −sin² in place of (cos − 1) (cos + 1)."""
+        """The factors with −sin² in place of (cos − 1) (cos + 1)."""
         for (left, power), (right, other) in itertools.combinations(factors, 2):
             product = self.simplify(left * right)
             if left.is_Add and right.is_Add and power == other and not product.is_Add:

@@ -15,11 +15,12 @@ from .linear_solve import solve_linear
 from .operating_point import OperatingPoint
 from .simplify import Simplifier
 
+NOT_FINITE = sympy.nan, sympy.zoo, sympy.oo, -sympy.oo
 NUMBERS = "`linearise` does it with numbers"
 
 
 class Linearisation(NamedTuple):
-    """M δq̈ + P δq̇ + R δq = B δu in independent coordinates, and what leads there from all coordinates."""
+    """M δq̈ + P δq̇ + R δq = B δu in independent coordinates, and the reduction to these from all coordinates."""
 
     independent: tuple[int, ...]
     eliminated: dict[Symbol, Expr]  # deviations of the other coordinates
@@ -38,7 +39,7 @@ class Lineariser:
         self.s, self.steps, self.at, self.simplify, self.show = s, steps, at, simplify, show
 
     def __call__(self, inputs: Sequence[Symbol]) -> Linearisation:
-        """The linear equations, after it is checked that there are any."""
+        """The linear equations, after checks that they exist."""
         s, steps = self.s, self.steps
         self._check_kind(inputs)
         self._check_constraints()
@@ -68,12 +69,24 @@ class Lineariser:
     def _at_point(self, formula: Expr) -> Expr:
         """A formula at the point."""
         value, beside = self.at(formula), lambda formula: formula.xreplace(dict.fromkeys(formula.atoms(Side), sympy.Integer(1)))
-        if value.has(sympy.nan, sympy.zoo, sympy.oo, -sympy.oo):
+        if value.has(*NOT_FINITE):
+            value = self._as_rates_vanish(formula)
+        if value.has(*NOT_FINITE):
             raise ValueError(
                 f"`linearised_at` must be a state where all formulas are finite, but {self.show(beside(formula))} is not. "
                 "Choose another one, or other coordinates."
             )
         return self.simplify(value)
+
+    def _as_rates_vanish(self, formula: Expr) -> Expr:
+        """The limit at rest, if it is the same from all directions, as for the slope of |v| v, which is 0/0 as it stands."""
+        if any(self.at(rate) != 0 for rate in self.s.qdot):
+            return sympy.nan
+        small, directions = sympy.Dummy("ε", positive=True), [sympy.Dummy(rate.name, real=True) for rate in self.s.qdot]
+        near = self.at(formula.xreplace({rate: small * way for rate, way in zip(self.s.qdot, directions, strict=True)}))
+        near = near.replace(lambda part: part.is_Pow and not part.exp.is_integer, lambda part: sympy.factor(part.base) ** part.exp)
+        limit = sympy.cancel(sympy.together(near)).xreplace({small: sympy.Integer(0)})
+        return sympy.nan if limit.free_symbols & {small, *directions} else limit
 
     def _at(self, matrix: Matrix) -> Matrix:
         return matrix.applyfunc(self._at_point)
@@ -86,7 +99,7 @@ class Lineariser:
         return ", ".join(f"{self.show(left)} = {self.show(right)}" for left, right in pairs)
 
     def _tangent(self, deviations: tuple[Symbol, ...]) -> tuple[dict[Symbol, Expr], Matrix]:
-        """Deviations that the constraints express by the others, and the basis J of all deviations."""
+        """Deviations that the constraints express in terms of the others, and the basis J of all deviations."""
         column = Matrix(len(deviations), 1, deviations)
         G = self._at(self.steps.G)
         eliminated = eliminate_coordinates(self.s._replace(q=deviations, g=G * column), self.simplify)
@@ -98,7 +111,7 @@ class Lineariser:
         return eliminated, _jacobian(column.xreplace(eliminated), [x for x in deviations if x not in eliminated])
 
     def _multipliers(self, force: Matrix, dependent: Sequence[int], curvature: Matrix) -> dict[Symbol, Expr]:
-        """λ from f + Gᵀλ = 0, where constraints are curved."""
+        """λ from f + Gᵀλ = 0, if constraints are curved."""
         if curvature.free_symbols.isdisjoint(self.s.multipliers):
             return {}
         balance = force + self._at(self.steps.reaction)
@@ -107,7 +120,7 @@ class Lineariser:
             raise ValueError(f"the reactions at `linearised_at` must have formulas short enough to be read, but have none; {NUMBERS}.")
         return multipliers
 
-    # What cannot be linearised.
+    # Systems and points that cannot be linearised.
 
     def _check_kind(self, inputs: Sequence[Symbol]) -> None:
         s, steps = self.s, self.steps
@@ -145,7 +158,7 @@ class Lineariser:
                 )
 
     def _check_balance(self, J: Matrix, force: Matrix, independent: Sequence[int]) -> None:
-        """The point must stay what it is: rates constant, forces balanced along all deviations."""
+        """Checks that the point stays as it is: constant rates, and forces balanced along all deviations."""
         changing = [(x, formula) for x, formula in self.at.given.items() if not formula.free_symbols.isdisjoint(self.at.running)]
         if changing:
             raise ValueError(
@@ -160,6 +173,9 @@ class Lineariser:
         balance = (J.T * force).applyfunc(self.simplify)
         if not all(map(self._is_zero, balance)):
             rows = [-row if row.could_extract_minus_sign() else row for row in balance if row != 0]
+            if not self.s.g and not any(row.is_Add for row in map(self.simplify, rows)):  # as m g = 0, which no coordinate can satisfy
+                still = dict.fromkeys(self.s.qdot, sympy.Integer(0))
+                rows = [row for row in self.steps.f.xreplace(still) if not self._is_zero(row)]
             condition = self._list((self.simplify(row), sympy.Integer(0)) for row in rows)
             accelerations = self._accelerations(J, balance, independent)
             raise ValueError(
@@ -184,7 +200,7 @@ class Lineariser:
 
 
 def is_identity(formula: Expr) -> bool:
-    """Whether a formula is zero at random numbers, positive and negative, to 25 of 40 digits, though no simplification shows it."""
+    """Whether a formula is zero at random numbers, positive and negative, to 25 of 40 digits, even if no simplification shows it."""
     draw = np.random.default_rng(0)
     for _ in range(10):
         signs = {x: 1 if x.is_positive else draw.choice((-1, 1)) for x in sorted(formula.free_symbols, key=lambda x: x.name)}
@@ -195,6 +211,6 @@ def is_identity(formula: Expr) -> bool:
 
 
 def _jacobian(column: Matrix, symbols: Sequence[Symbol]) -> Matrix:
-    """Beside kinks with the powers of their sides apart: of |v|^(3/2) the derivative at v = 0 is zero."""
+    """The Jacobian; next to kinks, with the powers of their sides separated: the derivative of |v|^(3/2) at v = 0 is zero."""
     entry = lambda formula: sympy.expand_power_base(formula, force=True) if formula.has(Side) else formula
     return Matrix(len(column), len(symbols), lambda i, j: entry(derivative(column[i], symbols[j])))

@@ -56,7 +56,7 @@ def linearised(
 
 
 def _inputs(names: str | Collection[str], parameters: Sequence[Symbol]) -> list[Symbol]:
-    """The parameters that are named."""
+    """The named parameters."""
     by_name = {symbol.name: symbol for symbol in parameters}
     names = (names,) if isinstance(names, str) else tuple(names)
     for name in names:

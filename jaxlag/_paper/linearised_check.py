@@ -21,7 +21,7 @@ from .symbol_tree import SymbolTree
 from .symbolic_system import States, bound, number
 
 Numbers = dict[Symbol, Expr]
-DRAWS = 100  # of parameters, ever further from those given, until the point is real: acos(g/(l Ω²)) is not for slow turning
+DRAWS = 100  # of parameters, ever further from the given ones, until the point is real: acos(g/(l Ω²)) is not for slow rotation
 
 
 def check_against_derivatives(
@@ -34,7 +34,7 @@ def check_against_derivatives(
     params: SymbolTree,
     states: States,
 ) -> None:
-    """Raises where M, P, R or B differ from those of the simulation, at random parameters."""
+    """Raises if M, P, R or B differ from the matrices of the simulation, at random parameters."""
     like = coordinates(q.example, "q")
     point = _random_point(found, at, params)
     valued = lambda formulas: np.array([number(formula.xreplace(point)).real for formula in formulas])
@@ -58,6 +58,11 @@ def check_against_derivatives(
     want = {"M": J.T @ M @ J, "C": -J.T @ by_qdot @ J, "K": -J.T @ by_q @ J, "B": J.T @ by_p[:, [symbols.index(x) for x in inputs]]}
     for (name, wanted), matrix in zip(want.items(), (found.M, found.P, found.R, found.B), strict=True):
         got = valued(matrix).reshape(matrix.shape)
+        if not np.all(np.isfinite(wanted)):
+            raise ValueError(
+                f"the forces must have a derivative at `linearised_at` in the simulation, too, but {name} is {wanted} there, as "
+                "a power of a speed makes it at rest. Write drag by `jaxlag.dissipation.drag` or `power_law`."
+            )
         if not np.allclose(got, wanted, rtol=0, atol=1e-9 * (1 + np.max(np.abs(wanted), initial=0))):
             raise ValueError(
                 f"the linear equations must agree with the simulation, but {name} differs: {got} on paper, {wanted} in the simulation. "

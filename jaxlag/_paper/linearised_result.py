@@ -11,7 +11,7 @@ from .result import Section, aligned, lines
 
 
 class LinearDetails(NamedTuple):
-    """What `LinearisedEquations` are printed with."""
+    """The data with which `LinearisedEquations` are printed."""
 
     given: dict  # what the user said about the state
     omega: Any  # symbols of ω₀ and ζ
@@ -74,11 +74,13 @@ class LinearisedEquations:
     def omega_squared(self) -> dict:
         """ω₀² = K/M of each deviation that is coupled with no other and has a mass and a stiffness; negative where it is unstable."""
         single = ((block[0], self.q.index(block[0])) for block in self.blocks if len(block) == 1)
-        return {
-            x: self._details.simplify(self.stiffness[i, i] / self.mass[i, i])
-            for x, i in single
-            if self.mass[i, i] * self.stiffness[i, i] != 0
-        }
+        return {x: self._shortest(self.stiffness[i, i] / self.mass[i, i]) for x, i in single if self.mass[i, i] * self.stiffness[i, i] != 0}
+
+    def _shortest(self, ratio):
+        """The formula, simplified or cancelled, whichever is shorter."""
+        from sympy import count_ops, factor
+
+        return min(self._details.simplify(ratio), factor(ratio), key=count_ops)
 
     @functools.cached_property
     def damping_ratio(self) -> dict:
@@ -86,9 +88,7 @@ class LinearisedEquations:
         from sympy import sqrt
 
         i = {x: self.q.index(x) for x, square in self.omega_squared.items() if not square.could_extract_minus_sign()}
-        ratio = lambda i: self._details.simplify(
-            self.damping[i, i] / (2 * sqrt(self._details.simplify(self.mass[i, i] * self.stiffness[i, i])))
-        )
+        ratio = lambda i: self._shortest(self.damping[i, i] / (2 * sqrt(self._details.simplify(self.mass[i, i] * self.stiffness[i, i]))))
         return {x: ratio(i) for x, i in i.items() if self.damping[i, i] != 0}
 
     @property
@@ -110,7 +110,7 @@ class LinearisedEquations:
         return f"$${self.latex()}$$"
 
     def _sections(self, printer: Any) -> Iterator[Section]:
-        """The state; deviations that are eliminated; then each block, with its frequency and its damping ratio."""
+        """The state; eliminated deviations; then each block, with its frequency and damping ratio."""
         omega, zeta = self._details.omega, self._details.zeta
         equal = lambda left, right: (printer.doprint(left), printer.doprint(right))
         yield [equal(x, formula) for x, formula in self._details.given.items()]

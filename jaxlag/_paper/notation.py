@@ -1,4 +1,4 @@
-"""The order of a textbook: what symbols mean, and how terms and factors are ordered by it."""
+"""The order of a textbook: the meaning of symbols, and the order of terms and factors that follows from it."""
 
 from collections.abc import Iterable
 
@@ -28,11 +28,11 @@ class Notation:
         return max((self.kind.get(symbol, PARAMETER) for symbol in formula.free_symbols), default=-1)
 
     def places(self, formula: Expr, kind: int) -> list[int]:
-        """The places of its symbols of a kind."""
+        """The places of a formula's symbols of one kind."""
         return sorted(self.place.get(x, -1) for x in formula.free_symbols if self.kind.get(x, PARAMETER) == kind)
 
     def in_order(self, formula: Expr) -> list[Expr]:
-        """The terms of a sum: those of accelerations, velocities, positions, parameters; within each, bare symbols first."""
+        """The terms of a sum: accelerations, velocities, positions, parameters; within each kind, bare symbols first."""
 
         def order(term):
             kind, factors = self.highest(term), [factor for factor in Mul.make_args(term) if not factor.is_number]
@@ -42,7 +42,7 @@ class Notation:
         return sorted(sympy.Add.make_args(formula), key=order)
 
     def terms(self, formula: Expr) -> list[Expr]:
-        """The terms of a sum in order, but led by a positive one where there is one."""
+        """The terms of a sum in order, but led by a positive one if there is one."""
         terms = self.in_order(formula)
         if terms[-1].is_number and any(is_in_denominator(factor) for term in terms for factor in Mul.make_args(term)):
             terms = [terms[-1], *terms[:-1]]  # 1 + l/r, but x + 1

@@ -1,4 +1,4 @@
-"""The state about which equations are linearised: what the user gives, as formulas of symbols."""
+"""The state about which equations are linearised: the user's input as formulas of symbols."""
 
 import re
 from collections.abc import Callable, Mapping
@@ -37,7 +37,7 @@ class OperatingPoint(NamedTuple):
 def operating_point(given: Any, s: SymbolicSystem, q: SymbolTree, params: SymbolTree, simplify: Simplifier) -> OperatingPoint:
     """The point from `linearised_at`: coordinates, or a pair of these and their rates; coordinates left out keep their symbols.
 
-    Those that constraints express by others follow from these.
+    Coordinates that constraints express in terms of others follow from these.
     """
     is_pair = type(given) is tuple and len(given) == 2 and (not isinstance(q.symbols, tuple) or isinstance(given[0], (tuple, Mapping)))
     given_q, given_qdot = given if is_pair else (given, {})
@@ -62,14 +62,14 @@ def operating_point(given: Any, s: SymbolicSystem, q: SymbolTree, params: Symbol
 
 
 def _followed(s: SymbolicSystem, own: dict[Symbol, Expr], still: list[Symbol], simplify: Simplifier) -> dict[Symbol, Expr]:
-    """Coordinates by others, as constraints demand: first those that are neither given nor run, then those that run."""
+    """Coordinates in terms of others, as constraints demand: first coordinates that are neither given nor run, then running ones."""
     first = eliminate_coordinates(s._replace(q=tuple(still), g=s.g.xreplace(own)), simplify)
     left = tuple(x for x in s.q if x not in own and x not in first)
     return first | eliminate_coordinates(s._replace(q=left, g=s.g.xreplace(own).xreplace(first)), simplify)
 
 
 def _resolved(values: dict[Symbol, Expr], simplify: Simplifier) -> dict[Symbol, Expr]:
-    """The formulas, with each other's inserted."""
+    """The formulas, with each inserted into the others."""
     for _ in values:
         values = {x: formula.xreplace(values) for x, formula in values.items()}
     for x, formula in values.items():
@@ -85,7 +85,7 @@ class _Reader:
         self.names, self.reserved = names, reserved
 
     def tree(self, given: Any, symbols: PyTree[np.ndarray], known: tuple[Symbol, ...]) -> dict[Symbol, Expr]:
-        """Formulas by symbol, of a tree like `symbols`; in a mapping entries may be left out, and any of the known symbols named."""
+        """Formulas by symbol, from a tree like `symbols`; a mapping may leave out entries and name any of the known symbols."""
         if isinstance(given, Mapping):
             parts = [self._entry(name, value, symbols, known) for name, value in given.items()]
         elif isinstance(symbols, np.ndarray):

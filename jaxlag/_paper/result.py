@@ -15,7 +15,7 @@ from .._program.expressions import filled
 
 MOST_OPERATIONS = 150  # of a solution that is still shown
 
-Section = list[tuple[str, ...]]  # left and right sides, and the relation between them where it is not equality
+Section = list[tuple[str, ...]]  # left and right sides, and the relation between them if it is not equality
 
 
 @dataclasses.dataclass(frozen=True, eq=False, repr=False)
@@ -137,7 +137,7 @@ class Equations:
         return Program(self.t, self.q, self.qdot, self.qddot, details.paths, details.multipliers, details.residuals, details.solution)
 
     def _sections(self, printer: Any) -> Iterator[Section]:
-        """Eliminated coordinates; equations of motion and constraints; laws of contact; where there are multipliers, the solution."""
+        """Eliminated coordinates; equations of motion and constraints; contact laws; and the solution if there are multipliers."""
         from .contact_laws import contact_lines
 
         details = self._details
@@ -155,7 +155,7 @@ class Equations:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Details:
-    """What `Equations` are made from."""
+    """The data from which `Equations` are made."""
 
     steps: Any  # `derivation.Steps`: SymPy is not imported here
     free: tuple  # symbols of the accelerations that remain
@@ -164,14 +164,14 @@ class Details:
     residuals: tuple  # zero for the right q̈ and λ
     structure: PyTree[np.ndarray]  # symbols like q
     multiplier_rows: dict[str, PyTree[np.ndarray]]  # the indices of each constraint's multipliers
-    paths: list  # each parameter's symbol and how Python reaches it
+    paths: list  # each parameter's symbol and its path in Python
     simplify: Any  # `simplify.Simplifier`
     notation: Any  # `notation.Notation`
     contacts: tuple = ()  # of `derivation.ContactLaw`
 
     @functools.cached_property
     def solution(self) -> dict:
-        """Formulas of q̈ and λ, where they are short enough to read."""
+        """Formulas for q̈ and λ, if they are short enough to read."""
         from .linear_solve import solve_linear
 
         given = {contact.multiplier for contact in self.contacts}
@@ -225,7 +225,7 @@ class Derivation:
 
 
 def arranged(shape: tuple, formulas: Iterable) -> Any:
-    """The next formulas as an array of a shape, or a single one."""
+    """The next formulas as an array of the given shape, or a single formula."""
     array = filled(shape, itertools.islice(formulas, math.prod(shape)))
     return array if shape else array[()]
 

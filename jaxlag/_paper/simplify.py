@@ -1,4 +1,4 @@
-"""Formulas simplified as by a person: like terms combined by the identities that everyone knows, common factors in front of brackets."""
+"""Formulas simplified as by a person: like terms combined by well-known identities, common factors in front of brackets."""
 
 from collections.abc import Iterable
 from typing import Any
@@ -17,9 +17,9 @@ class Simplifier:
 
     def __init__(self, separate: Iterable[Symbol] = (), parameters: Iterable[Symbol] = ()):
         self.atoms = Atoms()
-        self.unexpanded: set[Expr] = set()  # sums inside | | and sign: they are not expanded beside these
+        self.unexpanded: set[Expr] = set()  # sums inside | | and sign, which are not expanded next to these
         self._factoring = Factoring(self.atoms, separate, parameters)
-        self._normal_forms: dict[Expr, Expr] = {}  # of such sums, by what they were given as
+        self._normal_forms: dict[Expr, Expr] = {}  # of such sums, by their original form
         self._expanded: dict[Expr, Sum] = {}
 
     def __call__(self, formula: Expr) -> Expr:
@@ -37,7 +37,7 @@ class Simplifier:
         return Add(*parts, self._factoring.of_sum(terms))
 
     def factored(self, formula: Expr) -> Expr:
-        """The formula, simplified, with the factors in front that all its terms share."""
+        """The formula, simplified, with the factors that all its terms share in front."""
         terms = self.terms(formula)
         common = common_factor(*map(dict, terms)) if terms else {}
         sign_ = -ONE if all(c.could_extract_minus_sign() for c in terms.values()) else ONE
@@ -47,7 +47,7 @@ class Simplifier:
         return Mul(sign_, self._factoring.of_product(common), bracket, Add(*(part / bracket for part in Add.make_args(rest))))
 
     def terms(self, formula: Expr) -> Sum:
-        """The formula as a sum of products, of which none cancel or combine."""
+        """The formula as a sum of products, none of which cancel or combine."""
         if formula.has(Abs, sign):
             formula = formula.replace(lambda e: isinstance(e, (Abs, sign)), self._normalised)
         return combine(self, self._expanded_where_alone(self.expanded(formula)))
@@ -90,7 +90,7 @@ class Simplifier:
         return argument.func(*map(self._argument, argument.args)) if argument.args else argument
 
     def product(self, sums: Iterable[Sum]) -> Sum:
-        """The product of sums; one that would make it too long enters as an atom."""
+        """The product of sums; a sum that would make it too long enters as an atom."""
         out: Sum = {(): ONE}
         for terms in sums:
             if len(out) * len(terms) > MOST_PRODUCTS:
@@ -101,7 +101,7 @@ class Simplifier:
     # Sums inside | | and sign.
 
     def _normalised(self, term: Expr) -> Expr:
-        """|u| or sign u with u simplified; a sum u is recorded, so that it is not expanded beside |u|."""
+        """|u| or sign u with u simplified; a sum u is recorded, so that it is not expanded next to |u|."""
         if not isinstance(term, (Abs, sign)):
             return term
         (u,) = term.args
@@ -113,14 +113,14 @@ class Simplifier:
         if not simplified.is_Add:
             return self._normalised(term.func(number * simplified))
         size = Abs(simplified)
-        sign_ = 1 if not isinstance(size, Abs) or size.args[0] == simplified else -1  # of u and −u it takes always the same
+        sign_ = 1 if not isinstance(size, Abs) or size.args[0] == simplified else -1  # always the same one of u and −u
         self.unexpanded |= {size.args[0]} if isinstance(size, Abs) else set()
         self._normal_forms |= {u: number * simplified, -u: -number * simplified}
         self._expanded.clear()
         return number * size if isinstance(term, Abs) else sign_ * sign(sign_ * simplified)
 
     def _expanded_where_alone(self, terms: Sum) -> Sum:
-        """With the sums expanded that stand beside no | | or sign of themselves."""
+        """The terms with each sum expanded that is not next to its own | | or sign."""
         if not self.unexpanded:
             return terms
         partners = {self.atoms.index(u): {self.atoms.index(Abs(u)), self.atoms.index(sign(u))} for u in self.unexpanded}

@@ -1,7 +1,7 @@
-"""Sums of products of powers of atoms: how a formula is held while it is simplified.
+"""Sums of products of powers of atoms: the form of a formula while it is simplified.
 
-An atom is a symbol, or a function of simplified formulas; it goes by an index. A product is made of powers of atoms, and a sum holds the
-coefficient of each of its products.
+An atom is a symbol, or a function of simplified formulas; it is identified by an index. A product is made of powers of atoms, and a sum
+holds the coefficient of each of its products.
 """
 
 from collections.abc import Iterable
@@ -75,7 +75,7 @@ def added(sums: Iterable[Sum]) -> Sum:
 
 
 def common_factor(*products: dict[int, Any]) -> dict[int, Any]:
-    """The powers that all have: the smallest where they are positive, the largest where they are negative."""
+    """The powers that all products share: the smallest if they are positive, the largest if they are negative."""
     first, *others = products
     out = {}
     for atom, exponent in first.items():

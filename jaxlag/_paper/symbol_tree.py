@@ -43,7 +43,7 @@ def symbol_tree(tree: PyTree, bare: str, positive: Collection[str] = ()) -> Symb
 
 
 def _symbols_of_leaf(path: str, name: str, leaf: Any, is_coordinate: bool, positive: Collection[str]) -> tuple[Any, Any, Any, list]:
-    """Numbers, symbols, what is neither, and the paths of the symbols. Arrays of integers in the parameters are neither."""
+    """Numbers, symbols, the leaf if it is neither, and the paths of the symbols. Arrays of integers in the parameters are neither."""
     array = np.asarray(None if callable(leaf) else leaf)
     is_name = array.dtype.kind == "U"
     if not (is_name or array.dtype.kind == "f" or (array.dtype.kind in "iu" and (is_coordinate or isinstance(leaf, int)))):
@@ -60,7 +60,7 @@ def _is_names(node: Any) -> bool:
 
 
 def _name(path: tuple, bare: str) -> str:
-    """The name of a leaf, followed by that of its parents: phi_wheel of q["wheel"]["phi"], q_1 of q[0]."""
+    """The name of a leaf, followed by its parents' names: phi_wheel for q["wheel"]["phi"], q_1 for q[0]."""
     keys = [jax.tree_util.keystr((key,), simple=True) for key in path]
     *outer, last = [key for key in keys if not key.isdigit()] or [bare]
     return "_".join([last, *outer, *(str(int(key) + 1) for key in keys if key.isdigit())])
@@ -73,7 +73,7 @@ def _numbered(name: str, shape: tuple) -> list[str]:
 
 
 def parameters_in_order(system: System, given: PyTree, params: SymbolTree) -> list[Symbol]:
-    """The parameters in the order in which the system's functions name them, then in that of the given mapping."""
+    """The parameters in the order in which the system's functions name them, then in the order of the given mapping."""
     functions = [function for slot in SLOTS for _, function in getattr(system, slot)]
     functions += [state.rate if isinstance(state, State) else state.update for _, state in system.states]
     names = [name for function in functions for name in _argument_names(function)]
@@ -83,7 +83,7 @@ def parameters_in_order(system: System, given: PyTree, params: SymbolTree) -> li
 
 
 def _argument_names(function: Callable) -> Iterator[str]:
-    """The names of a function's arguments, and those of the functions that it is made from."""
+    """The names of a function's arguments, and of the arguments of functions that it is made from."""
     yield from (parameter.name for parameter in declared_parameters(function))
     for field in dataclasses.fields(function) if dataclasses.is_dataclass(function) else ():
         if callable(part := getattr(function, field.name)):

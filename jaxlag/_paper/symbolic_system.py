@@ -27,12 +27,12 @@ from .symbol_tree import SymbolTree, symbol_tree
 
 
 def dotted(symbol: Symbol, dot: str) -> Symbol:
-    """The symbol of a velocity or an acceleration: xdot_1 of x_1."""
+    """The symbol of a velocity or an acceleration: xdot_1 for x_1."""
     return Symbol(re.sub(r"^([^\W\d_]*)", rf"\1{dot}", symbol.name), real=True)
 
 
 class States(NamedTuple):
-    """The further states: symbols of those of first order, of their rates, and of the sampled ones; and all of them by name."""
+    """The further states: symbols of first-order states, of their rates, and of sampled states; and all states by name."""
 
     z: tuple[Symbol, ...]
     zdot: tuple[Symbol, ...]
@@ -41,7 +41,7 @@ class States(NamedTuple):
 
     @classmethod
     def of(cls, system: System, q: SymbolTree, params: SymbolTree) -> "States":
-        """Those of a system."""
+        """The further states of a system."""
         like = coordinates(q.example, "q")
         t = jnp.zeros((), jax.tree.leaves(like)[0].dtype)
         values = jax.tree.map(np.asarray, start_values(system, {}, t, like, like, parameters(params.example, like)))
@@ -57,7 +57,7 @@ def _flat(symbols: PyTree[np.ndarray]) -> list[Symbol]:
 def trace_system(
     system: System, q: SymbolTree, params: SymbolTree, states: States, positive: Collection[str]
 ) -> tuple[SymbolicSystem, dict[str, PyTree]]:
-    """L, D, Q, g, a and what drives the states of a system as formulas, and the indices of each constraint's multipliers."""
+    """L, D, Q, g, a and the rates and updates of the states of a system as formulas, and the indices of each constraint's multipliers."""
     like = coordinates(q.example, "q")
     values = parameters(params.example, like)
     check(system, jnp.zeros((), jax.tree.leaves(like)[0].dtype), like, like, values, states.tree.numbers)
@@ -105,7 +105,7 @@ def bound(system: System, like: PyTree, numbers: PyTree, params: SymbolTree, at:
 
 
 def _multiplier_names(rows: dict[str, np.ndarray]) -> list[str]:
-    """In the order of the rows: λ where there is only one; otherwise by the constraint's name, and by number where it has several."""
+    """Names in the order of the rows: λ if there is only one; otherwise by the constraint's name, and by number if it has several."""
     if sum(map(len, rows.values())) == 1:
         return ["lambda"]
     unnamed = len(rows) == 1 and not set(rows) - {"holonomic", "nonholonomic"}
@@ -126,7 +126,7 @@ def _check_names(symbols: list[Symbol], positive: Collection[str]) -> None:
 
 
 def check_against_simulation(system: System, s: SymbolicSystem, steps: Steps, q: SymbolTree, params: SymbolTree, states: States) -> None:
-    """Raises where the equations differ from what is simulated, at random states: all positive, all negative, and of both signs."""
+    """Raises if the equations differ from the simulation at random states: all positive, all negative, and of both signs."""
     like = coordinates(q.example, "q")
 
     def simulated(t, q_, v, multipliers, params_, states_):
@@ -153,7 +153,7 @@ def check_against_simulation(system: System, s: SymbolicSystem, steps: Steps, q:
 
 
 def _check_at(values: dict[Symbol, float], program: Any, s: SymbolicSystem, steps: Steps) -> None:
-    """Raises where the equations differ from what is simulated, for these numbers."""
+    """Raises if the equations differ from the simulation for these numbers."""
     shapes = [aval.shape for aval in program.in_avals]
     parts = np.split(np.array(list(values.values())), np.cumsum([int(np.prod(shape)) for shape in shapes])[:-1])
     with jax.enable_x64(True):
@@ -172,5 +172,5 @@ def _check_at(values: dict[Symbol, float], program: Any, s: SymbolicSystem, step
 
 
 def number(formula: Any) -> complex:
-    """The value of a formula without symbols; NaN where it is not finite."""
+    """The value of a formula without symbols; NaN if it is not finite."""
     return complex(formula) if formula.is_finite else complex("nan")

@@ -1,4 +1,4 @@
-"""What plain text and LaTeX share: sums, products, powers and symbols as in a textbook."""
+"""The common part of plain text and LaTeX: sums, products, powers and symbols as in a textbook."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -15,7 +15,7 @@ class Textbook(Printer):
     """An abstract printer: parameters before coordinates before velocities, ẍ after its factor."""
 
     minus = "-"
-    deviation = "δ"  # in front of what differs little from its value
+    deviation = "δ"  # in front of a small deviation from a value
 
     def __init__(self, notation: Notation, **settings: Any):
         super().__init__(settings)
@@ -96,7 +96,7 @@ class Textbook(Printer):
         return f"{float(number):.15g}"
 
     def _product(self, number: Expr, factors: Sequence[Expr]) -> str:
-        """A positive number times factors: one fraction, of parameters alone where the denominator has no other symbols."""
+        """A positive number times factors: one fraction, of parameters alone if the denominator has no other symbols."""
         factors = _merged_abs_powers(factors)
         below = [1 / factor for factor in factors if is_in_denominator(factor)]
         above = [factor for factor in factors if not is_in_denominator(factor)]

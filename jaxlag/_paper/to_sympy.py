@@ -51,11 +51,11 @@ def to_sympy(function: Callable, *arguments: PyTree) -> PyTree:
 
 
 def require_sympy(what: str) -> None:
-    """Raises an error that names the extra where SymPy is missing."""
+    """Raises an error that names the extra if SymPy is missing."""
     try:
         import sympy  # noqa: F401
     except ImportError as error:
-        raise ImportError(f"`{what}` must have SymPy, but it cannot be imported. Install `jaxlag[symbolic]`.") from error
+        raise ImportError(f"`{what}` must have SymPy, but it cannot be imported. Run `pip install sympy`.") from error
 
 
 def _expressions(argument: Any) -> np.ndarray:

@@ -23,7 +23,7 @@ class Unicode(Textbook, StrPrinter):
     NAMES: ClassVar = {"asin": "arcsin", "acos": "arccos", "atan": "arctan", "log": "ln", "Max": "max", "Min": "min", "ceiling": "ceil"}
 
     def fraction(self, above, below, is_followed):
-        """(g/l) sin φ, or ½ where such a character exists."""
+        """(g/l) sin φ, or ½ if such a character exists."""
         whole = Mul(*above, *(1 / factor for factor in below)) if all(x.is_Rational for x in (*above, *below)) else None
         if whole in self.FRACTIONS:
             return self.FRACTIONS[whole]
@@ -34,7 +34,7 @@ class Unicode(Textbook, StrPrinter):
         return self.bracketed(text) if is_followed else text
 
     def bracketed(self, text):
-        """In round brackets."""
+        """The text in round brackets."""
         return f"({text})"
 
     def power(self, base, exponent):

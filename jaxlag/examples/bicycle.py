@@ -1,7 +1,7 @@
 """The Whipple bicycle: two frames that a steering hinge joins, on two thin wheels that roll without slip.
 
-x forward, y to the right, z down; the centre (x, y, z) of the rear wheel, yaw, roll and pitch of the rear frame, the steering angle and
-the rotations of the wheels are nine coordinates. `bodies` gives the frames of the four parts as functions of these; `rigid` makes of them
+x forward, y to the right, z down; the centre (x, y, z) of the rear wheel, yaw, roll and pitch of the rear frame, the steering angle and the
+rotations of the wheels are nine coordinates. `bodies` gives the frames of the four parts as functions of these, from which `rigid` makes
 
     T = Σ ½m ẋ·ẋ + ½ω·Iω,   g = h − r √(1 − (n·e)²),   a = ẋ + ω × ρ along the road,   ρ = −r (n − (n·e) e)/√(1 − (n·e)²)
 
@@ -24,7 +24,7 @@ UP = np.diag([1.0, -1.0, -1.0])  # axes of the road: the third up
 
 
 def bodies(q, p):
-    """Frames at the centres of mass: of the rear wheel, the rear frame with the rider, the front frame, the front wheel."""
+    """Frames at the centres of mass of the rear wheel, the rear frame with the rider, the front frame, the front wheel."""
     rear = rigid.frame([q["x"], q["y"], q["z"]], rigid.euler("zxy")([q["yaw"], q["roll"], q["pitch"]]))
     hinge = [jnp.sin(p["lambda_"]), 0.0, jnp.cos(p["lambda_"])]
     front = rear.on([p["w"] + p["c"], 0.0, p["r_R"]], rigid.rotation(hinge, q["steer"]))
@@ -37,7 +37,7 @@ def bodies(q, p):
 
 
 def inertias(p):
-    """Moments of inertia about the centres of mass: of a wheel about two diameters and its axle."""
+    """Moments of inertia about the centres of mass; for a wheel, about two diameters and its axle."""
     I = lambda part: jnp.array([[p[f"I_{part}xx"], 0, p[f"I_{part}xz"]], [0, p[f"I_{part}yy"], 0], [p[f"I_{part}xz"], 0, p[f"I_{part}zz"]]])
     wheel = lambda part: [p[f"I_{part}xx"], p[f"I_{part}xx"], p[f"I_{part}yy"]]
     return {"R": wheel("R"), "B": I("B"), "H": I("H"), "F": wheel("F")}
@@ -57,7 +57,7 @@ def contacts(q, params):
 
 
 def slip(q, qdot, params):
-    """Velocities along the road of the points of the wheels that touch it, a."""
+    """Velocities a, along the road, of the wheels' points that touch it."""
     wheel = lambda part: rigid.rolling(lambda q: bodies(q, params)[part], params[f"r_{part}"], rigid.frame(axes=UP))
     return {"rear": wheel("R")(q, qdot), "front": wheel("F")(q, qdot)}
 

@@ -41,6 +41,6 @@ def polar_state(phi, phidot, l):
 
 
 def cartesian_state(phi, phidot, l):
-    """The same state in x and y."""
+    """q and q̇ of that state in x and y."""
     s, c = jnp.sin(phi), jnp.cos(phi)
     return {"x": l * s, "y": -l * c}, {"x": l * c * phidot, "y": l * s * phidot}

@@ -79,7 +79,7 @@ class ConvexDissipation(eqx.Module):
         return self.power * self._beyond_tangent(scaled(qdot, self.scale, "qdot"))
 
     def _beyond_tangent(self, x):
-        """f(x) − f(0) − ∇f(0)·x, by the three parts of z = z(0) + ∇z(0)·x + remainder."""
+        """f(x) − f(0) − ∇f(0)·x, from the three parts of z = z(0) + ∇z(0)·x + remainder."""
         A, b = self.inlets[0], self.biases[0]
         at_rest, linear, beyond = expand(b, A @ x, jnp.zeros_like(b))
         for A, b, raw in zip(self.inlets[1:], self.biases[1:], self.weights, strict=True):

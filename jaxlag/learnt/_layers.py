@@ -1,8 +1,8 @@
-"""Layers that keep a network convex or increasing, their first weights, and the checks of sizes.
+"""Layers that keep a network convex or increasing, their initial weights, and the checks of sizes.
 
 Weights are made positive by softplus. The activation σ(x) = ½(x + √(1 + x²)) is convex and increasing (Barron, Squareplus,
-arXiv:2112.11687): what σ has beyond its tangent is δ² over a positive number, exactly zero and flat at δ = 0, where softplus would leave
-the rounding error of a difference.
+arXiv:2112.11687): the remainder of σ beyond its tangent is δ² over a positive number, exactly zero and flat at δ = 0, where softplus would
+leave the rounding error of a difference.
 """
 
 import math
@@ -24,8 +24,8 @@ def squareplus(x):
 def convex_remainder(c, d):
     """σ(c + d) − σ(c) − σ'(c) d ≥ 0, convex in d.
 
-    With p = 1 + c(c + d) and m = √(1 + c²) √(1 + (c + d)²) it is ½(m − p)/√(1 + c²), where m − p = d²/(m + p). Of the two forms this
-    takes the one that adds numbers of equal sign, so that nothing cancels.
+    With p = 1 + c(c + d) and m = √(1 + c²) √(1 + (c + d)²) it is ½(m − p)/√(1 + c²), where m − p = d²/(m + p). This takes the form that
+    adds numbers of equal sign, so that nothing cancels.
     """
     root = jnp.sqrt(1 + c**2)
     p = 1 + c * (c + d)
@@ -65,7 +65,7 @@ def weight_shapes(width, depth):
 
 
 def positive_weights(key, shape, steepness=1.0):
-    """Raw weights: with softplus applied they take about the mean of the units that come in, each divided by its steepness."""
+    """Raw weights: after softplus, they take roughly the mean of the incoming units, each divided by its steepness."""
     mean = jnp.broadcast_to(1 / (shape[-1] * steepness), shape)
     return jnp.log(jnp.expm1(mean)) + 0.5 * jax.random.normal(key, shape)
 

@@ -102,7 +102,7 @@ def kinetic_energy(m: Any, Theta: Any, position: Callable, rotation: Callable | 
 
 
 def _axis_of_revolution(Theta: Any) -> int | None:
-    """The axis about which all directions are alike: the moments about the other two are one and the same number."""
+    """The axis of revolution: the moments about the other two axes are one and the same number."""
     seen = known(Theta)
     if (seen is None and not isinstance(Theta, (list, tuple))) or len(Theta) != 3 or np.ndim(Theta[0]):
         return None
@@ -111,12 +111,12 @@ def _axis_of_revolution(Theta: Any) -> int | None:
 
 
 def _as_dict(bodies: Any) -> dict:
-    """What is given for several bodies, by name or number."""
+    """The entries for several bodies, by name or number."""
     return dict(bodies) if isinstance(bodies, Mapping) else dict(enumerate(bodies))
 
 
 def _same_bodies(given: Any, m: Any, name: str) -> dict:
-    """What is given for several bodies, if they are those that have a mass."""
+    """The entries for several bodies, if these are the bodies that have a mass."""
     names = list(_as_dict(m))
     one_for_all = isinstance(given, Frame) or not isinstance(given, (Mapping, list, tuple))
     if one_for_all or set(_as_dict(given)) != set(names):
@@ -128,7 +128,7 @@ def _same_bodies(given: Any, m: Any, name: str) -> dict:
 
 
 def _checked(frame: Any) -> tuple[Array, Array]:
-    """The place and the axes of a frame."""
+    """The origin and the axes of a frame."""
     if not isinstance(frame, Frame):
         raise ValueError(
             f"`position` must return a `Frame` where no `rotation` is given, but returned {type(frame).__name__}. Give `rotation`, "

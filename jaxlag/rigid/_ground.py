@@ -1,4 +1,4 @@
-"""Planes, ropes and wheels, as functions that return what has to be zero or must not be negative."""
+"""Planes, ropes and wheels, as functions whose value has to be zero or must not be negative."""
 
 import itertools
 from collections.abc import Callable
@@ -117,7 +117,7 @@ def rolling_ball(ball: Callable, radius: Any, plane: Frame | None = None) -> Cal
 
 
 def _sliding(body: Callable, below: Callable, plane: Frame) -> Callable:
-    """The velocity of the point of a body that is at `below(its z axis)` from its origin."""
+    """The velocity of a body's point at `below(its z axis)` from its origin."""
 
     def velocity(q: Any, qdot: Any) -> Float[Array, "2"]:
         ((v, (axes, omega)),) = rates(lambda q: [body(q)], q, qdot, _turning)
@@ -133,7 +133,7 @@ def _turning(of: AngularVelocities, R: Any) -> Callable:
 
 
 def _lowest(axle: Array, radius: Any, plane: Frame) -> Float[Array, "3"]:
-    """From the centre of a thin wheel to its point that is nearest to a plane, ρ."""
+    """The vector ρ from the centre of a thin wheel to its point nearest to a plane."""
     n = plane.axes[:, 2]
     return -radius * (n - (n @ axle) * axle) / _slope(axle, plane)
 

@@ -1,7 +1,7 @@
-"""Joints between bodies, as functions that return what has to be zero: for `System(holonomic=...)`.
+"""Joints between bodies, as functions whose value has to be zero: for `System(holonomic=...)`.
 
-A joint takes two frames, of which each sits on one body (or in space): the origins are its place on both, the z axes its own. Its
-multipliers are the forces and moments of the joint on the first of both.
+A joint takes two frames, each fixed to one body (or in space): the origins are its place on both, the z axes its own axis. Its multipliers
+are the forces and moments of the joint on the first body.
 """
 
 import jax.numpy as jnp

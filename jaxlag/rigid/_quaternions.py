@@ -1,4 +1,4 @@
-"""Quaternions: rotation matrices of them, their rates and their length."""
+"""Quaternions: their rotation matrices, rates and length."""
 
 from typing import Any
 

@@ -1,4 +1,4 @@
-"""The angular velocity of a rotation matrix, from the program that makes it: of a product, factor by factor."""
+"""The angular velocity of a rotation matrix, from the program that makes it; for a product, factor by factor."""
 
 import functools
 from collections.abc import Callable
@@ -20,7 +20,7 @@ FORMULAS: dict[str, Callable] = {}  # of the kit's rotations, by names that no o
 
 
 def turning(formula: Callable) -> Callable[[Callable], Callable]:
-    """For a rotation matrix of some arrays: its ω, in the axes of the body, is formula(arrays, their rates)."""
+    """Decorator of a function that makes a rotation matrix of arrays: ω, in the axes of the body, is formula(arrays, their rates)."""
 
     def named(matrix: Callable) -> Callable:
         matrix.__name__ = f"jaxlag.rigid.{matrix.__name__}"
@@ -37,12 +37,12 @@ def body_rate(rotation: Callable, q: Any, qdot: Any) -> Float[Array, "3"]:
 
 
 def rates(frames: Callable, q: Any, qdot: Any, *wanted: Callable) -> list[tuple[Array, Any]]:
-    r"""Velocities of places and angular velocities of axes, of frames that one program makes of q.
+    r"""Velocities of the origins and angular velocities of the axes of frames that one program makes from q.
 
     $$ \omega_{AB} = B^T \omega_A + \omega_B, \qquad \omega_{A^T} = -A\,\omega_A, \qquad [\omega]_\times = R^T\dot R $$
 
-    The last by differentiating R: of a product as a whole it would make a mass matrix ten times as long. `wanted` says of each frame
-    what is returned beside the velocity of its place: a method of `AngularVelocities`.
+    The last differentiates R: for a product as a whole, it would make a mass matrix ten times as long. `wanted` gives, for each frame, the
+    method of `AngularVelocities` whose result accompanies the velocity of the origin.
 
     **Source:** Murray, Li & Sastry, A Mathematical Introduction to Robotic Manipulation, proposition 2.15.
     """
@@ -52,7 +52,7 @@ def rates(frames: Callable, q: Any, qdot: Any, *wanted: Callable) -> list[tuple[
         return [(x, check_rotation(R, "`rotation` of a body")) for x, R in frames(jax.tree.unflatten(structure, leaves))]
 
     if known(leaves) is not None:
-        program(*leaves)  # which looks at its numbers
+        program(*leaves)  # which checks its numbers
     factors = _Factors(jax.make_jaxpr(program)(*leaves))
     places, matrices = factors.closed.jaxpr.outvars[::2], factors.closed.jaxpr.outvars[1::2]
     of = AngularVelocities(factors)
@@ -63,7 +63,7 @@ def rates(frames: Callable, q: Any, qdot: Any, *wanted: Callable) -> list[tuple[
 
 
 class _Factors:
-    """What a program makes rotation matrices of."""
+    """The factors of which a program makes rotation matrices."""
 
     def __init__(self, closed: Any):
         self.closed = closed
@@ -80,7 +80,7 @@ class _Factors:
         return core.jaxpr_as_fun(core.ClosedJaxpr(jaxpr, self.closed.consts))(*leaves)
 
     def is_rotation(self, R: Any) -> bool:
-        """Whether an array is a rotation matrix for certain."""
+        """Whether an array is certainly a rotation matrix."""
         if R in self.constants:
             seen = known(self.constants[R])
             return seen is not None and np.allclose(seen.T @ seen, np.eye(3), rtol=0, atol=1e-6) and bool(np.linalg.det(seen) > 0)
@@ -88,7 +88,7 @@ class _Factors:
         return kind in FORMULAS or (kind in (*UNCHANGED, "transpose", "product") and all(map(self.is_rotation, of)))
 
     def made(self, R: Any) -> tuple[str, list]:
-        """By what an array is made, and of which."""
+        """The operation that makes an array, and its operands."""
         if R not in self.made_by:
             return "", []
         equation = self.made_by[R]
@@ -100,7 +100,7 @@ class _Factors:
 
 
 def _once(formula: Callable) -> Callable:
-    """A method whose value, a function without arguments, is made once for each of its arguments and worked out once."""
+    """Decorator of a method that returns a function without arguments: made once for each set of arguments, and evaluated once."""
 
     @functools.wraps(formula)
     def made(self: Any, *given: Any) -> Callable:
@@ -113,11 +113,11 @@ def _once(formula: Callable) -> Callable:
 
 
 class AngularVelocities:
-    """Angular velocities of the rotation matrices of a program, as functions without arguments, of the arrays that they ask it for."""
+    """Angular velocities of the rotation matrices of a program, as functions without arguments of the arrays that they request from it."""
 
     def __init__(self, factors: _Factors):
         self.factors = factors
-        self.numbers: dict[Any, Any] = {}  # by variables: what they are, and their rates, once they are known
+        self.numbers: dict[Any, Any] = {}  # by variable: the value and its rate, once they are known
         self.made: dict[tuple, Callable] = {}
 
     def number(self, x: Any) -> Callable[[], tuple[Array, Array]]:
@@ -130,7 +130,7 @@ class AngularVelocities:
 
     @_once
     def body(self, R: Any) -> Callable[[], Float[Array, "3"]]:
-        """ω of an array that is a rotation matrix, in the axes that are its columns."""
+        """ω of a rotation matrix, in the axes that are its columns."""
         if R not in self.factors.moving:  # the unit matrix, made of truth values, has no derivative
             return lambda: jnp.zeros(3, R.aval.dtype)
         kind, of = self.factors.made(R)
@@ -150,7 +150,7 @@ class AngularVelocities:
 
     @_once
     def world(self, R: Any) -> Callable[[], Float[Array, "3"]]:
-        """ω in the axes of space, in which the last rotation about an axis of the body does not show: ω_A + A ω_B."""
+        """ω in the axes of space, independent of the last rotation if that is about an axis of the body: ω_A + A ω_B."""
         if R not in self.factors.moving:
             return self.body(R)
         kind, of = self.factors.made(R)
@@ -164,7 +164,7 @@ class AngularVelocities:
 
     @_once
     def unspun(self, R: Any, axis: int) -> Callable[[], Float[Array, "3"]]:
-        """ω in the axes before the last rotation, where that is about an axis of the body: ω_A + ω_B. Otherwise in those of the body."""
+        """ω in the axes before the last rotation if that is about an axis of the body: ω_A + ω_B. Otherwise in the axes of the body."""
         kind, of = self.factors.made(R)
         if kind == "product" and self.factors.made(of[1])[0] == ABOUT[axis]:
             first, second = map(self.body, of)

@@ -113,7 +113,7 @@ def _about_z(angle):
 
 
 def _about_axis(axis: int, angle: Any) -> Float[Array, "3 3"]:
-    """About one of the axes: two products fewer than by Rodrigues' formula."""
+    """Rotation about one of the axes, with two products fewer than Rodrigues' formula."""
     c, s = jnp.cos(angle), jnp.sin(angle)
     full, zero = jnp.ones_like(c), jnp.zeros_like(c)
     rows = [[full, zero, zero], [zero, c, -s], [zero, s, c]]
@@ -203,7 +203,7 @@ def rotation_vector(r: Any) -> Float[Array, "3 3"]:
 
 
 def _ratio(square: Array, first: int, above: Callable, below: Callable) -> Array:
-    """sin α/α or (1 − cos α)/α² of α², by its series for small angles, so that all derivatives are right there, too."""
+    """sin α/α or (1 − cos α)/α² as a function of α², by its series for small angles, so that all derivatives are right there, too."""
     small = square < 1
     terms = [(-1) ** k / math.factorial(2 * k + first) for k in range(SERIES)]
     series = jnp.polyval(jnp.array(terms[::-1], square.dtype), jnp.where(small, square, 0))
@@ -212,7 +212,7 @@ def _ratio(square: Array, first: int, above: Callable, below: Callable) -> Array
 
 
 def _three(angles: Any) -> tuple:
-    """Three angles out of an array, a sequence or a dict."""
+    """Three angles from an array, a sequence or a dict."""
     given = tuple(angles.values()) if isinstance(angles, dict) else tuple(angles)
     if len(given) != 3:
         raise ValueError(f"`angles` must be three numbers, but are {len(given)}. Give one for each letter of the sequence.")

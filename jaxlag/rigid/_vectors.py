@@ -1,4 +1,4 @@
-"""Vectors and matrices of space, as they are given and checked."""
+"""Vectors and matrices in space, converted and checked."""
 
 from collections.abc import Callable
 from typing import Any
@@ -10,7 +10,7 @@ from jaxtyping import Array, Float
 
 
 def check_rotation(R: Any, name: str) -> Float[Array, "3 3"]:
-    """A matrix whose columns are right-handed unit vectors at right angles; as far as its numbers are known."""
+    """A rotation matrix, checked for right-handed orthogonal unit vectors as columns, as far as its numbers are known."""
     seen, R = known(R), floating(R)
     if R.shape != (3, 3):
         raise ValueError(
@@ -38,12 +38,12 @@ def one(like: Array) -> Float[Array, "3 3"]:
 
 
 def known(x: Any) -> np.ndarray | None:
-    """Numbers as Python may look at them; None where a program is being traced."""
+    """Numbers as a concrete array; None if they are traced."""
     return None if any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(x)) else np.asarray(x, float)
 
 
 def floating(x: Any) -> Array:
-    """Numbers as an array of real numbers, in the precision they have."""
+    """Numbers as an array of floating-point numbers, in the precision they have."""
     x = jnp.asarray(x)
     return x if jnp.issubdtype(x.dtype, jnp.floating) else x.astype(float)
 
@@ -55,7 +55,7 @@ def moving(function: Callable, q: Any, qdot: Any) -> tuple[Any, Any]:
 
 
 def vector(x: Any, name: str, size: int = 3) -> Array:
-    """As many numbers."""
+    """A vector of `size` numbers, checked."""
     x = floating(x)
     if x.shape != (size,):
         raise ValueError(f"`{name}` must be {size} numbers, but has shape {x.shape}. Write them as an array of shape ({size},).")

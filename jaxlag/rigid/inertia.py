@@ -264,7 +264,7 @@ def matrix(Theta: Any) -> Float[Array, "3 3"]:
 
 
 def check_inertia(Theta: Any, name: str) -> Array:
-    """An inertia as an array, if a body has it: as far as its numbers are known."""
+    """An inertia as an array, checked that a body can have it, as far as its numbers are known."""
     seen, Theta = known(Theta), floating(Theta)
     if Theta.shape not in ((3,), (3, 3)):
         raise ValueError(f"{name} must be three moments of inertia or a matrix (3, 3), but has shape {Theta.shape}. Write [A, B, C].")

@@ -4,8 +4,8 @@ The vehicle: seconds until its first motion, gradient and fit, and then of each 
 optimistix in their default settings (gradient in reverse mode; only the fit requires another adjoint); and, when all is compiled, its
 motion called from Python beside the compiled one within `jax.jit`, and one acceleration. The pendulum of README's first
 example, a point on a rod with the constraint |r| = l: its first motion, gradient and Hessian, its first motion with dry friction in the
-joint and the gradient of that; by hand from its equations with the multiplier eliminated. The whole of that example, without and with
-`keep_compiled`. "import" is that of the libraries named.
+joint and the gradient of that; by hand from its equations with the multiplier eliminated. The whole of that example with `keep_compiled`,
+in a first process and in a second one. "import" is that of the libraries named.
 Run: python tests/benchmarks/bench_first_use.py [processes]
 """
 
@@ -162,7 +162,8 @@ def readme():
     """README's first example as one action."""
     text = (Path(__file__).parents[2] / "README.md").read_text()
     (example, *_) = re.findall(r"```python\n(.*?)```", text, re.S)
-    return FIRST.format(imports="import contextlib, io", actions=f"source = {example!r}\n{RUN_QUIETLY}")
+    source = f"import jaxlag as jl\njl.keep_compiled()\n{example}"
+    return FIRST.format(imports="import contextlib, io", actions=f"source = {source!r}\n{RUN_QUIETLY}")
 
 
 RUN_QUIETLY = """
@@ -212,7 +213,7 @@ def pendulum(processes):
 
 
 def example(processes):
-    """Table of README's first example: in a first process, and in a second one with what the first has kept."""
+    """Table of README's first example with `keep_compiled`: in a first process, and in a second one with what the first has kept."""
     taken = {"first process": [], "second process": []}
     for _ in range(processes):
         with tempfile.TemporaryDirectory() as cache:

@@ -10,7 +10,7 @@ import diffrax
 import jax
 import jax.numpy as jnp
 import numpy as np
-from timing import medians, once
+from timing import Row, medians, once, record
 
 import jaxlag as jl
 
@@ -37,9 +37,9 @@ def on_a_rod(friction):
 by_angle = jl.System(lambda q, qdot: 0.5 * qdot**2 + 9.81 * jnp.cos(q), dissipation={"joint": lambda qdot: 0.1 * jnp.abs(qdot)})
 START_ON_ROD = np.array([0.6, -0.8])
 PENDULA = {
-    "by its angle": (by_angle, np.array(1.0)),
-    "on a rod": (on_a_rod(lambda q, qdot: 0.1 * sweep(q, qdot)), START_ON_ROD),
-    "of the rod's force": (
+    "friction in an angle": (by_angle, np.array(1.0)),
+    "friction on a rod": (on_a_rod(lambda q, qdot: 0.1 * sweep(q, qdot)), START_ON_ROD),
+    "friction by the force of the rod": (
         on_a_rod(lambda q, qdot, multipliers: 0.1 * jnp.abs(multipliers["rod"]) * sweep(q, qdot)),
         START_ON_ROD,
     ),
@@ -68,13 +68,22 @@ def main():
         motion, first, then = timed(**how)
         error = float(jnp.max(jnp.abs(motion.q[-1] - reference)))
         print(f"{name:<34}{error:10.1e}{int(motion.stats['num_steps']):9d}{first:9.2f}{1e3 * then:9.1f}")
-    print(f"\n{'pendulum':<34}{'motion: first s':>16}{'then ms':>9}{'derivative: first s':>21}{'then ms':>9}")
+    record("friction", pendula())
+
+
+def pendula():
+    """Tables of the pendula: first and further calls of the motion and of its derivative."""
+    tables: dict[str, list[Row]] = {}
     for name, (system, start) in PENDULA.items():
         motion = jax.jit(lambda q, system=system: jl.simulate(system, q, 0 * q, np.linspace(0, 2, 101)).q)
         derivative = jax.jit(lambda q, motion=motion: jax.jacfwd(motion)(q))
-        first, first_derivative = (once(lambda action=action: action(start)) for action in (motion, derivative))  # noqa: B023
-        then = medians({"motion": lambda: motion(start), "derivative": lambda: derivative(start)}, rounds=7)  # noqa: B023
-        print(f"{name:<34}{first:16.1f}{1e3 * then['motion']:9.1f}{first_derivative:21.1f}{1e3 * then['derivative']:9.1f}")
+        actions = {"motion": lambda: motion(start), "derivative": lambda: derivative(start)}  # noqa: B023
+        first = {task: once(action) for task, action in actions.items()}
+        then = medians(actions, rounds=7)
+        for task in actions:
+            tables.setdefault(f"first {task}", []).append(Row(name, seconds=first[task]))
+            tables.setdefault(f"{task} again", []).append(Row(name, seconds=then[task]))
+    return tables.items()
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""All speed comparisons in one run, each in its own process; the tables go to `results.json`.
+"""All speed comparisons in one run, each in its own process; the tables go to `results.json`, which `docs/figures.py` shows.
 
 Peers: pip install -e ".[benchmarks]". A peer that is not installed is listed as skipped.
 numbalsoda is not in that extra, because building it needs a Fortran compiler.
@@ -9,7 +9,7 @@ import subprocess
 import sys
 from pathlib import Path
 
-TOPICS = ("vehicle", "devices", "pendulum", "constraints", "bodies", "growth", "first_use", "emitters")
+TOPICS = ("vehicle", "friction", "devices", "pendulum", "constraints", "bodies", "growth", "first_use", "emitters")
 
 
 def main():

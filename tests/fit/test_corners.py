@@ -1,12 +1,16 @@
 """Corners of fits in which numbers came out wrong without a word: narrow valleys, units, channels without noise, few events, bounds."""
 
+import diffrax
+import jax
 import jax.numpy as jnp
 import numpy as np
+import optax
 import pytest
 from oscillator import START, SYSTEM, TIMES, TRUE, noisy, position
 from scipy.optimize import least_squares
 
 import jaxlag as jl
+from jaxlag._fit.parameters import Free
 
 SIGMA = 0.01
 
@@ -134,7 +138,82 @@ def test_fits_of_other_data_are_not_compared():
         jl.compare(fits)
 
 
+def test_priors_are_no_likelihood():
+    """A prior ten of its deviations away made a difference of some hundred in AIC, "very strong", with the same data."""
+    fit = lambda **how: jl.fit(SYSTEM, jl.Experiment(TIMES, noisy(5), 1.0, 0.0, sigma=0.01), START, free=("c", "b"), **how)
+    plain = fit()
+    c, error = float(plain.estimates["c"]), float(plain.standard_errors["c"])
+    held = fit(priors={"c": (c + 1000 * error, 100 * error)})
+    table = jl.compare({"plain": plain, "held": held})
+    squares = lambda found: float(np.sum((np.asarray(noisy(5)) - found.predictions[0]) ** 2) / 0.01**2)
+    np.testing.assert_allclose(table.aic["held"], squares(held) - squares(plain), atol=1e-6)
+    assert table.aic["held"] < 1 and "'held' had priors on c" in repr(table) and table.priors == {"held": ("c",)}
+
+
+def test_random_starts_keep_their_sign():
+    """In 7 % of them an unbounded 0.3 had become negative."""
+    free = Free.of({name: np.array(x) for name, x in (("a", 0.3), ("b", -2.0), ("c", 0.0))}, ("a", "b", "c"))
+    starts = np.asarray(jax.vmap(free.theta)(free.random_starts(jax.random.key(0), 400)))
+    assert np.all(starts[:, 0] > 0) and np.all(starts[:, 1] < 0) and 0.3 < np.mean(starts[:, 2] < 0) < 0.7
+    np.testing.assert_allclose(np.median(starts[:, :2], axis=0), [0.3, -2.0], rtol=0.15)
+
+
+def test_as_many_unknowns_as_measurements_are_said():
+    found = jl.fit(SYSTEM, jl.Experiment(np.r_[0.0, TIMES[9:40:20]], np.r_[np.nan, noisy(5)[9:40:20]], 1.0, 0.0), START, free=("c", "b"))
+    assert "is left over that could contradict" in repr(found) and "no measurement is left over" in repr(found) and "nan" not in repr(found)
+
+
 @pytest.mark.parametrize("prior", [(np.nan, 1.0), (None, 1.0), (np.inf, 1.0)])
 def test_priors_have_a_mean(prior):
     with pytest.raises(ValueError, match="`priors` of 'c' must have a finite mean"):
         jl.fit(SYSTEM, jl.Experiment(TIMES, noisy(6), 1.0, 0.0), START, free=("c",), priors={"c": prior})
+
+
+@pytest.mark.parametrize("unit", [1e-6, 1.0, 1e3])
+def test_a_start_at_rest_in_dry_friction(unit):
+    """What sticks at the start has no velocity to be seen: "0 ± 0" stood there. The estimates against the numbers that made the record."""
+    ts = np.linspace(0, 8, 200)
+    params = {"m": 1.0, "c": 4.0, "F": 0.6 * unit, "A": 2.0 * unit}
+    x = jl.simulate(STICKING, 0.05 * unit, 0.0, ts, params, rtol=1e-10).q
+    record = jl.Experiment(ts, x + 1e-3 * unit * np.random.default_rng(0).standard_normal(200), 0.04 * unit, 0.0, unknown=("q0", "qdot0"))
+    found = jl.fit(STICKING, record, params | {"m": 1.3, "c": 3.5, "F": 0.4 * unit}, free=("m", "c", "F"))
+    assert found.converged and np.isinf(found.unknown_errors[0]["qdot0"]) and "± 0" not in repr(found).replace("± 0.", "")
+    assert "qdot0  not determined by these measurements" in repr(found)
+    for name in ("m", "c", "F"):
+        assert abs(float(found.estimates[name]) - params[name]) < 4 * float(found.standard_errors[name])
+    assert abs(float(found.unknowns[0]["q0"]) - 0.05 * unit) < 4 * float(found.unknown_errors[0]["q0"])
+
+
+STICKING = jl.System(
+    lambda q, qdot, m, c: 0.5 * m * qdot**2 - 0.5 * c * q**2,
+    dissipation=lambda qdot, F: F * jnp.abs(qdot),
+    force=lambda t, A: A * jnp.sin(2 * t) * jnp.minimum(t / 3, 1),
+)
+
+
+def test_an_impossible_trial_of_an_implicit_solver_is_no_crash():
+    """Started far off, an implicit solver that is differentiated met numbers that are not finite: a raw error of a callback."""
+    ts = np.linspace(0, 2, 40)
+    record = jl.Experiment(ts, np.exp(-2 * ts) + 1e-3 * np.random.default_rng(0).standard_normal(40), 1.0, -2.0)
+    damped = jl.System(lambda q, qdot, m, k: 0.5 * m * qdot**2 - 0.5 * k * q**2, dissipation=lambda qdot, b: 0.5 * b * qdot**2)
+    found = jl.fit(damped, record, {"m": 1.0, "k": 1.0, "b": 1.0}, free=("m", "k"), solver=diffrax.Kvaerno5())
+    m, k = float(found.estimates["m"]), float(found.estimates["k"])
+    assert not found.converged or abs(k - 2 + 4 * m) < 0.05  # m s² + s + k = 0 at s = −2
+
+
+def test_a_network_may_have_more_weights_than_there_are_samples():
+    """README's optimisers of optax were refused for a network of 65 weights and 40 samples: "must name no more than was measured"."""
+    keys = jax.random.split(jax.random.key(0), 2)
+    net = {
+        "A": 0.3 * jax.random.normal(keys[0], (16, 2)),
+        "a": jnp.zeros(16),
+        "c": 0.1 * jax.random.normal(keys[1], (16,)),
+        "d": jnp.zeros(1),
+    }
+    force = lambda q, qdot, net: net["c"] @ jnp.tanh(net["A"] @ jnp.array([q, qdot]) + net["a"]) + net["d"][0]
+    record = jl.Experiment(np.linspace(0, 3, 40), np.exp(-0.2 * np.linspace(0, 3, 40)) * np.cos(2 * np.linspace(0, 3, 40)), 1.0, -0.2)
+    pushed = jl.System(lambda q, qdot: 0.5 * qdot**2 - 2 * q**2, force=force)
+    found = jl.fit(pushed, record, {"net": net}, free="net", method=optax.adam(1e-2), max_steps=60)
+    assert found.costs[-1] < 0.3 * found.costs[0] and "nan" not in repr(found)
+    with pytest.raises(ValueError, match="must name no more than was measured"):
+        jl.fit(pushed, record, {"net": net}, free="net")

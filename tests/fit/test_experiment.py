@@ -100,7 +100,6 @@ def test_bad_data_are_refused_with_the_cure(case):
 FREE = ("c", "b")
 BAD_FITS = {
     "an unknown name": (lambda: fit(free=("d",)), "`free` must name entries of params, but holds 'd'. There are b, c, m."),
-    "a string": (lambda: fit(free="c"), "`free` must be a list of names"),
     "a name twice": (lambda: fit(free=("c", "c")), "must name each parameter once"),
     "nothing free": (lambda: fit(free=()), "must name at least one entry"),
     "more unknowns than measurements": (
@@ -171,13 +170,50 @@ def test_what_cannot_be_fitted_is_refused_with_the_cure(case):
 def test_a_table_in_a_file(tmp_path):
     file = tmp_path / "drive.csv"
     file.write_text("time [s]; x [m]; note\n0; 1.0; 7\n0.5; ; 7\n1; 0.5; 7\n")
-    e = jl.Experiment.from_csv(file, 1.0, 0.0, time="time [s]", channels={"x": "x [m]"}, delimiter=";", observe=lambda q: {"x": q})
+    e = jl.Experiment.from_csv(file, 1.0, 0.0, time="time [s]", columns={"x": "x [m]"}, observe=lambda q: {"x": q})
     np.testing.assert_array_equal(e.ts, [0, 0.5, 1])
     np.testing.assert_array_equal(e.values["x"], [1.0, np.nan, 0.5])
     assert set(e.values) == {"x"}
     file.write_text("t,x\n0,1\n1,one\n")
     with pytest.raises(ValueError, match="line 3, column 'x' must be a number, but is 'one'"):
         jl.Experiment.from_csv(file, 1.0, 0.0, time="t", observe=lambda q: {"x": q})
+
+
+TABLES = {  # x in mm: 1.25, missing, 0.5 at 0, 0.5 and 1 s
+    "commas": ("t,x\n0,1.25\n0.5,\n1,0.5\n", "t", {}),
+    "decimal commas": ("t;x\n0;1,25\n0,5;\n1;0,5\n", "t", {}),
+    "tabs, and a row of units": ("t\tx\ns\tmm\n0\t1,25\n0,5\t\n1\t5e-1\n", "t", {}),
+    "milliseconds of a Unix clock": ("t,x\n1712345678250,1.25\n1712345678750,\n1712345679250,0.5\n", ("t", 1e-3), {"from_zero": True}),
+    "ISO dates": ("t,x\n2026-11-28T23:59:59.5,1.25\n2026-11-29T00:00:00,\n2026-11-29T00:00:00.5,0.5\n", "t", {}),
+    "dates with the day first": ("t;x\n28.11.2026 23:59:59,5;1,25\n29.11.2026 00:00:00,0;\n29.11.2026 00:00:00,5;0,5\n", "t", {}),
+    "another encoding": ("t;x;Länge [µm]\n0;1,25;\n0,5;;\n1;0,5;\n", "t", {"encoding": "latin-1"}),
+}
+
+
+@pytest.mark.fast
+@pytest.mark.parametrize("case", TABLES)
+def test_tables_of_laboratories(case, tmp_path):
+    text, time, how = TABLES[case]
+    file = tmp_path / "log.csv"
+    file.write_text(text, encoding=how.get("encoding", "utf-8"))
+    read = lambda file: jl.Experiment.from_csv(file, {"x": 1.0}, {"x": 0.0}, time=time, columns={"x": ("x", 1e-3)}, **how)
+    for e in (read(file), *read([file, str(file)])):
+        np.testing.assert_allclose(e.ts, [0, 0.5, 1], rtol=1e-12)
+        np.testing.assert_allclose(e.values["x"], [1.25e-3, np.nan, 0.5e-3], rtol=1e-12)
+
+
+@pytest.mark.fast
+def test_tables_that_cannot_be_read_say_where(tmp_path):
+    file = tmp_path / "log.csv"
+    read = lambda **how: jl.Experiment.from_csv(file, {"x": 1.0}, {"x": 0.0}, **({"time": "t"} | how))
+    file.write_text("t;x\n0;1\n\n1;l,5\n")
+    with pytest.raises(ValueError, match="line 4, column 'x' must be a number, but is 'l,5'"):
+        read()
+    with pytest.raises(ValueError, match="a column must be a name, or a name and a factor"):
+        read(columns={"x": ("x", "mm")})
+    file.write_text("")
+    with pytest.raises(ValueError, match="must hold a table, but .* is empty"):
+        read()
 
 
 @pytest.mark.fast

@@ -155,7 +155,16 @@ def test_a_second_fit_traces_nothing(monkeypatch):
 
 @pytest.mark.fast
 @pytest.mark.parametrize(
-    "value, error, said", [(2998.4, 12.3, "2998 ± 12"), (0.600029, 2.1e-5, "0.600029 ± 0.000021"), (41234.0, 310.0, "41230 ± 310")]
+    "value, error, said",
+    [
+        (2998.4, 12.3, "2998 ± 12"),
+        (0.600029, 2.1e-5, "0.600029 ± 0.000021"),
+        (41234.0, 310.0, "41230 ± 310"),
+        (1.0000000123, 2e-9, "1.0000000123 ± 2e-09"),
+        (-3.4567e-12, 2.1e-15, "-3.4567e-12 ± 2.1e-15"),
+        (123456789.0, 12.0, "123456789 ± 12"),
+        (1e-9, 0.5, "0.00 ± 0.50"),
+    ],
 )
 def test_plus_minus(value, error, said):
     assert plus_minus(value, error) == said
@@ -188,3 +197,17 @@ def test_an_input_that_ends_before_the_record_is_remarked():
         fit = jl.fit(cart, jl.Experiment(ts, ts**2 / 4, 0.0, 0.0, params={"u": push}), {"m": 1.0}, free=("m",))
         np.testing.assert_allclose(fit.estimates["m"], 2.0, rtol=1e-6)
         assert (fit.remarks == ["u ends at t = 1 and keeps its value to the end of the record at 2"]) == remarked
+
+
+def test_one_name_is_one_name():
+    """`free="damping"` as `free=("damping",)`, in all that fits."""
+    ts = np.linspace(0, 3, 60)
+    damped = jl.System(lambda q, qdot: 0.5 * qdot**2 - 2 * q**2, dissipation=lambda qdot, damping: 0.5 * damping * qdot**2)
+    w = np.sqrt(4 - 0.1**2)
+    record = jl.Experiment(ts, np.exp(-0.1 * ts) * (np.cos(w * ts) + 0.1 / w * np.sin(w * ts)), 1.0, 0.0, sigma=1e-3)
+    params = {"damping": 0.4}
+    for find in (jl.fit, jl.regress, lambda *given, **how: jl.fit_each(given[0], [given[1]], given[2], **how)[0]):
+        np.testing.assert_allclose(find(damped, record, params, free="damping").estimates["damping"], 0.2, rtol=1e-3)
+    led_in = jl.fit(damped, record, params, free="damping", start=jl.Regress())
+    np.testing.assert_allclose(led_in.estimates["damping"], 0.2, rtol=1e-3)
+    assert set(jl.information(damped, record, params, free="damping").standard_errors) == {"damping"}

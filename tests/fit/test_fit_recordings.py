@@ -56,7 +56,7 @@ def test_a_driven_pendulum_from_its_regression():
     names = ("J", "ml", "b", "F", "offset")
     bounds = {"b": (0, None), "F": (0, None)}
     found = jl.fit(system, record, dict.fromkeys(names, np.nan), free=names, start=jl.Regress(), bounds=bounds, solver=jl.Dopri5())
-    assert found.converged and found.led_in[0] == "regress"
+    assert found.converged and found.led_in[0].startswith("regress")
     assert 0.48 < found.estimates["J"] / found.estimates["ml"] < 0.52
     assert 0.12 < found.estimates["J"] < 0.18
 

@@ -221,7 +221,7 @@ def test_many_starts_find_what_one_does_not():
     """A frequency three times off leads nowhere, where damping cannot make the motion small on the way."""
     far = osc.START | {"c": 30.0}
     bounds = {"c": (1.0, 60.0), "b": (0.01, 0.6)}
-    alone, many = (fit(osc.record(0), far, bounds=bounds, starts=n) for n in (1, 24))
+    alone, many = (fit(osc.record(0), far, bounds=bounds, start=start) for start in (None, jl.MultiStart(24)))
     assert abs(alone.estimates["c"] - 4) > 1
     np.testing.assert_allclose(many.estimates["c"], by_scipy(osc.noisy(0)).x[0], rtol=1e-5)
 
@@ -229,7 +229,7 @@ def test_many_starts_find_what_one_does_not():
 @pytest.mark.slow
 def test_starts_that_cannot_be_simulated_do_no_harm():
     """Without a bound on c some of the motions explode within the steps allowed."""
-    found = fit(osc.record(0), osc.START | {"c": 0.5}, starts=8, max_steps=60)
+    found = fit(osc.record(0), osc.START | {"c": 0.5}, start=jl.MultiStart(8), max_steps=60)
     np.testing.assert_allclose(found.estimates["c"], by_scipy(osc.noisy(0)).x[0], rtol=1e-4)
 
 
@@ -332,7 +332,7 @@ def test_interrupted_starts_are_not_called_converged(monkeypatch):
         return now, trial
 
     monkeypatch.setattr(levenberg_marquardt, "BATCHED", (levenberg_marquardt.BATCHED[0], interrupting))
-    found = fit(osc.record(0), osc.START | {"c": 3.5}, bounds={"c": (1.0, 60.0), "b": (0.01, 0.6)}, starts=24)
+    found = fit(osc.record(0), osc.START | {"c": 3.5}, bounds={"c": (1.0, 60.0), "b": (0.01, 0.6)}, start=jl.MultiStart(24))
     assert calls.count("converged") == 2 and not found.converged and "interrupted (Ctrl-C)" in found.reason
 
 

@@ -49,7 +49,7 @@ def test_the_work_of_projection_is_listed_apart():
     run = lambda how: jl.simulate(
         pendulum.cartesian, *pendulum.cartesian_state(2.0, 0.0, 1.0), ts, p, rtol=1e-5, atol=1e-7, works=True, stabilisation=how
     )
-    projected, drifting = run(jl.Projection()), run(jl.NoStabilisation())
+    projected, drifting = run(jl.stabilisation.Projection()), run(jl.stabilisation.NoStabilisation())
     assert set(projected.work()) == {"rod", "time", "projection"}
     assert np.abs(projected.work()["projection"][-1]) > 1e-8
     assert np.all(drifting.work()["projection"] == 0)

@@ -747,6 +747,6 @@ def test_baumgartes_feedback_is_a_damped_oscillator():
         nonholonomic={"edge": lambda t, qdot: qdot[1] - 5.0 * t},
     )
     q, v, t = jnp.array([0.4, 0.0]), jnp.array([0.7, -0.3]), 0.5
-    feedback = jl.Baumgarte(alpha=3.0, beta=7.0).feedback()(bind(system, q, None), t, q, v)
+    feedback = jl.stabilisation.Baumgarte(alpha=3.0, beta=7.0).feedback()(bind(system, q, None), t, q, v)
     off, rate, a = 3.0 * 0.4 - np.sin(1.0), 3.0 * 0.7 - 2.0 * np.cos(1.0), -0.3 - 2.5
     np.testing.assert_allclose(feedback, [6.0 * rate + 49.0 * off, 6.0 * a], rtol=1e-14)

@@ -199,3 +199,21 @@ def test_a_force_of_another_shape_is_refused(case):
 def test_a_plain_zero_is_zeros_of_any_shape():
     for zero in (0, 0.0, np.float32(0)):
         np.testing.assert_array_equal(accelerate(jl.System(kinetic, force=lambda zero=zero: zero)).qddot, [0, 0])
+
+
+@pytest.mark.fast
+@pytest.mark.parametrize("derivative", [jax.grad, jax.jacfwd, lambda f: jax.jit(jax.grad(f))], ids=["grad", "jacfwd", "jit of grad"])
+@pytest.mark.parametrize("slot", ["force", "update"])
+def test_a_function_that_closes_over_what_is_differentiated_is_refused_by_name(slot, derivative):
+    """It ended in errors of JAX on compiler options and on loops; the value alone was right."""
+
+    def end(net):
+        policy = lambda q, qdot: net["weights"] @ jnp.array([q, qdot])
+        if slot == "force":
+            system = jl.System(kinetic, force=policy)
+        else:
+            system = jl.System(kinetic, force=lambda u: u, states={"u": jl.Sampled(policy, every=0.1, start=0.0)})
+        return jl.simulate(system, 1.0, 0.0, [0.0, 1.0]).q[-1]
+
+    with pytest.raises(ValueError, match="closes over 'net', which is being differentiated. Make 'net' an entry of params"):
+        derivative(end)({"weights": jnp.array([-1.0, -0.5])})

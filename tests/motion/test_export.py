@@ -386,7 +386,7 @@ def test_an_experiment_reads_the_table(library, rubbed):
     frame = pytest.importorskip(library).DataFrame
     table = rubbed.to_dataframe(frame)
     start = rubbed[0]
-    experiment = jl.Experiment.from_dataframe(table, start.q, start.qdot, time="t", channels={"x": "q.x"}, observe=lambda q: q)
+    experiment = jl.Experiment.from_dataframe(table, start.q, start.qdot, time="t", columns={"x": "q.x"}, observe=lambda q: q)
     np.testing.assert_array_equal(experiment.values["x"], rubbed.q["x"])
 
 

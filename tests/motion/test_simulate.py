@@ -155,7 +155,9 @@ def drift_and_error(stabilisation):
 
 
 def test_projection_holds_what_drifts_without_it():
-    projected, fed_back, nothing = map(drift_and_error, (jl.Projection(), jl.Baumgarte(20.0, 20.0), jl.NoStabilisation()))
+    projected, fed_back, nothing = map(
+        drift_and_error, (jl.stabilisation.Projection(), jl.stabilisation.Baumgarte(20.0, 20.0), jl.stabilisation.NoStabilisation())
+    )
     assert projected[0] < 1e-15 and projected[1] < 2e-3
     assert nothing[0] > 1e-3 and nothing[1] > 1e-2
     assert fed_back[0] < 1e-3 * nothing[0] and fed_back[1] < 0.3 * nothing[1]

@@ -72,7 +72,7 @@ def by_radau(n):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("more", [{}, {"works": True}, {"stabilisation": jl.Baumgarte(20.0, 20.0)}], ids=str)
+@pytest.mark.parametrize("more", [{}, {"works": True}, {"stabilisation": jl.stabilisation.Baumgarte(20.0, 20.0)}], ids=str)
 def test_motion_is_that_of_scipy(more):
     found = simulated(**more)
     np.testing.assert_allclose(found.q, by_radau(RODS), atol=1e-7)

@@ -730,7 +730,7 @@ def test_without_sympy_the_rest_works_and_the_extra_is_named():
                 print(error)
     """
     run = subprocess.run([sys.executable, "-c", re.sub("^ {8}", "", code, flags=re.M)], capture_output=True, text=True)
-    said = "`{}` must have SymPy, but it cannot be imported. Install `jaxlag[symbolic]`."
+    said = "`{}` must have SymPy, but it cannot be imported. Run `pip install sympy`."
     assert run.stdout.splitlines() == [said.format("equations"), said.format("to_sympy")], run.stderr
 
 

@@ -619,3 +619,29 @@ def test_derivatives_that_differ_from_those_of_the_simulation_are_refused():
     assert str(jl.equations(system, "x", {"c"})) == "ẍ + 2 c x = 0"
     with pytest.raises(ValueError, match="the linear equations must agree with the simulation, but K differs: .*Write functions with a"):
         jl.equations(system, "x", {"c"}, linearised_at=0)
+
+
+SPRING = lambda q, qdot, m, g, c, l0: (
+    0.5 * m * (qdot["r"] ** 2 + (q["r"] * qdot["phi"]) ** 2) + m * g * q["r"] * jnp.cos(q["phi"]) - 0.5 * c * (q["r"] - l0) ** 2
+)
+
+
+def test_drag_has_no_linear_part_at_rest():
+    """A spring pendulum in air: the slopes of |v| v are 0/0 as formulas, and were refused; now they have their limit, 0."""
+    air = lambda q, qdot, k: dissipation.drag(jnp.stack([qdot["r"], q["r"] * qdot["phi"]]), k)
+    names = {"r", "phi"}, {"m", "g", "c", "l0", "k"}
+    found = jl.equations(jl.System(SPRING, dissipation=air), *names, linearised_at={"phi": 0, "r": "l0 + m*g/c"})
+    m, g, c, l0 = (next(x for x in found.stiffness.free_symbols | found.mass.free_symbols if x.name == n) for n in ("m", "g", "c", "l0"))
+    squares = {x.name: value for x, value in found.omega_squared.items()}
+    assert is_zero(squares["δphi"] - g / (l0 + m * g / c)) and is_zero(squares["δr"] - c / m) and found.damping.is_zero_matrix
+    assert sympy.count_ops(squares["δphi"]) <= 6  # it was g (l₀ + m g/c) over the square written out
+    dry = lambda q, qdot, k: k * dissipation.speed(jnp.stack([qdot["r"], q["r"] * qdot["phi"]]))  # a kink has none
+    with pytest.raises(ValueError, match="linearised_at"):
+        jl.equations(jl.System(SPRING, dissipation=dry), *names, linearised_at={"phi": 0, "r": "l0 + m*g/c"})
+
+
+def test_a_refusal_leaves_free_what_was_given_wrongly():
+    """At r = l₀ "m g = 0" was asked for, which is true and no help."""
+    names = {"r", "phi"}, {"m", "g", "c", "l0"}
+    with pytest.raises(ValueError, match=re.escape("It is one where m g cos φ − c (r − l₀) = 0.")):
+        jl.equations(jl.System(SPRING), *names, linearised_at={"phi": 0, "r": "l0"})
