@@ -21,7 +21,7 @@ from .._fit.rounding import plus_minus, rounded
 from .._motion.export import jsonable
 from .._paper.equations import equations
 from .axes import channels, label, panels, pyplot, units_of
-from .fit import convergence, parameters
+from .fit import MOST_PARAMETERS, convergence, parameters
 from .fit import fit as fitted
 
 MOST_COORDINATES = 12  # whose equations are printed
@@ -170,7 +170,8 @@ def _picture(axes: Any, words: str) -> str:
 
 
 def _few(fit: Fit) -> bool:
-    return 0 < len(fit.names) <= 40 and bool(np.any(np.isfinite(np.diag(fit.covariance))))
+    """Whether errors can be drawn."""
+    return 0 < len(fit.names) <= MOST_PARAMETERS and bool(np.any(np.isfinite(np.diag(fit.covariance))))
 
 
 def _given(comparison: Any, validation: Any) -> list[tuple[str, Any]]:

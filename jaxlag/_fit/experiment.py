@@ -40,7 +40,6 @@ class Experiment(eqx.Module):
       own `params`. An unknown start moves within the constraints.
     - `delay`: the time by which the sensors lag behind the motion: a number, or a function of parameters. Until it has passed, they show
       the state at ts[0].
-
     - `events`: by the name of an event of the system, the times at which it was observed, in order, such as clicks in a sound recording;
       NaN for one that was missed. Each is a further channel, with its own `sigma`; `values` must then be a mapping, or None. A motion with
       fewer events cannot be fitted.
@@ -137,17 +136,24 @@ class Experiment(eqx.Module):
         **Arguments:**
 
         - `file`: its path, or a list of paths, of which a list of experiments is made.
-        - `time`: the column of times: its name, or (name, factor), `("time_ms", 1e-3)`. Dates, by ISO 8601 or with the day first, become
+        - `time`: the column of times: its name, or (name, factor), `("time_ms", 1e-3)`. Dates, by ISO 8601 or as 28.11.2026, become
           seconds from the first one.
         - `columns`: those to use: names, or a mapping from channels to names or (name, factor): `{"x": ("laser_mm", 1e-3)}`. Default: all.
         - `from_zero`: whether times count from the first sample, as those of a Unix clock should.
         - `delimiter`: between the cells; by default a tab, a semicolon or a comma, whichever the first line holds. `decimal`: "." or ",";
-          by default both are read, unless commas separate the cells. `encoding`: of the text. A second line of units is skipped.
+          by default commas are points, unless they separate the cells. `encoding`: of the text. A second line of units is skipped.
         - `q0`, `qdot0`, `**more`: as for `Experiment`.
 
         **Returns:** an `Experiment` with `values` by channel, each of shape (T,); or a list of them.
 
-        **Raises:** `ValueError` if a column does not exist or a cell is not a number.
+        **Raises:** `ValueError` if a column does not exist, a cell is not a number, or a column has two decimal marks.
+
+        ```python
+        import jaxlag as jl
+        from jaxlag.examples import vehicle
+        record = jl.Experiment.from_csv(vehicle.recording, vehicle.q0, vehicle.qdot0, time="t", columns={"y": ("y", 1e3)})  # y in mm
+        len(record.ts)  # 1000
+        ```
         """
         if not isinstance(file, (str, Path)):
             how = {"time": time, "columns": columns, "from_zero": from_zero, "delimiter": delimiter, "decimal": decimal}

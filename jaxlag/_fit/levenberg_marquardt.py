@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import lineax as lx
@@ -106,7 +107,7 @@ def levenberg_marquardt(
     step, limits = 0, [np.broadcast_to(np.asarray(limit, y.dtype), y.shape[:-1]) for limit in (tolerance, freedom, size, noise)]
     try:
         for step in range(1, max_steps + 1):
-            now, trial = update(now, trial, linearise(trial.y), box, *limits)
+            now, trial = update(now, trial, _tried(linearise, trial.y, now), box, *limits)
             costs.append(now.cost)
             if progress:
                 progress(step, float(np.min(now.cost)))
@@ -118,6 +119,17 @@ def levenberg_marquardt(
     status = np.asarray(now.status)
     status = np.where(status == RUNNING, unfinished, status)
     return Outcome(now._replace(status=status), step, np.stack([np.asarray(cost) for cost in costs]))
+
+
+def _tried(linearise, y, now):
+    """What `linearise` returns; NaN where it fails, as an implicit solver does that is differentiated at numbers that are not finite."""
+    try:
+        found = linearise(y)
+        jax.block_until_ready(found[0])
+    except jax.errors.JaxRuntimeError:
+        none = lambda leaf: leaf * jnp.nan if eqx.is_inexact_array(leaf) else leaf
+        return jax.tree.map(none, (now.residuals, now.jacobian, now.aux))
+    return found
 
 
 def _cost(r):

@@ -127,17 +127,10 @@ def _noise_of(problem):
 
 
 def _from_one_start(problem, x, limits):
-    held, computed = held_by_jax(problem), []
+    held = held_by_jax(problem)
 
     def residuals(x):
-        try:
-            found = linearise(held, x)
-            found.residuals.block_until_ready()
-            computed[:] = [found]
-        except jax.errors.JaxRuntimeError as error:  # an implicit solver, differentiated where the motion has left all bounds
-            if not computed:
-                raise ValueError(f"{AT_THE_START}, but ended with: {error} Start from other parameters.") from None
-            found = jax.tree.map(lambda leaf: leaf * jnp.nan if eqx.is_inexact_array(leaf) else leaf, computed[0])
+        found = linearise(held, x)
         return found.residuals, found.jacobian, found
 
     outcome = levenberg_marquardt(residuals, x, bounds=problem.bounds, size=size_of(problem), noise=_noise_of(problem), **limits)

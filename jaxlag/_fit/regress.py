@@ -165,13 +165,12 @@ def _half(width, experiments):
 
 def _start(records, given, free, bounds):
     """The free parameters, and whether the equations are linear in them: then those that are not given start at zero, which has no unit."""
-    from_zero = Free.of(given.with_default_starts(0.0), free)
-    with np.errstate(all="ignore"):
-        finite = all(np.all(np.isfinite(part)) for record in records for part in record.form.linearised(from_zero, jnp.zeros(given.size)))
-    if finite and _is_linear(records, from_zero):
-        return Free.of(from_zero.params, free, bounds), True
-    params = given.with_default_starts()
-    return Free.of(params, free, bounds), _is_linear(records, Free.of(params, free))
+    for unbounded in (0.0, 1.0):
+        params = given.with_default_starts(unbounded)
+        linear = _is_linear(records, Free.of(params, free))
+        if linear:
+            break
+    return Free.of(params, free, bounds), linear
 
 
 def _is_linear(records, free):
@@ -179,6 +178,8 @@ def _is_linear(records, free):
     y = jnp.zeros(free.size)
     elsewhere = y + 0.37 * jnp.cos(1.0 + jnp.arange(y.size))
     here = [record.form.linearised(free, y) for record in records]
+    if not all(np.all(np.isfinite(part)) for parts in here for part in parts):
+        return False
     for record, (_, J) in zip(records, here, strict=True):
         if np.linalg.norm(J - record.form.linearised(free, elsewhere)[1]) > LINEAR * np.linalg.norm(J):
             return False

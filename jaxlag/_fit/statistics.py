@@ -50,7 +50,7 @@ def report(problem: Problem, experiments: Sequence[Any], outcome: Outcome, segme
     scale = 1.0 if minimum.absolute and problem.model.loss is None else noise["sigma"]
     predictions = _predictions(minimum, uncertainty, scale)
     parameters = _parameters(minimum, uncertainty, scale)
-    freedom = noise["measurements"] - noise["exact"] - noise["unknown_count"]
+    unknowns = noise["exact"] + noise["unknown_count"]
     is_noise = minimum.absolute and noise["sigma"] <= UNEXPLAINED
     doubt = doubt_of(parameters, minimum.theta, minimum.problem.free.start, predictions["channels"], is_noise)
     return Fit(
@@ -61,7 +61,7 @@ def report(problem: Problem, experiments: Sequence[Any], outcome: Outcome, segme
         **_unknowns(minimum, uncertainty, scale),
         **predictions,
         **_end(minimum, doubt),
-        remarks=[*_on_sigma(minimum), *_remarks(minimum, uncertainty, noise["sigma"], predictions["channels"], freedom)],
+        remarks=[*_on_sigma(minimum), *_remarks(minimum, uncertainty, noise["sigma"], predictions["channels"], unknowns)],
     )
 
 
@@ -150,7 +150,7 @@ def _predictions(minimum: Minimum, uncertainty: Uncertainty, scale: float) -> Fi
     }
 
 
-def _remarks(minimum, uncertainty, sigma, channels, freedom):
+def _remarks(minimum, uncertainty, sigma, channels, unknowns):
     """What the reader of the card should know."""
     free, p = minimum.problem.free, minimum.size
     remarks, at_bounds = [], []
@@ -169,7 +169,7 @@ def _remarks(minimum, uncertainty, sigma, channels, freedom):
     misfit = on_misfit(_relative_size(minimum), times_noise, independent, halves, channels, bool(at_bounds), bool(minimum.recordings))
     return [
         *remarks,
-        *on_no_freedom(minimum.measurements, minimum.measurements - freedom),
+        *on_no_freedom(minimum.measurements, unknowns),
         *at_bounds,
         *doubts(minimum),
         *on_inputs(ended_inputs(minimum.recordings, free.params)),

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 SEPARATORS = "\t;,"  # in this order, the first that the line of names holds
-PLAIN_DATE = re.compile(r"(\d{1,2})[./](\d{1,2})[./](\d{4})[ T]+(.*)")  # day before month, where the year comes last
+PLAIN_DATE = re.compile(r"(\d{1,2})\.(\d{1,2})\.(\d{4})[ T]+(.*)")  # day before month; with slashes, some write the month first
 
 Column = Callable[[str], np.ndarray]
 
@@ -24,17 +24,19 @@ def of_text(file: str | Path, time: str, delimiter: str | None, decimal: str | N
     numbers_of_lines, rows = zip(*numbered, strict=True)
     delimiter = delimiter or next((mark for mark in SEPARATORS if mark in rows[0]), ",")
     names, *cells = ([cell.strip() for cell in row] for row in csv.reader(rows, delimiter=delimiter, skipinitialspace=True))
-    decimal = decimal or ("," if delimiter != "," else ".")
-    if decimal not in (".", ","):
+    if decimal not in (None, ".", ","):
         raise ValueError(f"`decimal` must be '.' or ',', but is {decimal!r}. Leave it out, and both are read, unless cells end at commas.")
+    is_said, decimal = decimal is not None, decimal or ("," if delimiter != "," else ".")
     as_number = (lambda text: text.replace(",", ".")) if decimal == "," else (lambda text: text)
-    at = names.index(time) if time in names else 0
-    has_units = bool(cells) and len(cells[0]) > at and _number(as_number(cells[0][at])) is None and _date(cells[0][at]) is None
+    has_units = bool(cells) and all(_number(as_number(cell)) is None and _date(cell) is None for cell in cells[0])
     table = list(zip(numbers_of_lines[1:], cells, strict=True))[has_units:]
 
     def column(name):
         i = names.index(name)
         texts = [(line, row[i] if i < len(row) else "") for line, row in table]
+        marks = [{*text} & {".", ","} for _, text in texts]
+        if not is_said and decimal == "," and {"."} in marks and {","} in marks and name != time:
+            raise ValueError(f"column {name!r} must have one decimal mark, but has points and commas. Say which by `decimal`.")
         numbers = [np.nan if text == "" else _number(as_number(text)) for _, text in texts]
         if None not in numbers:
             return np.array(numbers, float)

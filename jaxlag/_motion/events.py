@@ -17,7 +17,7 @@ from .mode_changes import Change, changed
 from .protocol import Arguments
 from .scales import Scales
 from .state_vector import Parts
-from .witnesses import matching, sides, sides_of_those_left
+from .witnesses import matching, sides, signs_behind_step
 
 
 def behind_end(equations: EquationsOfMotion, t, y, args: Arguments, ended: Bool[Array, " m"], moved: Float[Array, " m"]) -> Change:
@@ -46,7 +46,7 @@ def behind_step(equations: EquationsOfMotion, t, y, args: Arguments) -> Float[Ar
     if not equations.events:
         return y
     parts = equations.parts(y)
-    return parts._replace(sign=sides_of_those_left(equations, t, parts, args)).y
+    return parts._replace(sign=signs_behind_step(equations, t, parts, args)).y
 
 
 def begun(equations: EquationsOfMotion, t, y, args: Arguments) -> tuple[Float[Array, " y"], Bool[Array, ""]]:

@@ -65,7 +65,7 @@ class Scales(NamedTuple):
         return 1e2 * self._absolute(self.of_v)
 
     @property
-    def with_what_is_held(self) -> "Scales":
+    def with_held_forces(self) -> "Scales":
         """The same, where coordinates have scales that have not moved yet, since forces hold one another."""
         if self.held is None:
             return self
@@ -74,7 +74,7 @@ class Scales(NamedTuple):
 
     def roundings(self, q: Array, v: Array) -> tuple[Array, Array]:
         """What counts as rounding of q and of q̇."""
-        reach = self.with_what_is_held
+        reach = self.with_held_forces
         return roundings(q, reach.of_q), roundings(v, reach.of_v)
 
     def roundings_of_rates(self, qddot: Array) -> Array:

@@ -25,7 +25,7 @@ def witness_margins(equations: EquationsOfMotion, t, parts: Parts, args: Argumen
 
 
 def _value_and_scale(equations, t, parts, args):
-    """Of each witness, its value, the sizes of its slopes over t, q, q̇ and multipliers, and what errors of q and q̇ amount to in it."""
+    """The value of each witness, the sizes of its slopes over t, q, q̇ and multipliers, and its error as a function of those of q and q̇."""
     flat, _ = equations.contents(t, parts, args)
     multipliers = _multipliers(equations, t, parts, args)(t, parts.q, parts.v)
     largest = jax.lax.stop_gradient(jnp.max(jnp.abs(multipliers), initial=0.0)) * jnp.ones_like(multipliers)
@@ -53,8 +53,8 @@ def _multipliers(equations, t, parts, args):
 
 
 def sides(equations: EquationsOfMotion, t, parts: Parts, args: Arguments) -> tuple[Float[Array, " w"], Bool[Array, " w"]]:
-    """On which side of zero each witness is, 1 or −1; where it is zero but for errors of the integration, to which side it goes, and 0
-    where it stays, as that of a velocity that friction holds. And whether it is farther away than by rounding.
+    """The side of zero of each witness, 1 or −1: the one to which it goes if it is zero up to the errors of the integration, and 0 if it
+    stays there, as a velocity does that friction holds. And whether it is away from zero by more than rounding.
     """
     assert args.scales is not None  # events are located
     parts = equations.decided(t, parts, args)
@@ -70,14 +70,14 @@ def sides(equations: EquationsOfMotion, t, parts: Parts, args: Arguments) -> tup
     return jax.lax.stop_gradient((side, jnp.abs(value) > scale_of(of_q, of_v)))
 
 
-def sides_of_those_left(equations: EquationsOfMotion, t, parts: Parts, args: Arguments) -> Float[Array, " w"]:
-    """The signs of witnesses at the end of a step, where some that stayed at zero have left it: that is no event."""
+def signs_behind_step(equations: EquationsOfMotion, t, parts: Parts, args: Arguments) -> Float[Array, " w"]:
+    """The signs of the witnesses behind a step. One that stayed at zero and has left it takes its present sign, without an event."""
     assert args.scales is not None  # events are located
 
     def found():
         there = equations.decided(t, parts, args)
         value, _, scale_of = _value_and_scale(equations, t, there, args)
-        scales = args.scales.with_what_is_held
+        scales = args.scales.with_held_forces
         has_left = (parts.sign == 0) & (jnp.abs(value) > scale_of(scales.of_positions(there.q), scales.of_velocities(there.v)))
         return jnp.where(has_left, jnp.sign(value), parts.sign)
 

@@ -211,6 +211,12 @@ def test_tables_that_cannot_be_read_say_where(tmp_path):
         read()
     with pytest.raises(ValueError, match="a column must be a name, or a name and a factor"):
         read(columns={"x": ("x", "mm")})
+    file.write_text("t;x\n0;1,5\n1;2.5\n")
+    with pytest.raises(ValueError, match="column 'x' must have one decimal mark, but has points and commas. Say which by `decimal`."):
+        read()
+    file.write_text("t,x\n03/04/2026 23:59:59,1\n03/05/2026 00:00:01,2\n")  # in March, or from April to May
+    with pytest.raises(ValueError, match="line 2, column 't' must be a number, but is '03/04/2026 23:59:59'"):
+        read()
     file.write_text("")
     with pytest.raises(ValueError, match="must hold a table, but .* is empty"):
         read()
@@ -266,3 +272,13 @@ def test_directions_of_an_unknown_start_in_any_units():
     position, velocity = (basis / np.linalg.norm(basis, axis=0)).T
     np.testing.assert_allclose(np.abs(position), [0.8, 0.6, 0, 0, 0, 0], atol=1e-9)
     np.testing.assert_allclose(np.abs(velocity), [0, 0, 0, 0.8, 0.6, 0], atol=1e-9)
+
+
+@pytest.mark.fast
+def test_a_data_frame_with_dates():
+    dates = np.datetime64("2026-11-28T23:59:59.5") + np.array([0, 500, 1000]).astype("timedelta64[ms]")
+    e = jl.Experiment.from_dataframe(
+        Frame(at=dates, x=np.array([1.0, 2.0, 3.0])), {"x": 1.0}, {"x": 0.0}, time="at", columns={"x": ("x", 1e-3)}
+    )
+    np.testing.assert_allclose(e.ts, [0, 0.5, 1.0], rtol=1e-12)
+    np.testing.assert_allclose(e.values["x"], [1e-3, 2e-3, 3e-3])
