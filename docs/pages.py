@@ -37,7 +37,7 @@ REFERENCE = {  # names in `jaxlag`
     "keep_compiled",
     "Near a steady state": "equilibrium steady results.Equilibrium linearise results.LinearSystem results.Modes lowest_modes root_locus "
     "results.RootLocus results.Crossing periodic results.PeriodicOrbit stability_map results.StabilityMap",
-    "Identification": "Experiment ModalTest FrequencyResponseTest fit fit_each results.Fit results.Channel results.Interval "
+    "Identification": "Experiment Measurement ModalTest FrequencyResponseTest fit fit_each results.Fit results.Channel results.Interval "
     "results.Prediction regress results.Regression Regress MultiStart validate results.Validation compare results.Comparison "
     "information results.Information Huber learnt.ConvexDissipation learnt.PassiveDissipation learnt.Potential "
     "learnt.ConvexPotential",

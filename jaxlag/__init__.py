@@ -17,12 +17,15 @@ from ._paper.equations import equations as equations
 from ._paper.to_sympy import to_sympy as to_sympy
 from ._mechanics.examine import examine as examine
 from ._mechanics.friction_treatment import Regularised as Regularised, StickSlip as StickSlip
-from ._fit.assess import compare as compare, information as information, validate as validate
+from ._fit.assess import information as information, validate as validate
+from ._fit.comparison import compare as compare
 from ._fit.experiment import Experiment as Experiment
 from ._fit.frequency_response_test import FrequencyResponseTest as FrequencyResponseTest
-from ._fit.fit import fit as fit, fit_each as fit_each
+from ._fit.fit import fit as fit
+from ._fit.fit_each import fit_each as fit_each
 from ._fit.robust_loss import Huber as Huber
 from ._fit.lead_in import MultiStart as MultiStart, Regress as Regress
+from ._fit.measurement import Measurement as Measurement
 from ._fit.modal_test import ModalTest as ModalTest
 from ._fit.regress import regress as regress
 from ._motion.simulate import simulate as simulate

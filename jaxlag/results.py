@@ -1,6 +1,7 @@
 """The classes that functions of jaxlag return, for annotations and `isinstance`; you need not create any of them."""
 
-from ._fit.assess import Comparison as Comparison, Information as Information, Validation as Validation
+from ._fit.assess import Information as Information, Validation as Validation
+from ._fit.comparison import Comparison as Comparison
 from ._fit.channels import Channel as Channel
 from ._fit.regress import Regression as Regression
 from ._fit.result import Fit as Fit, Interval as Interval, Prediction as Prediction

@@ -7,7 +7,7 @@ import jax
 import numpy as np
 from jaxtyping import PyTree
 
-from .._model.paths import labels, leaf_names
+from .._model.paths import labels, leaf_names, listed
 from .._motion.trajectory import Trajectory
 
 # Okabe & Ito, Color Universal Design (2008), distinguishable with any colour vision. Their yellow is too pale for a thin line.
@@ -42,10 +42,11 @@ def one_motion(trajectory: Trajectory) -> Trajectory:
 
 def chosen(names: Sequence[str] | None, known: Sequence[str], what: str) -> tuple[str, ...]:
     """The requested names, or all."""
-    for name in names or ():
+    names = known if names is None else listed(names)
+    for name in names:
         if name not in known:
             raise ValueError(f"`names` must name {what}, but holds {name!r}. There are {', '.join(known)}.")
-    return tuple(known if names is None else names)
+    return tuple(names)
 
 
 def panels(axes: Any, shape: tuple[int, int], which: str, *, sharex: Any = True, **layout: Any) -> Any:

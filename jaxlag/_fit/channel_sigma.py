@@ -9,6 +9,7 @@ import jax
 import numpy as np
 from jaxtyping import PyTree
 
+from .arrow import gathered
 from .channels import channel_names
 from .experiment_batch import ExperimentBatch, with_sigma
 from .problem import Linearisation, Problem
@@ -30,9 +31,8 @@ def too_short(problem: Problem) -> list[str]:
 
 def predicted_exactly(problem: Problem, found: Linearisation) -> dict[str, int]:
     """Of several channels those without noise, but not all, with the number of their measurements: none speaks of the noise of others."""
-    left = lambda z, seen: np.asarray(z)[: len(seen)] - np.asarray(seen)  # copies of the last one may follow
     measured = _by_channel(problem, lambda batch, _: batch.values)
-    residuals = _by_channel(problem, lambda batch, k: jax.tree.map(left, batch.values, found.batches[k].channels))
+    residuals = _by_channel(problem, lambda batch, k: jax.tree.map(_left, batch.values, found.batches[k].channels))
     exact = {name: r.size for name, r in residuals.items() if r.size and np.sqrt(np.mean(r**2)) <= FLOOR * _spread(measured[name])}
     return exact if len(exact) < len(residuals) else {}
 
@@ -49,26 +49,68 @@ def weighted_by_spread(problem: Problem) -> Problem:
 def weighted_by_residuals(problem: Problem, found: Linearisation) -> tuple[Problem, float]:
     r"""The problem with the most likely sigmas of its channels for the residuals found; and the largest relative change of a sigma.
 
-    $$ \hat\sigma_c^2 = \frac{1}{N_c} \sum_{i \in c} r_i^2 $$
+    $$ \hat\sigma_c^2 = \frac{1}{N_c - h_c} \sum_{i \in c} r_i^2, \qquad h_c = \mathrm{tr}\, J_c (J^T J)^{-1} J_c^T $$
 
-    or, with a robust loss, the standard deviation of normal noise whose residuals have this median. Experiments share the sigma of a
-    channel of the same name. Their geometric mean over all measurements is kept apart, in `Fit.sigma`, or with a robust loss in
-    `Problem.scale`: so −2 ln L = N ln Σ (r / σ)² for any sigmas of channels.
+    where h_c is the part of the unknowns that the channel decides (restricted likelihood); or, with a robust loss, the standard deviation
+    of normal noise whose residuals have this median. Experiments share the sigma of a channel of the same name. Their geometric mean over
+    all measurements is kept apart, in `Fit.sigma`, or with a robust loss in `Problem.scale`.
 
-    **Source:** Seber & Wild, Nonlinear Regression (1989), section 11.2; Huber, Robust Statistics (1981), section 5.1.
+    **Source:** Seber & Wild, Nonlinear Regression (1989), section 11.2; Patterson & Thompson, Biometrika 58 (1971) 545 (restricted
+    likelihood); Huber, Robust Statistics (1981), section 5.1.
     """
     robust, before = problem.model.loss is not None, sigmas_of(problem)
-    size = lambda r: NORMAL * np.median(np.abs(r)) if robust else np.sqrt(np.mean(r**2))
+    size = lambda r, decided=0.0: NORMAL * np.median(np.abs(r)) if robust else np.sqrt(r @ r / max(r.size - decided, 1))
+    decided = {} if robust or found.jacobian is None else {name: np.sum(h) for name, h in _leverages(problem, found).items()}
     measured = _by_channel(problem, lambda batch, _: batch.values)
-    residuals = _by_channel(problem, lambda batch, k: jax.tree.map(np.subtract, batch.values, found.batches[k].channels))
+    residuals = _by_channel(problem, lambda batch, k: jax.tree.map(_left, batch.values, found.batches[k].channels))
     if too_short(problem):
         after, scale = before, size(np.concatenate([r / before[name] for name, r in residuals.items()]))
     else:
-        sigmas = {name: max(size(r), FLOOR * _spread(measured[name])) for name, r in residuals.items()}
+        sigmas = {name: max(size(r, decided.get(name, 0.0)), FLOOR * _spread(measured[name])) for name, r in residuals.items()}
         after, scale = _relative_to_mean(sigmas, measured)
     scale = np.asarray(scale if robust else 1.0, problem.scale.dtype)
     changes = [abs(np.log(after[name] * scale / (before[name] * problem.scale))) for name in after]
     return dataclasses.replace(_with(problem, after), scale=scale), float(np.max(changes))
+
+
+def neg2_log_likelihood(problem: Problem, found: Linearisation) -> float:
+    """Of the data alone, Σ N ln (S/N) with the sum of squares S of the N residuals of each channel: −2 ln L up to a constant."""
+    measured = _by_channel(problem, lambda batch, _: batch.values)
+    residuals = _by_channel(problem, lambda batch, k: jax.tree.map(_left, batch.values, found.batches[k].channels))
+    squares = {name: max(np.mean(r**2), (FLOOR * _spread(measured[name])) ** 2) for name, r in residuals.items() if r.size}
+    return float(sum(residuals[name].size * np.log(square) for name, square in squares.items()))
+
+
+def freedom_of_channels(problem: Problem, found: Linearisation) -> float:
+    r"""The degrees of freedom of Student's distribution where channels have sigmas of their own, from their N and the part h of the
+    unknowns that each decides:
+
+    $$ \nu = \frac{(\sum_c h_c)^2}{\sum_c h_c^2/(N_c - h_c)} $$
+
+    **Source:** Satterthwaite, Biometrics Bull. 2 (1946) 110.
+    """
+    h = {name: np.sum(decided) for name, decided in _leverages(problem, found).items()}
+    counts = {name: z.size for name, z in _by_channel(problem, lambda batch, _: batch.values).items()}
+    terms = [h[name] ** 2 / max(counts[name] - h[name], 1) for name in h]
+    return float(sum(h.values()) ** 2 / sum(terms)) if sum(terms) > 0 else float(sum(counts.values()))
+
+
+def _leverages(problem, found):
+    """By channel how much each measurement decides of its own prediction."""
+    J = np.asarray(gathered(found.jacobian))
+    size = np.linalg.norm(J, axis=0)
+    size = np.where(size > 0, size, 1)
+    covariance = np.linalg.pinv((J / size).T @ (J / size), hermitian=True) / np.outer(size, size)
+
+    def of_batch(batch, k):
+        J = np.asarray(found.batches[k].jacobian)
+        at = problem.columns(k)
+        h = np.array([np.sum(rows @ covariance[np.ix_(columns, columns)] * rows, axis=1) for rows, columns in zip(J, at, strict=True)])
+        leaves, structure = jax.tree.flatten(batch.values)
+        ends = np.cumsum([int(np.prod(leaf.shape[1:])) for leaf in leaves])
+        return structure.unflatten([x.reshape(len(J), *z.shape[1:]) for x, z in zip(np.split(h, ends[:-1], axis=1), leaves, strict=True)])
+
+    return _by_channel(problem, of_batch)
 
 
 def _is_alone(problem: Problem) -> bool:
@@ -81,6 +123,11 @@ def sigmas_of(problem: Problem) -> ByChannel:
     """The sigma of each channel over their geometric mean."""
     first = lambda batch, _: jax.tree.map(lambda s: s[:1, :1], batch.sigma)
     return {name: float(s[0]) for name, s in _by_channel(problem, first).items()}
+
+
+def _left(z, seen):
+    """What is left of the measurements; copies of the last experiment may follow."""
+    return np.asarray(z)[: len(seen)] - np.asarray(seen)
 
 
 def _spread(z):

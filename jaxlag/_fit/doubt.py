@@ -25,10 +25,9 @@ def doubt_of(parameters: Mapping[str, Any], theta: Any, start: Any, channels: Se
     `parameters`: names, covariance and correlation as in a `Fit`; `theta`, `start`: their numbers, found and given; `is_noise`: whether
     residuals are as small as the stated noise.
     """
-    in_time = [c for c in channels if np.isfinite(c.r_squared)]
-    unexplained = [c for c in in_time if c.r_squared < WORSE] or (in_time if all(c.r_squared < NOTHING for c in in_time) else [])
-    if unexplained and not is_noise:
-        worst = min(unexplained, key=lambda c: c.r_squared)
+    missed = [] if is_noise else unexplained(channels)
+    if missed:
+        worst = min(missed, key=lambda c: c.r_squared)
         return f"the model explains nothing of {worst.name} here (R² {worst.r_squared:.3g}): {ELSEWHERE}"
     sizes = np.maximum(np.abs(theta), np.abs(np.asarray(start)))
     errors, others = np.sqrt(np.diag(parameters["covariance"])), np.abs(parameters["correlation"] - np.eye(len(sizes)))
@@ -37,3 +36,9 @@ def doubt_of(parameters: Mapping[str, Any], theta: Any, start: Any, channels: Se
             other = parameters["names"][int(np.argmax(others[i]))]
             return f"{name} and {other} cannot be told apart here ({name} {plus_minus(theta[i], errors[i])}): {ELSEWHERE}"
     return ""
+
+
+def unexplained(channels: Sequence[Channel]) -> list[Channel]:
+    """Those of which a model explains nothing."""
+    in_time = [c for c in channels if np.isfinite(c.r_squared)]
+    return [c for c in in_time if c.r_squared < WORSE] or (in_time if all(c.r_squared < NOTHING for c in in_time) else [])

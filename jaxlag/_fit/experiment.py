@@ -6,16 +6,15 @@ from typing import Any
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PyTree
 
 from .._model.injection import check_function
-from .._model.numbers import number, numbers
-from .._model.paths import entry_names, is_within
+from .._model.paths import entry_names, is_within, listed
+from .._model.recorded import delays, deviations, measured_values, of_equal_length, with_events
 from .._model.tables import of_frame, of_text, scaled
-from .._model.validation import is_vector, parameters, sample_times, state
-from .._program.jit import is_concrete, numpy_for
+from .._model.validation import parameters, sample_times, state
+from .._program.jit import is_concrete
 
 
 class Experiment(eqx.Module):
@@ -25,7 +24,8 @@ class Experiment(eqx.Module):
 
     **Arguments:**
 
-    - `ts`: (T,), the times of the samples, increasing, with any intervals; the motion starts at ts[0].
+    - `ts`: (T,), the times of the samples, in order, with any intervals; the motion starts at ts[0]. What was measured again at one time
+      may stand beside it as another sample of the same time.
     - `values`: the measurements z, any pytree of arrays (T, ...), e.g. `{"y": ..., "phi": ...}`. NaN is a missing sample. None for an
       experiment that is only planned (`jaxlag.information`), or of which only `events` were recorded.
     - `q0`, `qdot0`: the state at ts[0], structured as for `simulate`; where it is unknown, a guess.
@@ -38,11 +38,12 @@ class Experiment(eqx.Module):
     - `params`: parameters of this experiment only, which override those of the fit: a payload, a measured input (`Signal`).
     - `unknown`: what is to be estimated for this experiment alone: `"q0"`, `"qdot0"`, coordinates of them (`"qdot0.x"`), or entries of its
       own `params`. An unknown start moves within the constraints.
-    - `delay`: the time by which the sensors lag behind the motion: a number, or a function of parameters. Until it has passed, they show
-      the state at ts[0].
+    - `delay`: the time by which the sensors lag behind the motion: a number, or a function of parameters, for all channels but `events`;
+      or by channel, `{"laser": lambda lag: lag}`, where the others have none. Until it has passed, they show the state at ts[0]; `events`
+      are heard so much later.
     - `events`: by the name of an event of the system, the times at which it was observed, in order, such as clicks in a sound recording;
       NaN for one that was missed. Each is a further channel, with its own `sigma`; `values` must then be a mapping, or None. A motion with
-      fewer events cannot be fitted.
+      fewer events cannot be fitted. If there are more of them than samples, the last time is repeated, without measurements.
 
     Units are any consistent set.
 
@@ -67,7 +68,7 @@ class Experiment(eqx.Module):
     params: dict[str, Any]
     observe: Callable = eqx.field(static=True)
     unknown: tuple[str, ...] = eqx.field(static=True)
-    delay: Callable | float | None = eqx.field(static=True)
+    delay: Callable | float | tuple[tuple[str, Any], ...] | None = eqx.field(static=True)  # pairs, where it is by channel
     events: tuple[str, ...] = eqx.field(static=True)  # channels of `values` that are times of events, in their first rows
 
     def __init__(
@@ -81,7 +82,7 @@ class Experiment(eqx.Module):
         sigma: PyTree | None = None,
         params: Mapping[str, Any] | None = None,
         unknown: Sequence[str] = (),
-        delay: Callable | float | None = None,
+        delay: Callable | float | Mapping[str, Any] | None = None,
         events: Mapping[str, Any] | None = None,
     ):
         self.q0, self.qdot0 = state(q0, qdot0, ("q0", "qdot0"))
@@ -89,22 +90,19 @@ class Experiment(eqx.Module):
             if is_concrete(tree) and not all(np.all(np.isfinite(leaf)) for leaf in jax.tree.leaves(tree)):
                 raise ValueError(f"`{which}` must be finite, but has a missing value. Give a guess, and name it in `unknown`.")
         dtype = jax.tree.leaves(self.q0)[0].dtype
-        self.ts = sample_times(ts, dtype)
-        values = {} if values is None and events else _measured(values, self.ts, dtype)
-        self.values = _with_events(values, events, self.ts, dtype)
+        ts = sample_times(ts, dtype, repeated=True)
+        values = {} if values is None and events else measured_values(values, ts, dtype)
+        channels = with_events(values, events, dtype)
+        sigma = None if sigma is None else deviations(sigma, channels)
+        self.ts, self.values, self.sigma = of_equal_length(ts, channels, sigma)
         self.events = tuple(events or ())
-        self.sigma = None if sigma is None else _deviations(sigma, self.values)
         self.observe = Coordinates.named_by(values, self.q0) if observe is None else observe
         if params is not None and not isinstance(params, Mapping):
             raise TypeError(f"`params` of an experiment must be a mapping, but is a {type(params).__name__}. Name its entries in a dict.")
         self.params = dict(parameters(params or {}, self.q0))
         check_function(self.observe, "`observe`")
-        self.unknown = (unknown,) if isinstance(unknown, str) else tuple(unknown)
-        if callable(delay):
-            check_function(delay, "`delay`")
-        elif delay is not None and is_concrete(delay):
-            delay = float(number(delay, "`delay`", cure="Give the time by which the sensors lag behind the motion."))
-        self.delay = delay
+        self.unknown = listed(unknown)
+        self.delay = delays(delay, self.values)
         for name in self.unknown:
             self._check_unknown(name)
 
@@ -189,8 +187,8 @@ def measured(experiments: Any, params: PyTree, *, planned: bool = False, tests: 
             raise ValueError(f"`experiments` must have been measured, but number {i} has no values. Use `information` to plan one.")
     if params is None or (jax.tree_util.all_leaves([params]) and not isinstance(params, Mapping)):
         raise ValueError(f"`params` must have entries that `free` can name, but is a {type(params).__name__}. Use a dict.")
-    first = experiments[0]
-    params = parameters(params, first.q0 if isinstance(first, Experiment) else first.q)
+    starts = [getattr(e, "q0", getattr(e, "q", None)) for e in experiments]
+    params = parameters(params, next((start for start in starts if start is not None), np.zeros(())))
     for e in experiments:
         with_own(params, e.params)
     return experiments, params
@@ -206,64 +204,6 @@ def with_own(params: PyTree, own: Mapping[str, Any]) -> PyTree:
             "Use a dict; the present params may be one of its entries."
         )
     return {**params, **own}
-
-
-def _with_events(values, events, ts, dtype):
-    """The measured values, and in the first rows of channels of their own the times of events."""
-    if not events:
-        return values
-    if not isinstance(values, Mapping) or not isinstance(events, Mapping) or set(values) & set(events):
-        raise TypeError("`values` must be a mapping of channels where there are `events`, of other names, but is not. Name the channels.")
-    channels = dict(values)
-    for name, given in events.items():
-        times = numbers(given, f"`events[{name!r}]`", dtype)
-        if times.ndim != 1 or times.size > ts.size:
-            raise ValueError(
-                f"`events[{name!r}]` must be a list of at most {ts.size} times, as many as samples, but has shape {times.shape}. "
-                "Give more samples; missing ones may be NaN."
-            )
-        xnp = numpy_for(times)
-        channels[name] = xnp.concatenate([times, xnp.full(ts.size - times.size, xnp.nan, dtype)])
-    return channels
-
-
-def _measured(values, ts, dtype):
-    def channel(path, value):
-        at = f"`values{jax.tree_util.keystr(path)}`"
-        if not (hasattr(value, "shape") or is_vector(value)):
-            raise TypeError(f"{at} must be an array of real numbers, but is a {type(value).__name__}. Give one number for each time.")
-        value = numbers(value, at, dtype)
-        if value.shape[:1] != ts.shape:
-            raise ValueError(f"{at} must have one row for each of the {ts.size} times, but has shape {value.shape}. Put the samples first.")
-        if is_concrete(value):
-            if np.any(np.isinf(value)):
-                raise ValueError(f"{at} must be finite, but has infinities. Mark missing samples by NaN.")
-            if value.size and np.any(np.all(np.isnan(value), axis=0)):
-                raise ValueError(f"{at} must hold some measurements, but every sample of a channel is missing. Leave the channel out.")
-        return value
-
-    return jax.tree_util.tree_map_with_path(channel, values, is_leaf=is_vector)
-
-
-def _deviations(sigma, values):
-    name = lambda path: f"`sigma{jax.tree_util.keystr(path)}`"
-    sigma = jax.tree_util.tree_map_with_path(lambda path, s: numbers(s, name(path)), sigma, is_leaf=is_vector)
-    values = sigma if values is None else values  # of an experiment that is only planned
-    xnp = numpy_for(sigma, values)
-    for_each_sample = lambda s, v: xnp.broadcast_to(xnp.asarray(s, jnp.result_type(v, float)), np.shape(v))
-    try:
-        sigma = jax.tree.map(lambda s, v: jax.tree.map(lambda v: for_each_sample(s, v), v), sigma, values)
-    except ValueError as error:
-        raise ValueError(
-            f"`sigma` must be a number or structured like `values`, but does not fit: {error}. Give one for each channel."
-        ) from None
-    for s in jax.tree.leaves(sigma):
-        if is_concrete(s) and not np.all((np.asarray(s) > 0) & np.isfinite(s)):
-            raise ValueError(
-                "`sigma` must be positive and finite, but has an entry that is not. Give the standard deviation of the noise; "
-                "set samples that are to be ignored to NaN in `values`."
-            )
-    return sigma
 
 
 class Coordinates(eqx.Module):

@@ -53,6 +53,12 @@ class ExperimentBatch:
         of_params = (int(np.prod(leaf.shape[1:])) for name in self.own for leaf in jax.tree.leaves(self.params[name]))
         return self.tangent_basis.shape[-1] + sum(of_params)
 
+    @property
+    def times(self) -> list[Any]:
+        """For each leaf of the values when its rows were measured, (experiments, T): those of events are times themselves."""
+        leaves = jax.tree_util.tree_flatten_with_path(self.values)[0]
+        return [leaf if self.events and path[0].key in self.events else self.ts for path, leaf in leaves]
+
     def start(self, z: Float[Array, " d"]) -> tuple[PyTree, PyTree, dict[str, Any]]:
         """q0, qdot0 and the own parameters of one experiment (a batch without its first axis) at its unknowns z."""
         if self.unknowns == 0:  # what depends on no unknown is not to be differentiated

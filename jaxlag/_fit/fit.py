@@ -1,12 +1,12 @@
 """Identification: parameters of a real machine from recordings of its motion, with standard errors."""
 
+import contextlib
 import dataclasses
 from collections.abc import Mapping, Sequence
 from functools import partial
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import PyTree
 
@@ -15,13 +15,12 @@ from .._model.system import System
 from .._model.validation import without_contacts, without_events
 from .._motion.progress import Steps, compiling
 from .experiment import Experiment, measured
-from .lead_in import MultiStart, Regress, inside_bounds, led_in
-from .linear_test import LinearTest, apart
-from .minimise import each_apart, minimise, minimise_each
+from .lead_in import MultiStart, Regress, explains_too_little, led_in, without_unknown
+from .measurement import Test, apart
+from .minimise import minimise
 from .multiple_shooting import Segments, cut
-from .parameters import Free, is_unknown
+from .parameters import Free
 from .problem import Problem
-from .regress import regress
 from .residuals import Model
 from .result import Fit
 from .robust_loss import Huber
@@ -30,7 +29,7 @@ from .statistics import report
 
 def fit(
     system: System,
-    experiments: Experiment | LinearTest | Sequence[Experiment | LinearTest],
+    experiments: Experiment | Test | Sequence[Experiment | Test],
     params: PyTree,
     *,
     free: str | Sequence[str],
@@ -39,7 +38,7 @@ def fit(
     loss: Huber | None = None,
     method: Any = None,
     segments: int = 1,
-    start: Any = None,
+    start: Any = "auto",
     max_steps: int | None = None,
     tolerance: float = 1e-3,
     progress: bool = False,
@@ -54,8 +53,8 @@ def fit(
 
     **Arguments:**
 
-    - `experiments`: one `Experiment` or several, with T samples each; T may differ. `ModalTest`s and `FrequencyResponseTest`s may be added
-      or stand alone: their weighted squares are added, and recordings then need a `sigma`.
+    - `experiments`: one `Experiment` or several, with T samples each; T may differ. `ModalTest`s, `FrequencyResponseTest`s
+      and `Measurement`s may be added or stand alone: their weighted squares are added, and recordings then need a `sigma`.
     - `params`: all parameters, a mapping or any pytree with named parts, of numbers and arrays of any shape. Those in `free` are starting
       values; `jaxlag.regress` replaces a NaN, and an estimate at its bound is moved inside.
     - `free`: name or names of the entries of `params` to be identified, or paths to parts of them, `"arm.length"`, `"joints[0]"`.
@@ -67,7 +66,8 @@ def fit(
       onto the bounds.
     - `segments`: number of segments that each record is cut into (multiple shooting), for long or chaotic records.
     - `start`: what to do about a poor start. `jaxlag.Regress()` finds a better one, by `regress`, and by segments if that is not enough;
-      `jaxlag.MultiStart(16)` tries several in one batch.
+      `jaxlag.MultiStart(16)` tries several in one batch. By default `regress` helps where `params` do not lead to a fit that explains
+      the measurements, unless it is impossible or `max_steps` given. None: `params` alone.
     - `max_steps`: step limit, by default 100, or 1000 with `method`; 0 reports the start.
     - `tolerance`: the iteration ends when the next step would change no parameter by more than this part of its standard error.
     - `progress`: shows step, cost and remaining time on standard error (one line on a terminal, otherwise a line now and then), and what is
@@ -95,20 +95,21 @@ def fit(
     ```
     """
     segments = count(segments, "`segments`", cure="Use 1 for single shooting, some tens for a long or chaotic record.")
+    automatic, start = start == "auto" and max_steps is None, None if start == "auto" else start
     if (segments > 1) + (method is not None) + (start is not None) > 1:
         raise ValueError("`segments`, `start` and `method` must be used one at a time, but more than one was given. Omit the others.")
     starts, start = (start.count, None) if isinstance(start, MultiStart) else (1, start)
-    experiments, params = measured(experiments, params, tests=(LinearTest,))
+    experiments, params = measured(experiments, params, tests=(Test,))
     recordings, tests = apart(experiments)
     if tests:
         _check_options(recordings, loss, segments, start)
     common: dict[str, Any] = {"free": free, "bounds": bounds}
-    if start is not None:
-        fit_from = partial(fit, system, priors=priors, loss=loss, tolerance=tolerance, progress=progress, **common, **numerics)
-        return _led_in(fit_from, system, experiments, params, start, 100 if max_steps is None else max_steps, **common)
-    params, done = _without_nan(system, experiments, params, **common)
-    problem, experiments = _checked_problem(system, experiments, params, free, bounds, priors, loss, method is None, numerics)
     steps = (100 if method is None else 1000) if max_steps is None else max_steps
+    fit_from = partial(fit, system, priors=priors, loss=loss, tolerance=tolerance, progress=progress, start=None, **common, **numerics)
+    if start is not None:
+        return led_in(fit_from, system, experiments, params, start, steps, **common)
+    params, done = without_unknown(system, experiments, params, **common)
+    problem, experiments = checked_problem(system, experiments, params, free, bounds, priors, loss, method is None, numerics)
     line = Steps(steps) if progress else None
     if segments > 1:
         without_contacts(system, "`fit` with `segments`")
@@ -120,8 +121,8 @@ def fit(
                 of_segments.problem,
                 method=method,
                 starts=starts,
-                estimate_sigma=not _absolute(experiments),
-                freedom=max(sum(map(_measurements, experiments)) - problem.size, 1),
+                estimate_sigma=not absolute(experiments),
+                freedom=max(sum(map(count_measured, experiments)) - problem.size, 1),
                 max_steps=steps,
                 tolerance=tolerance,
                 progress=line,
@@ -129,7 +130,11 @@ def fit(
         finally:
             if line:
                 line.end()
-        return dataclasses.replace(report(problem, experiments, outcome, of_segments), led_in=done)
+        found = dataclasses.replace(report(problem, experiments, outcome, of_segments), led_in=done)
+    if automatic and method is None and segments == starts == 1 and not tests and explains_too_little(found):
+        with contextlib.suppress(ValueError):  # of what has no regression, or none from which a motion can be computed
+            return led_in(fit_from, system, experiments, params, Regress(), steps, first=found, **common)
+    return found
 
 
 def _check_options(recordings, loss, segments, start):
@@ -148,113 +153,31 @@ def _check_options(recordings, loss, segments, start):
         raise ValueError("`segments` must be 1 where nothing was recorded in time, but is more. Leave it out.")
 
 
-def _led_in(fit_from, system, experiments, params, start, max_steps, **common):
-    """The fit that `start` leads to."""
-    if not isinstance(start, Regress):
-        raise ValueError(f"`start` must be `Regress()`, `MultiStart()` or None, but is {start!r}. Write `start=jl.Regress()`.")
-    experiments, params = measured(experiments, params)
-    found = regress(system, experiments, params, width=start.width, **common)
-    inside, done = inside_bounds(found, **common)
-    chosen = Free.of(params, **common)
-    given = chosen.insert(jnp.where(np.isnan(chosen.start), Free.of(inside, **common).start, chosen.start))
-    return led_in(fit_from, start, experiments, inside, given, done, max_steps)
-
-
-def _without_nan(system, experiments, params, free, bounds):
-    """The parameters, where free ones that are NaN come from `regress`; and what was done."""
-    if not any(map(is_unknown, jax.tree.leaves(params))):
-        return params, ()
-    chosen = Free.of(params, free, bounds)
-    unknown = np.isnan(chosen.start)
-    if not np.any(unknown):
-        return params, ()
-    if apart(experiments)[1]:
-        name = chosen.entries[int(np.argmax(unknown))]
-        raise ValueError(
-            f"`params` must have a start for each free entry where modes or frequency responses are fitted, but {name!r} is NaN. "
-            "Give a guess, or take it from `regress` with the recordings."
-        )
-    found = regress(system, experiments, params, free=free, bounds=bounds)
-    inside, done = inside_bounds(found, free, bounds)
-    return chosen.insert(jnp.where(unknown, Free.of(inside, free).start, chosen.start)), (done,)
-
-
-def fit_each(
+def checked_problem(
     system: System,
-    experiments: Sequence[Experiment],
+    experiments: Any,
     params: PyTree,
-    *,
     free: str | Sequence[str],
-    bounds: Mapping[str, Any] | None = None,
-    priors: Mapping[str, Any] | None = None,
-    max_steps: int = 100,
-    tolerance: float = 1e-3,
-    progress: bool = False,
-    **numerics: Any,
-) -> list[Fit]:
-    r"""A separate fit for each experiment, all in one batch: a fleet of machines, or one machine measured again and again.
-
-    $$ \min_{\theta_e, s_e} \tfrac12 \sum_i \left(\frac{z_{ei} - h(t_i, q(t_i; \theta_e, s_e), \dots)}{\sigma_{ei}}\right)^2
-       \quad \text{for each } e $$
-
-    **Arguments:** as for `fit`. The E experiments are of one kind, with the same sensors and unknowns; the number of samples may differ.
-    Units are any consistent set.
-
-    **Returns:** a list of E `Fit`s, in the order of the experiments.
-
-    **Raises:** `ValueError` if the experiments are of different kinds, and as `fit`. A motion that cannot be computed raises nothing
-    here: that fit has `converged` False, and its `reason` says so.
-
-    ```python
-    import jax.numpy as jnp
-    import jaxlag as jl
-    oscillator = jl.System(lambda q, qdot, c: 0.5 * qdot**2 - 0.5 * c * q**2)
-    ts = jnp.linspace(0.0, 3.0, 50)
-    records = [jl.Experiment(ts, jnp.cos(w * ts), 1.0, 0.0) for w in (2.0, 2.1)]
-    [fit.estimates["c"] for fit in jl.fit_each(oscillator, records, {"c": 3.0}, free=("c",))]  # [4.0, 4.41]
-    ```
-    """
-    experiments, params = measured(experiments, params, tests=(LinearTest,))
-    if apart(experiments)[1]:
-        raise ValueError("`experiments` must be recordings in time, to be fitted in a batch, but some are tests. Call `fit` for each.")
-    params, done = _without_nan(system, experiments, params, free, bounds)
-    problem, experiments = _checked_problem(system, experiments, params, free, bounds, priors, None, True, numerics, alone=True)
-    if len(problem.batches) > 1:
-        raise ValueError("`experiments` must be of one kind, but differ in sensors, unknowns or shapes. Fit each kind by itself.")
-    (batch,) = problem.batches
-    line = Steps(max_steps) if progress else None
-    with compiling("the fits", progress):
-        try:
-            outcome, problem = minimise_each(
-                problem,
-                estimate_sigma=not _absolute(experiments),
-                freedom=max(min(map(_measurements, experiments)) - problem.free.size - batch.unknowns, 1),
-                max_steps=max_steps,
-                tolerance=tolerance,
-                progress=line,
-            )
-        finally:
-            if line:
-                line.end()
-        ends = each_apart(problem, outcome)
-        fits = [report(one, (e,), end, Segments(one, (0,), ())) for e, (one, end) in zip(experiments, ends, strict=True)]
-    return [dataclasses.replace(found, led_in=done) for found in fits]
-
-
-def _checked_problem(system, experiments, params, free, bounds, priors, loss, relative, numerics, alone=False):
+    bounds: Mapping[str, Any] | None,
+    priors: Mapping[str, Any] | None,
+    loss: Huber | None,
+    relative: bool,
+    numerics: Mapping[str, Any],
+    alone: bool = False,
+) -> tuple[Problem, tuple[Any, ...]]:
     """The problem after all checks of the arguments, and the experiments."""
-    experiments, params = measured(experiments, params, tests=(LinearTest,))
+    experiments, params = measured(experiments, params, tests=(Test,))
     if len({e.sigma is None for e in experiments}) > 1:
         raise ValueError("`experiments` must all have a `sigma` or none, but only some have. Give each of them one.")
     chosen = Free.of(params, free, bounds, priors, relative)
-    if priors and not _absolute(experiments):
+    if priors and not absolute(experiments):
         raise ValueError("`priors` must be weighed against known noise, but an experiment has no `sigma`. Give it.")
     for name in chosen.names:
         if all(name in e.params for e in experiments):
             raise ValueError(
                 f"`free` must name parameters that experiments share, but each has a {name!r} of its own. Name it `unknown` there."
             )
-    problem = Problem.of(Model(system, tuple(sorted(numerics.items())), loss), chosen, *apart(experiments))
+    problem = Problem.of(Model.of(system, numerics, loss), chosen, *apart(experiments))
     if problem.size == 0:
         raise ValueError("`free` must name at least one entry of params, but is empty. Say which parameters to identify.")
     if relative:  # optimisers of optax, which stop early, are for networks, which have more weights than there are samples
@@ -264,7 +187,7 @@ def _checked_problem(system, experiments, params, free, bounds, priors, loss, re
 
 def _check_enough_measured(problem, experiments, alone):
     """No more unknowns than measurements and priors; in each experiment, where each is fitted `alone`."""
-    counts = [_measurements(e) for e in experiments]
+    counts = [count_measured(e) for e in experiments]
     priors = int(np.sum(np.isfinite(problem.free.prior_deviation)))
     measurements = min(counts) if alone else sum(counts)
     unknown = problem.free.size + problem.batches[0].unknowns if alone else problem.size
@@ -274,9 +197,11 @@ def _check_enough_measured(problem, experiments, alone):
         )
 
 
-def _measurements(e):
+def count_measured(e: Any) -> int:
+    """How many numbers an experiment or a test has measured."""
     return sum(int(np.sum(np.isfinite(leaf))) for leaf in jax.tree.leaves(e.values)) if isinstance(e, Experiment) else e.measurements
 
 
-def _absolute(experiments):
+def absolute(experiments: Sequence[Any]) -> bool:
+    """Whether the noise of all is known."""
     return all(e.sigma is not None for e in experiments)

@@ -17,6 +17,8 @@ from .rounding import plus_minus, rounded
 ROWS = 40  # of a table at most
 STRONGEST = 6  # correlations on the card
 MANY = 16  # numbers of one name; more are only counted
+UNEVEN = 0.1  # of an interval between samples
+UNFOLDED = 12  # rows of the experiments' own unknowns; more become one for each entry
 
 
 def card(fit: Any) -> str:
@@ -60,10 +62,14 @@ def _heading(fit):
 def _parameter_rows(fit):
     """Estimates, errors and intervals; many numbers of one name in one row."""
     groups = list(estimates_by_name(fit))
+    own = groups[len(fit.estimates) :]
+    folded = own if sum(len(group) for _, group in own) > UNFOLDED and len(fit.unknowns) > 1 else []
+    groups = groups[: len(groups) - len(folded)]
     units = dict(fit.units)
     of = lambda name, whose: f" {unit}" if (unit := unit_of(name, whose, units)) else ""
-    named = [(name, _estimate(fit, v, e, of(name, whose))) for whose, group in groups if len(group) <= MANY for name, v, e in group]
+    named = [(name, _estimate(fit, name, v, e, of(name, whose))) for whose, group in groups if len(group) <= MANY for name, v, e in group]
     named += [(name, _counted(group)) for name, group in groups if len(group) > MANY]
+    named += list(_folded(folded, of))
     width = max((len(name) for name, _ in named[:ROWS]), default=0)
     wide = max((len(value) for _, (value, interval) in named[:ROWS] if interval), default=0)
     rows = [f"  {name:<{width}}  {value:<{wide if interval else 0}}{interval}" for name, (value, interval) in named[:ROWS]]
@@ -76,12 +82,29 @@ def unit_of(name: str, whose: str, units: Mapping[str, str]) -> str:
     return next((units[key] for key in (name, whose, entry) if key in units), "")
 
 
-def _estimate(fit, value, error, unit):
+def _folded(groups, of):
+    """A row for each entry of the unknowns of many experiments: how far they range, and the median of their errors."""
+    entries: dict[str, list[tuple[float, float]]] = {}
+    units = {}
+    for whose, group in groups:
+        for name, value, error in group:
+            entry = name.partition(": ")[2]
+            entries.setdefault(entry, []).append((value, error))
+            units[entry] = of(name, whose)
+    for entry, pairs in entries.items():
+        values, errors = np.array(pairs).T
+        error = float(np.median(errors))
+        text = f"{rounded(np.min(values), error)} … {rounded(np.max(values), error)}, ± {error:.2g}{units[entry]}"
+        yield f"{len(values)} experiments: {entry}", (text, "")
+
+
+def _estimate(fit, name, value, error, unit):
     """The estimate with its error, and its interval."""
     if not np.isfinite(error):
         return "not determined by these measurements" if np.isinf(error) else f"{value:.6g}{unit}", ""
     t = fit.quantile(0.95)
-    return f"{plus_minus(value, error) + unit:<24}", f" 95 %: {rounded(value - t * error, error)} … {rounded(value + t * error, error)}"
+    ends = fit.interval(name) if name in fit.names else (value - t * error, value + t * error)
+    return f"{plus_minus(value, error) + unit:<24}", f" 95 %: {' … '.join(rounded(end, error) for end in ends)}"
 
 
 def _counted(group):
@@ -104,7 +127,15 @@ def _inflation_rows(fit):
     known = fit.inflation[np.isfinite(fit.inflation) & np.isfinite(np.diag(fit.covariance))]
     factors = dict.fromkeys(f"{x:.2g}" for x in (np.min(known), np.max(known))) if known.size else ()
     larger = f": {' to '.join(factors)} times those for white residuals" if known.size else ""
-    return [f"  standard errors account for residuals correlated over {fit.correlated} samples{larger}"]
+    uneven = " that are not evenly spaced in time" if any(map(_is_uneven, fit.experiments)) else ""
+    return [f"  standard errors account for residuals correlated over {fit.correlated} samples{uneven}{larger}"]
+
+
+def _is_uneven(e):
+    """Whether the intervals between samples differ."""
+    intervals = np.diff(np.asarray(getattr(e, "ts", ())))
+    intervals = intervals[intervals > 0]
+    return intervals.size > 0 and np.ptp(intervals) > UNEVEN * np.median(intervals)
 
 
 def channel_rows(channels: Sequence[Channel]) -> list[str]:

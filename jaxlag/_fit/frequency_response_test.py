@@ -9,7 +9,10 @@ from jaxtyping import Array, Float, PyTree
 from .._linear.linear_system import LinearSystem
 from .._linear.response import frequencies
 from .._model.numbers import numbers
+from .._model.paths import listed
 from .linear_test import LinearTest
+
+CERTAIN = 4.0  # standard deviations from which on a sign is not that of noise
 
 
 class FrequencyResponseTest(LinearTest):
@@ -23,9 +26,9 @@ class FrequencyResponseTest(LinearTest):
     **Arguments:**
 
     - `omega`: (w,), angular frequencies in rad/time.
-    - `values`: complex, (w, outputs, inputs); axes of length one may be omitted. NaN marks what was not measured.
+    - `values`: complex, (w, outputs, inputs), of motions like exp(iωt); axes of length one may be omitted. NaN marks what was not measured.
     - `q`, `qdot`: a guess of the equilibrium, or where `qdot` is given, of the steady motion, structured as for `simulate`.
-    - `inputs`: what was excited, by names as for `linearise`: a force on a coordinate, an entry of `params`, a moved constraint.
+    - `inputs`: what was excited, by name or names as for `linearise`: a force on a coordinate, an entry of `params`, a moved constraint.
     - `observe`: the sensors, as for `Experiment`; by default all coordinates.
     - `sigma`: standard deviation of the real part and of the imaginary part, a number or structured like `values`; or, in its place,
     - `coherence`, `averages`: γ², between 0 and 1, structured like `values`, and the number n of independent averages behind it. If several
@@ -60,7 +63,7 @@ class FrequencyResponseTest(LinearTest):
         q: PyTree,
         qdot: PyTree = None,
         *,
-        inputs: Sequence[str],
+        inputs: str | Sequence[str],
         observe: Callable | None = None,
         sigma: Any = None,
         coherence: Any = None,
@@ -79,8 +82,8 @@ class FrequencyResponseTest(LinearTest):
         values = np.where(np.isnan(values), np.nan, values) + 0j
         if np.any(np.isinf(values)) or np.all(np.isnan(values)):
             raise ValueError("`values` must be finite, but are infinite or missing throughout. Mark by NaN what was not measured.")
-        if isinstance(inputs, str) or not len(inputs):
-            raise ValueError(f"`inputs` must be a list of what was excited, but is {inputs!r}. Write e.g. `inputs=['x']` for a force on x.")
+        if not listed(inputs):
+            raise ValueError(f"`inputs` must name what was excited, but is {inputs!r}. Write e.g. `inputs=['x']` for a force on x.")
         deviations = _deviations(values, sigma, coherence, averages)
         super().__init__(values, deviations, q, qdot, params, observe, inputs, fixed, fixed_rates)
 
@@ -103,8 +106,12 @@ class FrequencyResponseTest(LinearTest):
             )
 
     def doubts(self, near: LinearSystem) -> list[str]:
-        """None: every value belongs to its own frequency, whatever linear system is `near`."""
-        return []
+        """Whether the imaginary parts have the opposite sign of those of the linear system `near`: then conjugates are nearer to them."""
+        seen = np.where(np.isnan(self.values), 0, self.predicted(near)).imag / self.sigma
+        measured = np.nan_to_num(self.values).imag / self.sigma
+        if np.sum(seen * measured) >= -CERTAIN * np.linalg.norm(seen):
+            return []
+        return ["its values look like complex conjugates, as of another sign of time, exp(-iωt): pass `values.conj()`"]
 
 
 def _deviations(values, sigma, coherence, averages):

@@ -126,6 +126,8 @@ def _combinations(joint, nulls, thetas):
             continue
         pivots, exact = simplest
         factors = {i: tuple((joint[p], x) for p, x in zip(pivots, row, strict=True) if x != 0) for i, row in enumerate(exact)}
+        if any(not factors[i] for i in factors if i not in pivots):  # which would be determined alone, but is not everywhere
+            continue
         common = products and all(x == 1 for row in exact for x in row)
         return Combinations(products, common, tuple((joint[i], factors[i]) for i in factors if i not in pivots))
     return None

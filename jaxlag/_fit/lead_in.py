@@ -1,19 +1,24 @@
 """Leading a fit in from a poor start: regression on the equations of motion, then segments, then the whole motion."""
 
 import dataclasses
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import PyTree
 
 from .._model.numbers import count
-from .experiment import Experiment
-from .levenberg_marquardt import REASONS, STEP_LIMIT
+from .._model.system import System
+from .doubt import unexplained
+from .experiment import Experiment, measured
+from .levenberg_marquardt import INTERRUPTED, REASONS, STEP_LIMIT
+from .measurement import apart
 from .multiple_shooting import whole
-from .parameters import Free
-from .regress import Regression
+from .parameters import Free, is_unknown
+from .regress import Regression, regress
+from .remarks import UNEXPLAINED
 from .result import Fit
 
 FIRST_STEPS = 30  # of the whole motion from the start of `regress`; those that do not converge are long in vain
@@ -94,19 +99,13 @@ def _segments(start, experiments):
     return start.segments or min(SEGMENTS, *(e.ts.size // SAMPLES for e in experiments))
 
 
-def led_in(
-    fit_from: Callable[..., Fit],
-    start: Regress,
-    experiments: Sequence[Experiment],
-    params: PyTree,
-    given: PyTree,
-    done: str,
-    max_steps: int,
-) -> Fit:
+def _staged(fit_from, start, experiments, params, given, done, max_steps, first):
     """The best of the fits on the way. `fit_from(experiments, params, max_steps, segments)` is a fit; `given`: the parameters of the user,
-    which may be the better start; `done`: what was done before.
+    which may be the better start; `done`: what was done before; `first`: the fit from the given parameters, if there is one already.
     """
     steps, fits = [done], []
+    if first is not None:
+        steps, fits = [f"whole motion from the given start: {first.steps} steps, explaining too little", done], [first]
 
     def stage(name, *where, **more):
         try:
@@ -119,9 +118,9 @@ def led_in(
         steps.append(f"{name}: {fits[-1].steps} steps{'' if fits[-1].converged else ', not converged'}")
         return fits[-1]
 
-    segments, most = _segments(start, experiments), max_steps
+    segments, most = 1 if first else _segments(start, experiments), max_steps  # segments may take long: only where asked for
     found = stage("whole motion", experiments, params, max_steps=min(most, FIRST_STEPS))
-    if not (found and _explains(found)):
+    if first is None and not (found and _explains(found)):
         other = stage("whole motion from the given start", experiments, given, max_steps=min(most, FIRST_STEPS))
         found = other if other and _explains(other) else found
     if segments > 1 and not (found and _explains(found)):
@@ -158,3 +157,54 @@ def inside_bounds(found: Regression, free: str | Sequence[str], bounds: Any) -> 
             moves.append(f"{name} moved inside from its bound {bound:g} to {theta[i]:.3g}")
     moved_inside = f" ({'; '.join(moves)})" if moves else ""
     return chosen.insert(np.asarray(theta, chosen.start.dtype)), f"regress{moved_inside}"
+
+
+def led_in(
+    fit_from: Callable[..., Fit],
+    system: System,
+    experiments: Sequence[Experiment],
+    params: PyTree,
+    start: Any,
+    max_steps: int,
+    first: Fit | None = None,
+    **common: Any,
+) -> Fit:
+    """The fit that `start` leads to. `fit_from(experiments, params, max_steps, segments, **common)` is one from parameters alone; `first`:
+    that from the given ones, if there is one already.
+    """
+    if not isinstance(start, Regress):
+        raise ValueError(f"`start` must be `Regress()`, `MultiStart()`, 'auto' or None, but is {start!r}. Write `start=jl.Regress()`.")
+    experiments, params = measured(experiments, params)
+    found = regress(system, experiments, params, width=start.width, **common)
+    inside, done = inside_bounds(found, **common)
+    chosen = Free.of(params, **common)
+    given = chosen.insert(jnp.where(np.isnan(chosen.start), Free.of(inside, **common).start, chosen.start))
+    return _staged(fit_from, start, experiments, inside, given, done, max_steps, first)
+
+
+def without_unknown(
+    system: System, experiments: Sequence[Any], params: PyTree, free: str | Sequence[str], bounds: Mapping[str, Any] | None
+) -> tuple[PyTree, tuple[str, ...]]:
+    """The parameters, where free ones that are NaN come from `regress`; and what was done."""
+    if not any(map(is_unknown, jax.tree.leaves(params))):
+        return params, ()
+    chosen = Free.of(params, free, bounds)
+    unknown = np.isnan(chosen.start)
+    if not np.any(unknown):
+        return params, ()
+    if apart(experiments)[1]:
+        name = chosen.entries[int(np.argmax(unknown))]
+        raise ValueError(
+            f"`params` must have a start for each free entry where modes or frequency responses are fitted, but {name!r} is NaN. "
+            "Give a guess, or take it from `regress` with the recordings."
+        )
+    found = regress(system, experiments, params, free=free, bounds=bounds)
+    inside, done = inside_bounds(found, free, bounds)
+    return chosen.insert(jnp.where(unknown, Free.of(inside, free).start, chosen.start)), (done,)
+
+
+def explains_too_little(found: Fit) -> bool:
+    """Whether a fit is hardly one: at its minimum the model explains nothing, or little where the iteration did not find a minimum."""
+    if (found.absolute and found.sigma <= UNEXPLAINED) or found.reason == REASONS[INTERRUPTED]:
+        return False
+    return bool(unexplained(found.channels)) or not (found.converged or _explains(found))

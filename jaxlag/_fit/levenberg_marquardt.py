@@ -12,6 +12,7 @@ import optimistix as optx
 
 from .._program.implicit import undifferentiated
 from .._program.jit import compiled
+from .arrow import norms, over, times, transposed, triangular
 
 RUNNING, CONVERGED, STALLED, STEP_LIMIT, INTERRUPTED, FAILED, UNRELATED, DISCONTINUOUS, KINKED = range(9)
 REASONS = (
@@ -136,15 +137,15 @@ def _cost(r):
     return 0.5 * jnp.sum(r**2, axis=-1)
 
 
-def _norms(J):
-    return jnp.linalg.norm(J, axis=0)
+def _where(condition, a, b):
+    return jax.tree.map(lambda a, b: jnp.where(condition, a, b), a, b)
 
 
 @compiled
 def _initialise(y, linearised, bounds):
     r, J, aux = linearised
     cost, first, infinite = _cost(r), jnp.asarray(jnp.nan, y.dtype), jnp.asarray(jnp.inf, y.dtype)
-    now = Iterate(y, r, J, aux, cost, first, _norms(J), J, cost, infinite, jnp.asarray(0), jnp.asarray(RUNNING))
+    now = Iterate(y, r, J, aux, cost, first, norms(J), J, cost, infinite, jnp.asarray(0), jnp.asarray(RUNNING))
     return now, _propose(now, bounds)
 
 
@@ -154,28 +155,28 @@ def _across_the_kink(now):
     **Source:** Burke, Lewis & Overton, SIAM J. Optim. 15 (2005) 751 (gradient sampling), for two samples.
     """
     scale = jnp.where(now.scale > 0, now.scale, 1)
-    here, there = (now.residuals @ J / scale for J in (now.jacobian, now.across))
+    here, there = (transposed(J, now.residuals) / scale for J in (now.jacobian, now.across))
     apart = jnp.sum((here - there) ** 2)
     share = jnp.clip(here @ (here - there) / jnp.where(apart > 0, apart, 1), 0, 1)
-    return now.jacobian + share * (now.across - now.jacobian)
+    between = lambda a, b: a + share * (b - a) if jnp.issubdtype(a.dtype, jnp.inexact) else a
+    return jax.tree.map(between, now.jacobian, now.across)
 
 
 def _propose(now, bounds):
     """The damped Gauss–Newton step, in columns scaled to norm one. Entries that would cross a bound stop there."""
     scale = jnp.where(now.scale > 0, now.scale, 1)
     lower, upper = ((bound - now.y) * scale for bound in bounds)
-    J, slope = _across_the_kink(now) / scale[None, :], now.residuals @ now.jacobian
+    J, slope = over(_across_the_kink(now), scale), transposed(now.jacobian, now.residuals)
     active = ((lower >= 0) & (slope > 0)) | ((upper <= 0) & (slope < 0))
-    Q, R = jnp.linalg.qr(J)
-    step, damping, free_change = undifferentiated(_damped, in_turn=True)(R, now.residuals @ Q, now.radius, active, lower, upper)
-    return Trial(jnp.clip(now.y + step / scale, *bounds), J @ step, jnp.linalg.norm(step), damping, free_change, active)
+    step, damping, free_change = undifferentiated(_damped, in_turn=True)(*triangular(J, now.residuals), now.radius, active, lower, upper)
+    return Trial(jnp.clip(now.y + step / scale, *bounds), times(J, step), jnp.linalg.norm(step), damping, free_change, active)
 
 
 def _damped(R, r, radius, active, lower, upper):
     """The damped step within the bounds, and the square of the part of r that R can take away without the `active` columns."""
     descent = optx.DampedNewtonDescent()
-    U, values, _ = jnp.linalg.svd(jnp.where(active[None], 0, R), full_matrices=False)
-    damping = _damping_within(radius, values, r @ U)
+    values, along = _singular(jnp.where(active[None], 0, R), r)
+    damping = _damping_within(radius, values, along)
 
     def solve_anew(last):
         step, fixed, _ = last
@@ -188,7 +189,22 @@ def _damped(R, r, radius, active, lower, upper):
 
     step, _, _ = jax.lax.while_loop(lambda last: last[2], solve_anew, (jnp.zeros_like(lower), active, jnp.asarray(True)))
     clear = values > jnp.finfo(r.dtype).eps ** CLEAR * jnp.max(values, initial=0.0)
-    return step, damping, jnp.sum(jnp.where(clear, r @ U, 0) ** 2)  # however slowly a damped step takes it away along a valley of the cost
+    return step, damping, jnp.sum(jnp.where(clear, along, 0) ** 2)  # however slowly a damped step takes it away along a valley of the cost
+
+
+def _singular(R, r):
+    """The singular values s of R = U S Vᵀ, and Uᵀr: by RᵀR where LAPACK's divide and conquer has failed, as it may for hundreds of columns
+    that are much alike.
+    """
+    U, values, _ = jnp.linalg.svd(R, full_matrices=False)
+
+    def by_squares():
+        squares, V = jnp.linalg.eigh(R.T @ R)
+        values = jnp.sqrt(jnp.maximum(squares, 0))
+        seen = values > jnp.finfo(R.dtype).eps ** 0.5 * jnp.max(values, initial=0.0)
+        return values, jnp.where(seen, (R @ V).T @ r / jnp.where(seen, values, 1), 0)
+
+    return jax.lax.cond(jnp.all(jnp.isfinite(values)), lambda: (values, r @ U), by_squares)
 
 
 def _damping_within(radius, values, along):
@@ -219,7 +235,6 @@ def _update(now, trial, linearised, bounds, tolerance, freedom, size, noise):
     trusted = (expected <= rounding) & (after - before <= rounding)
     trusted |= (jnp.sum(trial.change**2) <= last) & (after - before <= last / 2)
     taken = better | (newton_like & trusted)
-    take = lambda new, old: jax.tree.map(lambda a, b: jnp.where(taken, a, b), new, old)
     as_expected = (before - after) > ENOUGH * expected
     well = (before - after) > WELL * expected
     radius = jnp.where(jnp.isnan(now.radius), trial.length, now.radius)
@@ -229,7 +244,7 @@ def _update(now, trial, linearised, bounds, tolerance, freedom, size, noise):
     drowned = ~better & newton_like & (trial.free_change <= 2 * rounding)  # in the errors of what is integrated
     status = jnp.where((status == RUNNING) & drowned, CONVERGED, status)
     short = (jnp.sum(trial.change**2) <= SHORT**2 * per_error) & jnp.isfinite(after)
-    across = jnp.where(taken, jnp.where(short & ~as_expected, now.jacobian, J), jnp.where(short, J, now.across))
+    across = _where(taken, _where(short & ~as_expected, now.jacobian, J), _where(short, J, now.across))
     fell = now.mark - jnp.where(taken, after, before) > SLIGHT**2 / 2 * per_error
     fell |= radius > WIDER * now.reach  # in a curved valley, which has no kink, steps become longer and longer
     slow = jnp.where(fell, 0, now.slow + (taken & ~newton_like))
@@ -237,20 +252,20 @@ def _update(now, trial, linearised, bounds, tolerance, freedom, size, noise):
     status = jnp.where((status == RUNNING) & (slow >= PATIENCE), jnp.where(within, CONVERGED, KINKED), status)
     mark = jnp.where(fell, jnp.where(taken, after, before), now.mark)
     reach = jnp.where(fell | jnp.isinf(now.reach), radius, now.reach)
-    chosen = take((trial.y, r, J, aux, after), now[:5])
-    scale = jnp.maximum(now.scale, _norms(jnp.where(taken, J, 0)))
+    chosen = _where(taken, (trial.y, r, J, aux, after), tuple(now[:5]))
+    scale = jnp.maximum(now.scale, jnp.where(taken, norms(J), 0))
     chosen = Iterate(*chosen, radius, scale, across, mark, reach, slow, status)
-    now = jax.tree.map(lambda a, b: jnp.where(now.status != RUNNING, b, a), chosen, now)
+    now = _where(now.status != RUNNING, now, chosen)
     return now, _propose(now, bounds)
 
 
 def _status(now, trial, taken, newton_like, tolerance, freedom, size):
     """Whether the iteration goes on, judged by the step that was tried from `now`."""
-    norms = _norms(now.jacobian)  # the present ones: those at the start may be larger by many powers of ten
-    largest = jnp.minimum(jnp.max(norms, initial=0.0), size)
+    sizes = norms(now.jacobian)  # the present ones: those at the start may be larger by many powers of ten
+    largest = jnp.minimum(jnp.max(sizes, initial=0.0), size)
     least = jnp.finfo(now.residuals.dtype).eps ** 0.625 * largest  # below the rounding of what is integrated
     short = trial.free_change <= jnp.maximum(tolerance**2 * 2 * now.cost / jnp.maximum(freedom, 1), least**2)
-    cosines = jnp.where((norms > 0) & ~trial.active, now.residuals @ now.jacobian / jnp.where(norms > 0, norms, 1), 0)
+    cosines = jnp.where((sizes > 0) & ~trial.active, transposed(now.jacobian, now.residuals) / jnp.where(sizes > 0, sizes, 1), 0)
     flat = jnp.linalg.norm(cosines) <= jnp.maximum(FLAT, SLIGHT / jnp.sqrt(jnp.maximum(freedom, 1))) * jnp.sqrt(2 * now.cost)
     status = jnp.where((short & newton_like) | (now.cost == 0), CONVERGED, RUNNING)
     status = jnp.where(~taken & (trial.damping >= HOPELESS), jnp.where(flat, CONVERGED, STALLED), status)

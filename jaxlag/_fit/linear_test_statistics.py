@@ -8,8 +8,12 @@ from .._linear.linear_system import LinearSystem
 from .channels import Channel, channel
 from .experiment import Experiment
 from .experiment_statistics import Predicted
-from .linear_test import LinearTest, deviations, linear_at
+from .frequency_response_test import FrequencyResponseTest
+from .linear_test import LinearTest, linear_at
+from .measurement import Test, deviations
 from .minimum import Minimum
+
+UNDAMPED = 1e-6  # damping ratio that counts as none
 
 
 def predicted_tests(minimum: Minimum, covariance: np.ndarray) -> list[Predicted]:
@@ -23,7 +27,7 @@ def _predicted(test, found, covariance):
     return Predicted(jax.tree.map(np.subtract, test.values, predictions), predictions, deviations(test, found, covariance))
 
 
-def channels_of_test(number: int, test: LinearTest, near: LinearSystem, residuals: PyTree) -> list[Channel]:
+def channels_of_test(number: int, test: Test, near: LinearSystem | None, residuals: PyTree) -> list[Channel]:
     """How well each kind of number is predicted."""
     columns = lambda tree: np.concatenate([np.reshape(x, (len(x), -1)) for x in jax.tree.leaves(tree)], axis=1).T
     triples = zip(test.labels(near), columns(test.values), columns(residuals), strict=True)
@@ -39,5 +43,16 @@ def doubts(minimum: Minimum) -> list[str]:
 
 
 def _doubts(part, system, params):
+    if not isinstance(part.test, LinearTest):
+        return part.test.doubts(None)
     near = linear_at(part, system, params)
-    return part.test.doubts(near) if np.all(np.isfinite(np.asarray(near.A))) else []
+    if not np.all(np.isfinite(np.asarray(near.A))):
+        return []
+    excited = isinstance(part.test, FrequencyResponseTest) and not _is_damped(near)  # as by conjugates: the start tells
+    return part.test.doubts(near) or (part.test.doubts(part.near) if excited else [])
+
+
+def _is_damped(near):
+    """Whether all modes that oscillate die away."""
+    values = np.asarray(near.eigenvalues)
+    return bool(np.all((values.real < -UNDAMPED * np.abs(values))[values.imag > 0]))

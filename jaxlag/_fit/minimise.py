@@ -40,7 +40,7 @@ def minimise(problem: Problem, *, method: Any, starts: int, estimate_sigma: bool
     """
     problem = weighted_by_spread(problem) if estimate_sigma else problem
     apart = problem.continuity  # the weight of the gaps grows anew in each round
-    outcome, problem = _minimise(problem, np.zeros(problem.size, problem.free.start.dtype), method, starts, limits)
+    outcome, problem = _minimise(problem, problem.begin, method, starts, limits)
     for _ in range(_rounds(problem, method) if estimate_sigma else 0):
         if int(outcome.best.status) in (INTERRUPTED, STEP_LIMIT) and method is None:
             break
@@ -78,7 +78,7 @@ def minimise_each(problem: Problem, *, estimate_sigma: bool, **limits: Any) -> t
     if estimate_sigma:
         problem = _each_weighted(problem, [weighted_by_spread(one) for one, _ in each_apart(problem)])
     outcome = minimised(problem, jnp.zeros((count, problem.free.size + batch.unknowns)))
-    for _ in range(SIGMA_ROUNDS if estimate_sigma and len(sigmas_of(problem)) > 1 else 0):
+    for _ in range(_rounds(problem, None) if estimate_sigma else 0):
         apart = [(one, end.best) for one, end in each_apart(problem, outcome)]
         found = [weighted_by_residuals(one, best.aux) if np.isfinite(best.cost) else (one, 0.0) for one, best in apart]
         if max(change for _, change in found) < SETTLED or np.any(outcome.best.status == INTERRUPTED):
@@ -97,17 +97,18 @@ def each_apart(problem: Problem, outcome: Outcome | None = None) -> list[tuple[P
     for i in range(len(problem.batches[0].members)):
         one = jax.tree.map(lambda leaf, i=i: leaf[i : i + 1] if eqx.is_array(leaf) else leaf, batch)
         end = outcome and outcome._replace(best=jax.tree.map(lambda leaf, i=i: leaf[i], best), costs=outcome.costs[:, i])
-        apart.append((dataclasses.replace(problem, batches=(one,)), end))
+        scale = np.broadcast_to(problem.scale, len(problem.batches[0].members))[i]
+        apart.append((dataclasses.replace(problem, batches=(one,), scale=np.asarray(scale)), end))
     return apart
 
 
 def _each_weighted(problem, apart):
-    """The problem with the sigmas of the problems that are its experiments."""
+    """The problem with the sigmas, and the scales, of the problems that are its experiments."""
     (batch,) = problem.batches
     copies = len(batch.ts) - len(apart)  # of the last one
     sigmas = [one.batches[0].sigma for one in [*apart, *apart[-1:] * copies]]
     together = jax.tree.map(lambda *leaves: np.concatenate(leaves), *sigmas)
-    return dataclasses.replace(problem, batches=(with_sigma(batch, together),))
+    return dataclasses.replace(problem, batches=(with_sigma(batch, together),), scale=np.stack([one.scale for one in apart]))
 
 
 def _minimise(problem, x, method, starts, limits):

@@ -10,7 +10,7 @@ import numpy as np
 from .._program.jit import compiled
 from .experiment import Experiment
 from .levenberg_marquardt import Outcome
-from .linear_test import apart
+from .measurement import apart
 from .multiple_shooting import Segments
 from .problem import Linearisation, Problem
 

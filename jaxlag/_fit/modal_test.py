@@ -37,7 +37,7 @@ class ModalTest(LinearTest):
     - `shapes`: what the sensors see of each mode: a pytree like the one that `observe` returns, with the modes as first axis; real or
       complex, of any scale. Each is paired with the predicted mode of the most similar shape, by the modal assurance criterion MAC; sensors
       should have one unit. Shapes only pair modes: they are no measurements. Without shapes, modes are paired in ascending order, the first
-      with the lowest that oscillates.
+      with the lowest that oscillates. A fit that would begin where modes have one frequency begins 1 % beside it.
     - `observe`: the sensors, as for `Experiment`; by default the coordinates named in `shapes`.
     - `params`: parameters of this test only, which override those of the fit: an added mass. `fixed`, `fixed_rates`: as for `steady`.
 
@@ -110,10 +110,6 @@ class ModalTest(LinearTest):
         values = jnp.where(oscillates, found.values, jnp.nan)[chosen]
         return values, jnp.take_along_axis(agreement, chosen[:, None], axis=1)[:, 0], jnp.max(agreement, axis=1)
 
-    def labels(self, near: LinearSystem) -> list[str]:
-        """Names of the channels, in JAX's order; they do not depend on the system `near`."""
-        return sorted(self.values)
-
     def refuse_misfit(self, near: LinearSystem) -> None:
         """Raises if fewer modes of the linear system `near` oscillate, or if its outputs differ."""
         count, there = len(self.values["frequency"]), int(np.sum(np.asarray(near.eigenvalues).imag > 0))
@@ -126,6 +122,11 @@ class ModalTest(LinearTest):
                 raise ValueError(
                     f"`shapes` must hold what `observe` returns, {seen}, but holds {', '.join(names)}. Give both the same names."
                 )
+
+    def is_singular(self, near: LinearSystem) -> bool:
+        """Whether modes of the linear system `near` have one frequency: only its mean over them has a derivative."""
+        found = of_first_order(near.A, near.sample_time)
+        return bool(np.any(np.asarray(found.repeated & (found.values.imag > 0))))
 
     def doubts(self, near: LinearSystem) -> list[str]:
         """Modes that may have been paired with the wrong ones of the linear system `near`."""

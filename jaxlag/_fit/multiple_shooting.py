@@ -5,6 +5,7 @@ import itertools
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -89,16 +90,9 @@ def _segment(problem, e, motion, a, b):
             q0, qdot0 = consistent_state(problem.model.system, q0, qdot0, with_own(problem.free.params, e.params), t=e.ts[a])
     if a:
         unknown = ("q0", "qdot0")
-    return Experiment(
-        e.ts[a:end],
-        jax.tree.map(masked, e.values),
-        q0,
-        qdot0,
-        observe=e.observe,
-        sigma=None if e.sigma is None else jax.tree.map(within, e.sigma),
-        params=e.params,
-        unknown=unknown,
-    )
+    sigma = None if e.sigma is None else jax.tree.map(within, e.sigma)
+    planned = Experiment(e.ts[a:end], None, q0, qdot0, observe=e.observe, sigma=sigma, params=e.params, unknown=unknown)
+    return eqx.tree_at(lambda one: one.values, planned, jax.tree.map(masked, e.values), is_leaf=lambda x: x is None)  # some may see nothing
 
 
 def join(problem: Problem, x: Any, *, max_steps: int, tolerance: float, freedom: int, progress: Any) -> tuple[Outcome, Problem]:

@@ -5,6 +5,7 @@ from typing import NamedTuple
 import jax
 import numpy as np
 
+from .arrow import Arrow, gathered, times, transposed
 from .autocorrelation import independent_samples
 from .identifiability import MANY, determined_by
 from .minimum import Minimum
@@ -34,28 +35,35 @@ def different_halves(minimum: Minimum, uncertainty: Uncertainty) -> Halves | Non
     from scipy import special
 
     p, beside, J = minimum.size, minimum.problem.beside, uncertainty.jacobian
-    if J is None or not 0 < p <= MANY or minimum.problem.model.loss is not None or minimum.measured.size < 4 * J.shape[1]:
+    if J is None or not 0 < p <= MANY or minimum.problem.model.loss is not None or minimum.measured.size < 4 * J.size:
         return None
-    second = np.concatenate([np.zeros(beside, bool), *(rows.ravel() for rows in _second_halves(minimum))])
-    both = np.hstack([J, J[:, :p] * second[:, None]])
+    both = _with_changes(J, p, _second_halves(minimum))
     gaps = np.asarray(minimum.found.gaps_jacobian)
-    known = determined_by(both, np.hstack([gaps, np.zeros((len(gaps), p))]))
-    own = np.flatnonzero(known.determined[-p:]) + J.shape[1]
+    known = determined_by(gathered(both), np.hstack([gaps, np.zeros((len(gaps), p))]))
+    own = np.flatnonzero(known.determined[-p:]) + J.size
     r = np.concatenate([-np.asarray(minimum.found.residuals)[:beside], np.nan_to_num(minimum.flat)])
-    found = known.covariance @ (both.T @ r)
-    left = r - both @ found
-    ends = np.cumsum([beside, *(part.size for part in minimum.weighted)])
-    weighted = [left[a:b].reshape(part.shape) + 0 * part for a, b, part in zip(ends, ends[1:], minimum.weighted, strict=False)]
+    found = known.covariance @ transposed(both, r)
+    left = r - times(both, found)
+    weighted = [part + 0 * measured for part, measured in zip(both.split(left)[1], minimum.weighted, strict=True)]
     covariance, correlated = sandwich(minimum, both, known.covariance, weighted)
-    covariance = covariance * (left @ left) / max(minimum.measured.size - both.shape[1], 1)
+    covariance = covariance * (left @ left) / max(minimum.measured.size - both.size, 1)
     deviation = np.sqrt(np.diag(covariance)[own])
     if not own.size or not np.all(deviation > 0):
         return None
     F = found[own] @ np.linalg.lstsq(covariance[np.ix_(own, own)], found[own], rcond=None)[0] / own.size
     if special.fdtrc(own.size, independent_samples(minimum.measured.size, correlated), F) >= DIFFERENT:
         return None
-    i = int(own[np.argmax(np.abs(found[own]) / deviation)] - J.shape[1])
-    return Halves(i, *_estimates(minimum, i, J.shape[1] + i, found, covariance))
+    i = int(own[np.argmax(np.abs(found[own]) / deviation)] - J.size)
+    return Halves(i, *_estimates(minimum, i, J.size + i, found, covariance))
+
+
+def _with_changes(J, p, late):
+    """With p columns more, for the change of the parameters from the first half to the second."""
+    changes = J.size + np.arange(p)
+    blocks = tuple(np.concatenate([block, block[..., :p] * of[..., None]], axis=2) for block, of in zip(J.blocks, late, strict=True))
+    columns = tuple(np.hstack([columns, np.tile(changes, (len(columns), 1))]) for columns in J.columns)
+    wider = lambda rows: np.hstack([rows, np.zeros((len(rows), p))])
+    return Arrow(wider(J.first), blocks, columns, wider(J.last))
 
 
 def _estimates(minimum, i, j, found, covariance):
@@ -74,12 +82,7 @@ def _second_halves(minimum):
         ts = np.asarray(e.ts)  # with arrays of JAX this took a tenth of a fit
         middle = (ts[0] + ts[-1]) / 2
         for k, row, _ in segments:
-            batch = minimum.problem.batches[k]
-            late, widths = np.asarray(batch.ts)[row] >= middle, _widths(batch)
-            halves[k][row] = np.concatenate([np.repeat(late, width) for width in widths])
+            leaves, times = jax.tree.leaves(minimum.problem.batches[k].values), minimum.problem.batches[k].times
+            late = [np.repeat(np.asarray(ts)[row] >= middle, int(np.prod(z.shape[2:]))) for z, ts in zip(leaves, times, strict=True)]
+            halves[k][row] = np.concatenate(late)
     return halves
-
-
-def _widths(batch):
-    """The number of scalar channels of each leaf of the values."""
-    return [int(np.prod(leaf.shape[2:])) for leaf in jax.tree.leaves(batch.values)]

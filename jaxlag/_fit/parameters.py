@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, PyTree
 
-from .._model.paths import entry_names, is_within, leaf_names
+from .._model.paths import entry_names, is_within, leaf_names, listed
 from .._program.jit import numpy_for
 
 
@@ -48,7 +48,7 @@ class Free:
 
         With `relative`, y is in units of |θ₀|; otherwise θ = θ₀ + y.
         """
-        free = (free,) if isinstance(free, str) else free
+        free = listed(free)
         every, names = jax.tree.leaves(params), leaf_names(params, "")
         chosen = [i for name in free for i in _leaves_within(name, names, every)]
         if len(set(chosen)) < len(chosen):
@@ -67,7 +67,7 @@ class Free:
                 raise ValueError(f"`params` must be known where they are not free, but {names[i]!r} is NaN. Give it a value, or free it.")
         scale = xnp.where(start == 0, 1, xnp.abs(start)) if relative else xnp.ones_like(start)
         lower, upper, mean, deviation = (np.asarray(x, start.dtype) for x in (lower, upper, mean, deviation))
-        return cls(params, start, scale, lower, upper, mean, deviation, tuple(free), entries, tuple(chosen))
+        return cls(params, start, scale, lower, upper, mean, deviation, free, entries, tuple(chosen))
 
     @property
     def size(self) -> int:

@@ -14,7 +14,7 @@ from .._linear.linear_system import LinearSystem
 from .._motion.trajectory import Trajectory
 from .._program.jit import compiled
 from .experiment import Experiment
-from .linear_test import LinearTest, deviations
+from .measurement import Test, deviations
 from .problem import Problem, failure_of, linearise, with_zero_values
 
 
@@ -24,7 +24,7 @@ class Prediction(NamedTuple):
     - `values`: structured like the experiment's `values`; leaves (T, ...) in the units of the channels.
     - `standard_errors`: of `values`, from the uncertainty of the parameters; structured like them.
     - `lower`, `upper`: the confidence band; structured like `values`.
-    - `motion`: the `Trajectory` behind them; for a `ModalTest` or `FrequencyResponseTest`, the `LinearSystem`.
+    - `motion`: the `Trajectory` behind them; for a `ModalTest` or `FrequencyResponseTest`, the `LinearSystem`; of a `Measurement`, None.
 
     ```python
     import jax.numpy as jnp
@@ -41,7 +41,7 @@ class Prediction(NamedTuple):
     standard_errors: PyTree
     lower: PyTree
     upper: PyTree
-    motion: Trajectory | LinearSystem
+    motion: Trajectory | LinearSystem | None
 
 
 def predicted(problem: Problem, x: np.ndarray, covariance: Any, experiment: Experiment, t: float) -> Prediction:
@@ -64,7 +64,7 @@ def predicted(problem: Problem, x: np.ndarray, covariance: Any, experiment: Expe
     return Prediction(values, standard_errors, lower, upper, _motion(single.model, free.insert(free.theta(y)), one))
 
 
-def predicted_test(problem: Problem, x: np.ndarray, covariance: Any, test: LinearTest, t: float) -> Prediction:
+def predicted_test(problem: Problem, x: np.ndarray, covariance: Any, test: Test, t: float) -> Prediction:
     """The same of a test; of complex values the ends are those of both parts."""
     free = problem.free
     y = jnp.asarray(x[: free.size])

@@ -13,11 +13,15 @@ from jaxtyping import Array, Float
 from .._motion.members import of_each
 from .._motion.results import reason_of
 from .._program.jit import compiled, numpy_for
+from .arrow import Arrow
 from .experiment import Experiment
 from .experiment_batch import ExperimentBatch, batches_of, map_batch
-from .linear_test import Evaluated, LinearTest, PreparedTest
+from .measurement import Evaluated, Prepared, Test
 from .parameters import Free
 from .residuals import Linearised, Model, evaluate_batch, linearise_batch
+
+WIDE = 4e6  # numbers in a Jacobian, from which on zeros are left out of it
+ASIDE = 0.01  # of a parameter, by which a start is moved
 
 
 @jax.tree_util.register_dataclass
@@ -60,12 +64,12 @@ class Problem:
     batches: tuple[ExperimentBatch, ...]
     scale: Any  # of the noise, in units of sigma, for robust losses
     continuity: Continuity | None = None
-    tests: tuple[PreparedTest, ...] = ()
+    tests: tuple[Prepared, ...] = ()
 
     @classmethod
-    def of(cls, model: Model, free: Free, recordings: Sequence[Experiment], tests: Sequence[LinearTest] = ()) -> "Problem":
-        """The problem of these experiments; its start is x = 0."""
-        prepared = tuple(PreparedTest.of(model.system, test, free.params) for test in tests)
+    def of(cls, model: Model, free: Free, recordings: Sequence[Experiment], tests: Sequence[Test] = ()) -> "Problem":
+        """The problem of these experiments; `params` are at x = 0."""
+        prepared = tuple(test.prepared(model.system, free.params) for test in tests)
         batches = batches_of(model.system, free.params, recordings)
         return cls(model, free, batches, np.ones((), free.start.dtype), tests=prepared)
 
@@ -85,6 +89,14 @@ class Problem:
         lower, upper = self.free.bounds
         xnp, others = numpy_for(lower, upper), np.full(self.size - self.free.size, np.inf, lower.dtype)
         return xnp.concatenate([lower, -others]), xnp.concatenate([upper, others])
+
+    @property
+    def begin(self) -> np.ndarray:
+        """Where to begin: at x = 0, or beside it where modes have one frequency there, which no derivative parts."""
+        x = np.zeros(self.size, self.free.start.dtype)
+        if any(part.test.is_singular(part.near) for part in self.tests):
+            x[: self.free.size] = np.clip(ASIDE * np.cos(np.arange(self.free.size)), *self.free.bounds)
+        return x
 
     @property
     def places(self) -> dict[int, tuple[int, int]]:
@@ -110,6 +122,8 @@ class Problem:
         slope = jnp.diag(self.free.slope(y) / self.free.prior_deviation)
         of_free = [(self.free.prior_residual(y), slope), *(test[:2] for test in tests)]
         blocks = [(r, jnp.zeros((len(r), self.size), x.dtype).at[:, : self.free.size].set(J)) for r, J in of_free]
+        if self._is_wide:
+            return self._with_arrow(blocks, parts, tests)
         for k, part in enumerate(parts):
             blocks.append((part.residuals, self._over_all_unknowns(k, np.arange(len(part.residuals)), part.jacobian)))
         gaps, gaps_J = jnp.zeros(0), jnp.zeros((0, self.size))
@@ -118,6 +132,28 @@ class Problem:
             blocks.append((self.continuity.weight * (gaps + self.continuity.dual), self.continuity.weight * gaps_J))
         residuals, jacobians = zip(*((r.ravel(), J.reshape(-1, self.size)) for r, J in blocks), strict=True)
         return Linearisation(jnp.concatenate(residuals), jnp.concatenate(jacobians), parts, gaps, gaps_J, tests)
+
+    @property
+    def _is_wide(self):
+        """Whether a Jacobian would have little but zeros in it, in too large a number."""
+        rows = sum(leaf.size for batch in self.batches for leaf in jax.tree.leaves(batch.values))
+        return rows * (self.size - self.free.size) > WIDE and sum(len(batch.members) for batch in self.batches) > 1
+
+    def _with_arrow(self, of_free, parts, tests):
+        gaps, gaps_J = jnp.zeros(0), jnp.zeros((0, self.size))
+        weight, dual = 0.0, 0.0
+        if self.continuity is not None:
+            (gaps, gaps_J), weight, dual = self._gaps(parts), self.continuity.weight, self.continuity.dual
+        columns = tuple(self.columns(k) for k in range(len(parts)))
+        first = jnp.concatenate([J for _, J in of_free])
+        jacobian = Arrow(first, tuple(part.jacobian for part in parts), columns, weight * gaps_J)
+        residuals = jnp.concatenate([*(r for r, _ in of_free), *(part.residuals.ravel() for part in parts), weight * (gaps + dual)])
+        return Linearisation(residuals, jacobian, parts, gaps, gaps_J, tests)
+
+    def columns(self, k: int) -> np.ndarray:
+        """Indices in x of what each experiment of batch k depends on, (experiments, p + unknowns)."""
+        count = len(self.batches[k].members)
+        return np.hstack([np.tile(np.arange(self.free.size), (count, 1)), self.own_columns(k, np.arange(count))])
 
     def cost(self, x: Float[Array | np.ndarray, " x"]) -> Array:
         """Half the sum of squares, without the Jacobian of the residuals: for reverse-mode differentiation."""
@@ -199,7 +235,7 @@ def linearise_starts(problem: Problem, xs: Float[Array, "starts x"]) -> Linearis
 
 
 def linearise_each(problem: Problem, xs: Float[Array, "experiments x"]) -> Linearisation:
-    """Each experiment of a problem with one batch as a problem by itself."""
+    """Each experiment of a problem with one batch as a problem by itself; each may have a `scale` of its own."""
     found = _linearise_each(problem, xs)
     return found if problem.batches[0].mesh is None else jax.tree.map(np.asarray, found)
 
@@ -208,11 +244,12 @@ def linearise_each(problem: Problem, xs: Float[Array, "experiments x"]) -> Linea
 def _linearise_each(problem, xs):
     (batch,) = problem.batches
 
-    def of_one(e, x, common):
+    def of_one(e, x_and_scale, common):
         one = dataclasses.replace(jax.tree.map(lambda leaf: leaf[None] if eqx.is_array(leaf) else leaf, e), members=(0,), mesh=None)
-        return dataclasses.replace(common, batches=(one,)).linearise(x)
+        return dataclasses.replace(common, batches=(one,), scale=x_and_scale[-1]).linearise(x_and_scale[:-1])
 
-    return map_batch(of_one, batch, xs, dataclasses.replace(problem, batches=()))
+    scales = jnp.broadcast_to(jnp.asarray(problem.scale, xs.dtype), len(xs))
+    return map_batch(of_one, batch, jnp.concatenate([xs, scales[:, None]], axis=1), dataclasses.replace(problem, batches=()))
 
 
 def size_of(problem: Problem) -> float:
@@ -245,7 +282,10 @@ def with_zero_values(model: Model, free: Free, experiment: Experiment, y: Any = 
 
 
 TOO_FEW = "fewer events happen than were measured, or what is observed is not finite."
-NOT_STEADY = "no steady state was found near which a test could be predicted, or a measured mode does not oscillate there."
+NOT_STEADY = (
+    "no steady state was found near which a test could be predicted, or a measured mode does not oscillate there, or what `predict` "
+    "returns is not finite."
+)
 
 
 def failure_of(found: Linearisation) -> str | None:

@@ -3,6 +3,7 @@
 import jax.numpy as jnp
 import numpy as np
 
+from .arrow import without
 from .levenberg_marquardt import levenberg_marquardt
 from .problem import Problem, linearise, size_of
 
@@ -33,7 +34,7 @@ def profile_end(
 
         def residuals(rest):
             found = linearise(problem, fixed.at[kept].set(rest))
-            return found.residuals, found.jacobian[:, kept], found
+            return found.residuals, without(found.jacobian, i), found
 
         if kept.size:
             limits = {"freedom": freedom, "max_steps": 50, "tolerance": 1e-4, "bounds": bounds, "size": size_of(problem)}

@@ -91,8 +91,8 @@ def regress(
     eliminates the unknown constraint forces, also nonholonomic ones. q and q̇ come from smoothing splines of all channels, including
     measured velocities and accelerations; the means of the constraints over the windows are further residuals. If the equations are linear
     in the parameters, which is checked by differentiation, one step solves them. Each equation is weighted by the inverse of the size of
-    its residuals. Windows in which dry friction may stick are left out; windows in which it only reverses are used if that lowers the
-    standard errors.
+    its residuals. Windows in which dry friction may stick are left out; windows in which it only reverses are used if that predicts all
+    windows better.
 
     **Arguments:**
 
@@ -101,19 +101,20 @@ def regress(
     - `params`: all parameters, as for `fit`; a free one that is NaN needs no starting value.
     - `free`, `bounds`: as for `fit`.
     - `width`: of the windows, a time. In narrow windows the noise of the motion biases the estimates; wide windows are few. The default is
-      the width with the smallest errors among those whose estimates agree, within their errors, with those of all wider windows.
+      the width whose estimate predicts the windows of all widths best.
 
     Units are any consistent set.
 
-    **Returns:** a `Regression`. Its standard errors come from the scatter of the windows: they account for coloured noise and for forces
-    that the model lacks, but not for a bias common to all windows. If noise is all that is wrong, estimates of `fit` are more accurate.
+    **Returns:** a `Regression`. Its standard errors come from the scatter of the windows, and of estimates from other widths that predict
+    as well: they account for coloured noise and for forces that the model lacks, but not for a bias common to all. If noise is all that
+    is wrong, estimates of `fit` are more accurate.
 
     **Raises:** `ValueError` if the system has further states, `free` names no parameter, the equations contain only ratios of the
     parameters, the sensors do not see the motion, or they have a delay; if `width` is not positive, or fits no window into the records.
 
     **Source:** Shinbrot, Trans. ASME 79 (1957) 582 (method of modulating functions); Messenger & Bortz, J. Comput. Phys. 443 (2021)
-    110525 (weak form); Gautier & Khalil, IEEE Trans. Robot. Autom. 6 (1990) 368; Goldenshluger & Nemirovski, Math. Methods Stat. 6
-    (1997) 135 (choice of the width); Newey & West, Econometrica 55 (1987) 703 (standard errors).
+    110525 (weak form); Gautier & Khalil, IEEE Trans. Robot. Autom. 6 (1990) 368; Stone, J. R. Stat. Soc. B 36 (1974) 111 (choice by
+    prediction); Newey & West, Econometrica 55 (1987) 703 (standard errors).
 
     ```python
     import jax.numpy as jnp

@@ -95,7 +95,9 @@ def on_no_freedom(measurements: int, unknowns: int) -> list[str]:
     """At least as many unknowns as measurements."""
     if unknowns < measurements:
         return []
-    return [f"there are {unknowns} unknowns for {measurements} measurements: none is left over that could contradict the model"]
+    are, some = ("is", "unknown") if unknowns == 1 else ("are", "unknowns")
+    of = "measurement" if measurements == 1 else "measurements"
+    return [f"there {are} {unknowns} {some} for {measurements} {of}: none is left over that could contradict the model"]
 
 
 def on_exact(channels: Mapping[str, int]) -> list[str]:

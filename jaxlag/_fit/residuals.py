@@ -1,14 +1,17 @@
 """Predicted measurements of an experiment, their residuals, and the Jacobians of these."""
 
 import dataclasses
+import inspect
+from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
-from jaxtyping import Array, PyTree
+from jaxtyping import PyTree
 
 from .._model.injection import call
+from .._model.recorded import refuse_unknown
 from .._model.system import System
 from .._motion.results import RESULTS
 from .._motion.simulate import simulate
@@ -17,6 +20,9 @@ from .experiment import with_own
 from .experiment_batch import ExperimentBatch, map_batch
 from .parameters import Free
 from .robust_loss import Huber
+
+NUMERICS = tuple(name for name, p in inspect.signature(simulate).parameters.items() if p.kind is p.KEYWORD_ONLY)
+OPTIONS = "Such options are `solver`, `rtol`, `atol`, `stabilisation` and `friction`."
 
 
 @jax.tree_util.register_dataclass
@@ -28,15 +34,19 @@ class Model:
     numerics: tuple[tuple[str, Any], ...] = dataclasses.field(metadata={"static": True})
     loss: Huber | None = dataclasses.field(metadata={"static": True})
 
+    @classmethod
+    def of(cls, system: System, numerics: Mapping[str, Any], loss: Huber | None = None) -> "Model":
+        """With options of `simulate`; all others are refused."""
+        for name in sorted(set(numerics) - set(NUMERICS)):
+            raise TypeError(f"`{name}` must be an argument of this function or an option of `simulate`, but is neither. {OPTIONS}")
+        return cls(system, tuple(sorted(numerics.items())), loss)
+
     def predicted(self, params: PyTree, e: ExperimentBatch, z: Any) -> tuple[PyTree, Trajectory]:
         """The predicted measurements of one experiment, and the motion behind them."""
         q0, qdot0, own = e.start(z)
         params = with_own(params, own)
-        ts = e.ts
-        if e.delay is not None:
-            delay = call(e.delay, "`delay`", params) if callable(e.delay) else e.delay
-            delayed = ts - jnp.asarray(delay, ts.dtype)
-            ts = jnp.concatenate([ts[:1], jnp.where(delayed > ts[0], delayed, ts[0])])
+        late = _delays(e, params)
+        ts, rows = _sampled(e.ts, late)
         motion = simulate(self.system, q0, qdot0, ts, params, **{**dict(self.numerics), "throw": False})
 
         def seen(t, q, qdot, qddot, multipliers, states):
@@ -44,17 +54,42 @@ class Model:
             return call(e.observe, "`observe`", params, **state, **states, states=states)
 
         channels = jax.vmap(seen)(motion.ts, motion.q, motion.qdot, motion.qddot, motion.multipliers, motion.states)
-        channels = channels if e.delay is None else jax.tree.map(lambda x: x[1:], channels)
-        return (channels | self._times(e, motion) if e.events else channels), motion
+        if isinstance(e.delay, tuple):
+            refuse_unknown(late, {**channels, **dict.fromkeys(e.events)} if isinstance(channels, Mapping) else channels)
+            channels = {name: x[rows[name if name in late else ALL]] for name, x in channels.items()}
+        elif late:
+            channels = jax.tree.map(lambda x: x[rows[ALL]], channels)
+        return (channels | _times(e, motion, late) if e.events else channels), motion
 
-    def _times(self, e: ExperimentBatch, motion: Trajectory) -> dict[str, Array]:
-        """When events happen, in rows of the length of the samples; NaN beyond the last."""
-        for name in e.events:
-            if name not in motion.events:
-                there = ", ".join(motion.events) or "none"
-                raise ValueError(f"`events` must name events of the system, but holds {name!r}. There are {there}.")
-        times = {name: motion.events[name].ts[: e.ts.size] for name in e.events}
-        return {name: jnp.concatenate([ts, jnp.full(e.ts.size - ts.size, jnp.nan, ts.dtype)]) for name, ts in times.items()}
+
+ALL = ""  # stands for all channels that have no delay of their own
+
+
+def _delays(e, params):
+    """The delays by channel."""
+    given = e.delay if isinstance(e.delay, tuple) else () if e.delay is None else ((ALL, e.delay),)
+    return {name: call(delay, "`delay`", params) if callable(delay) else delay for name, delay in given}
+
+
+def _sampled(ts, late):
+    """The times, in order, at which the motion is wanted, and by channel those of them that are its samples."""
+    if not late:
+        return ts, {}
+    delayed = [ts - jnp.asarray(delay, ts.dtype) for delay in ({ALL: 0.0} | late).values()]
+    times = jnp.concatenate([ts[:1], *(jnp.where(one > ts[0], one, ts[0]) for one in delayed)])
+    order = jnp.argsort(times)
+    places = jnp.argsort(order)[1:].reshape(-1, ts.size)
+    return times[order], dict(zip({ALL: 0.0} | late, places, strict=True))
+
+
+def _times(e, motion, late):
+    """When events happen, in rows of the length of the samples; NaN beyond the last."""
+    for name in e.events:
+        if name not in motion.events:
+            there = ", ".join(motion.events) or "none"
+            raise ValueError(f"`events` must name events of the system, but holds {name!r}. There are {there}.")
+    times = {name: motion.events[name].ts[: e.ts.size] + late.get(name, 0.0) for name in e.events}
+    return {name: jnp.concatenate([ts, jnp.full(e.ts.size - ts.size, jnp.nan, ts.dtype)]) for name, ts in times.items()}
 
 
 class Evaluation(NamedTuple):

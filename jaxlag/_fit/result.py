@@ -15,7 +15,7 @@ from .channel_sigma import sigmas_of
 from .channels import Channel
 from .experiment import Experiment
 from .fit_card import card, estimates_by_name, unit_of
-from .linear_test import LinearTest
+from .measurement import Test
 from .prediction import Prediction, predicted, predicted_test
 from .problem import Problem
 from .profile_likelihood import profile_end
@@ -76,8 +76,9 @@ class Fit:
     - `sigma`: σ̂, in units of the given sigma; if none was given, the geometric mean of those of the channels, in units of the
       measurements. `sigmas`: for each experiment, one for each channel, estimated or given; structured like a row of its values.
       `absolute`: whether sigma was given.
-    - `cost`: ½ Σ r² at the estimates; `measurements`: N; `unknown_count`: the number of determined unknowns, of parameters and experiments;
-      `exact`: the number of measurements in channels that are predicted exactly.
+    - `misfit`: −2 ln L of the data, up to a constant; priors are no part of it. `cost`: ½ Σ r² at the estimates; `measurements`: N;
+      `unknown_count`: the number of determined unknowns, of parameters and experiments; `exact`: the number of measurements in channels
+      that are predicted exactly; `freedom_of_channels`: the degrees of freedom of intervals where channels have sigmas of their own.
     - `converged`; `reason`: why the iteration ended; `steps`: the number of steps; `costs`: the cost at the start and after each step.
     - `led_in`: the steps by which the start was found, if it was not `params` (`Regress`).
     - `problem`, `x`, `x_covariance`: the least-squares problem, all its unknowns at the minimum, and their covariance divided by σ̂².
@@ -99,7 +100,7 @@ class Fit:
     ```
     """
 
-    experiments: tuple[Experiment | LinearTest, ...]
+    experiments: tuple[Experiment | Test, ...]
     params: PyTree
     estimates: dict[str, PyTree]
     standard_errors: dict[str, PyTree]
@@ -129,7 +130,9 @@ class Fit:
     inflation: Float[np.ndarray, " p"]
     correlated: int
     led_in: tuple[str, ...] = ()
+    misfit: float = np.nan
     exact: int = 0
+    freedom_of_channels: float = np.inf
 
     if TYPE_CHECKING:  # put here by `jaxlag.plot`
         plot: ClassVar[Callable[..., Any]]
@@ -149,12 +152,6 @@ class Fit:
     def white_standard_errors(self) -> dict[str, PyTree]:
         """The standard errors as if residuals were white, structured like `estimates`."""
         return self.problem.free.by_name(np.sqrt(np.diag(self.covariance)) / self.inflation)
-
-    @property
-    def misfit(self) -> float:
-        """−2 ln L, up to a constant that depends on the data only. Priors are no part of the likelihood."""
-        squares = 2 * self.cost - float(np.sum(np.asarray(self.problem.free.prior_residual(self.x[: len(self.names)])) ** 2))
-        return squares if self.absolute else self.measurements * float(np.log(squares / self.measurements))
 
     @property
     def aic(self) -> float:
@@ -182,7 +179,9 @@ class Fit:
             raise ValueError(f"`level` must lie between 0 and 1, but is {level:g}. Use e.g. 0.95.")
         from scipy import special
 
-        return float(special.ndtri(0.5 + level / 2) if self.absolute else special.stdtrit(max(self.freedom, 1), 0.5 + level / 2))
+        if self.absolute:
+            return float(special.ndtri(0.5 + level / 2))
+        return float(special.stdtrit(max(min(self.freedom, self.freedom_of_channels), 1), 0.5 + level / 2))
 
     def interval(self, name: str, level: float = 0.95, *, profile: bool = False) -> Interval:
         """The confidence interval of one parameter.
@@ -228,7 +227,7 @@ class Fit:
         )
         return lower, upper
 
-    def predict(self, experiment: Experiment | LinearTest, *, level: float = 0.95) -> Prediction:
+    def predict(self, experiment: Experiment | Test, *, level: float = 0.95) -> Prediction:
         """What another experiment should show, with the confidence band due to the uncertainty of the parameters.
 
         **Arguments:** `experiment`: its start is taken as exact; its `values` may be None. Or a `ModalTest` or `FrequencyResponseTest`.
@@ -239,7 +238,7 @@ class Fit:
         **Raises:** `ValueError` if the motion cannot be computed, or `level` is out of range.
         """
         covariance = self.sigma_scale**2 * self.x_covariance
-        of = predicted_test if isinstance(experiment, LinearTest) else predicted
+        of = predicted_test if isinstance(experiment, Test) else predicted
         return of(self.problem, self.x, covariance, experiment, self.quantile(level))  # type: ignore[operator]
 
     def to_dict(self, *, level: float = 0.95) -> dict[str, Any]:

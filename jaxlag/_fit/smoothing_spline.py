@@ -56,7 +56,7 @@ def smooth(experiment: Experiment, params: Any, at: np.ndarray | None = None) ->
 def _cross_validated(sensors, ts):
     """The splines with the least score, and their coefficients."""
     measured = int(np.sum(np.isfinite(sensors.measured)))
-    most = max(4, int(MOST_INTERVALS * min(len(ts), measured / sensors.n)))
+    most = max(4, int(MOST_INTERVALS * min(len(np.unique(ts)), measured / sensors.n)))
     found = {}
 
     def attempt(intervals):
@@ -150,7 +150,7 @@ class _Splines:
     """A basis of splines whose knots are quantiles of the times; values and derivatives are B_d C with coefficients C (splines, n)."""
 
     def __init__(self, ts, intervals):
-        knots = np.quantile(ts, np.linspace(0, 1, intervals + 1))
+        knots = np.quantile(np.unique(ts), np.linspace(0, 1, intervals + 1))
         self.ts, self.intervals, self.interval = ts, intervals, (ts[-1] - ts[0]) / intervals
         self.knots = np.concatenate([np.full(DEGREE, knots[0]), knots, np.full(DEGREE, knots[-1])])
         self.count = len(self.knots) - DEGREE - 1

@@ -9,16 +9,17 @@ from typing import Any
 import jax
 import numpy as np
 
+from .arrow import transposed
 from .autocorrelation import independent_samples
-from .channel_sigma import predicted_exactly, too_short
+from .channel_sigma import freedom_of_channels, neg2_log_likelihood, predicted_exactly, sigmas_of, too_short
 from .channels import channels_of
 from .doubt import PARTNERS, doubt_of
 from .experiment import Experiment
 from .experiment_statistics import deciding, ended_inputs, own_estimates, predictions_of, with_estimates
 from .identifiability import correlation_of
-from .levenberg_marquardt import CONVERGED, INTERRUPTED, KINKED, REASONS, STEP_LIMIT, UNRELATED, Outcome
-from .linear_test import in_given_order
+from .levenberg_marquardt import CONVERGED, INTERRUPTED, KINKED, REASONS, STALLED, STEP_LIMIT, UNRELATED, Outcome
 from .linear_test_statistics import channels_of_test, doubts, predicted_tests
+from .measurement import in_given_order
 from .minimum import Minimum
 from .multiple_shooting import Segments
 from .parameter_stability import different_halves
@@ -72,6 +73,7 @@ def _noise(minimum: Minimum, uncertainty: Uncertainty) -> Fields:
     squares = np.sum(np.asarray(minimum.found.residuals)[: beside + minimum.flat.size] ** 2)
     exact = 0 if minimum.absolute else sum(predicted_exactly(minimum.problem, minimum.found).values())
     sigma = _sigma(r, minimum.problem, max(minimum.measurements - exact - unknown_count, 0))
+    priors = float(np.sum(np.asarray(minimum.found.residuals)[: minimum.size] ** 2))
     return {
         "exact": exact,
         "measurements": minimum.measurements,
@@ -80,7 +82,18 @@ def _noise(minimum: Minimum, uncertainty: Uncertainty) -> Fields:
         "sigma": sigma,
         "sigmas": _sigmas(minimum, sigma),
         "cost": float(squares / 2),
+        **_likelihood(minimum, float(squares) - priors),
     }
+
+
+def _likelihood(minimum, squares):
+    """−2 ln L of the data, from the sum of squares of residuals over sigma; degrees of freedom where channels have sigmas of their own."""
+    if minimum.absolute:
+        return {"misfit": squares}
+    if minimum.problem.model.loss is not None or len(sigmas_of(minimum.problem)) == 1 or minimum.found.jacobian is None:
+        return {"misfit": minimum.measurements * float(np.log(squares / minimum.measurements))}
+    at = minimum.problem, minimum.found
+    return {"misfit": neg2_log_likelihood(*at), "freedom_of_channels": freedom_of_channels(*at)}
 
 
 def _sigma(r, problem, freedom):
@@ -160,7 +173,7 @@ def _remarks(minimum, uncertainty, sigma, channels, unknowns):
         found = undetermined_parameters(minimum, uncertainty)
         remarks = [] if found is None else on_undetermined(free.entries, found, deciding(minimum) if found.idle else {})
         r = np.nan_to_num(np.asarray(minimum.found.residuals), posinf=0.0)  # of a motion that could not be computed
-        at_bounds = list(on_bounds(free, minimum.theta, r @ np.asarray(minimum.found.jacobian)[:, :p]))
+        at_bounds = list(on_bounds(free, minimum.theta, np.asarray(transposed(minimum.found.jacobian, r))[:p]))
     times_noise = sigma if minimum.absolute else 1.0
     independent = independent_samples(minimum.measurements, uncertainty.correlated)
     unfinished = int(minimum.outcome.best.status) in (STEP_LIMIT, INTERRUPTED)  # halves are compared at a minimum
@@ -189,7 +202,13 @@ def _end(minimum: Minimum, doubt: str) -> Fields:
     status = int(outcome.best.status)
     if status in (CONVERGED, STEP_LIMIT) and _relative_size(minimum) > UNRELATED_SIZE:
         status = UNRELATED
-    reason = doubt if status == CONVERGED and doubt else PARTNERS if status == KINKED and not minimum.recordings else REASONS[status]
+    reason = (
+        doubt
+        if status in (CONVERGED, STALLED, KINKED) and doubt
+        else PARTNERS
+        if status == KINKED and not minimum.recordings
+        else REASONS[status]
+    )
     return {"converged": status == CONVERGED and not doubt, "reason": reason, "steps": outcome.steps, "costs": outcome.costs}
 
 

@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from .arrow import Arrow, gathered, norms
 from .autocorrelation import autoregression, coloured_information, correlation_length
 from .identifiability import Determined, Undetermined, determined_by, undetermined
 from .minimum import Minimum
@@ -19,7 +20,7 @@ class Uncertainty(NamedTuple):
     """
 
     known: Determined
-    jacobian: np.ndarray | None
+    jacobian: Arrow | None
     inflation: np.ndarray
     correlated: int
 
@@ -31,7 +32,7 @@ def uncertainty_of(minimum: Minimum) -> Uncertainty:
     if J is None:
         known = Determined(np.full((size, size), np.nan), np.ones(size, bool), np.zeros((size, 0)))
         return Uncertainty(known, None, np.ones(p), 0)
-    known = determined_by(J, np.asarray(minimum.found.gaps_jacobian))
+    known = determined_by(gathered(J), np.asarray(minimum.found.gaps_jacobian))
     covariance, correlated = sandwich(minimum, J, known.covariance, _influences(minimum))
     np.fill_diagonal(covariance, np.maximum(np.diag(covariance), 0))  # where nothing is determined, rounding may leave less
     after, before = (np.diag(c)[:p] for c in (covariance, known.covariance))
@@ -41,13 +42,16 @@ def uncertainty_of(minimum: Minimum) -> Uncertainty:
 
 def _jacobian(minimum):
     """Of priors, tests and residuals; those of a robust loss as if it were quadratic."""
-    if minimum.found.jacobian is None:
+    problem, found, loss = minimum.problem, minimum.found, minimum.problem.model.loss
+    if found.jacobian is None:
         return None
-    beside, flat, loss = minimum.problem.beside, minimum.flat, minimum.problem.model.loss
-    J = np.asarray(minimum.found.jacobian)[: beside + flat.size].copy()
+    blocks = [np.asarray(part.jacobian).astype(float) for part in found.batches]
     if loss is not None:
-        J[beside:] /= loss.slope(np.where(np.isfinite(flat), flat, 0) / minimum.problem.scale)[:, None]
-    return J
+        slopes = [loss.slope(np.nan_to_num(r) / problem.scale) for r in minimum.weighted]
+        blocks = [J / np.asarray(slope)[:, :, None] for J, slope in zip(blocks, slopes, strict=True)]
+    beside = found.jacobian.first if isinstance(found.jacobian, Arrow) else found.jacobian[: problem.beside]
+    columns = tuple(problem.columns(k) for k in range(len(blocks)))
+    return Arrow(np.asarray(beside).astype(float), tuple(blocks), columns, np.zeros((0, minimum.x.size)))
 
 
 def _influences(minimum):
@@ -56,32 +60,34 @@ def _influences(minimum):
     return minimum.weighted if loss is None else [np.asarray(loss.influence(r / minimum.problem.scale)) for r in minimum.weighted]
 
 
-def sandwich(minimum: Minimum, J: np.ndarray, covariance: np.ndarray, weighted: list[np.ndarray]) -> tuple[np.ndarray, int]:
+def sandwich(minimum: Minimum, J: Arrow, covariance: np.ndarray, weighted: list[np.ndarray]) -> tuple[np.ndarray, int]:
     """The covariance over σ² of what the columns of J belong to, with the sandwich where residuals are correlated; and over how many
     samples they are. `weighted`: the residuals of each batch, like those of the minimum; `covariance`: as if they were white.
     """
-    beside = minimum.problem.beside
-    begins = beside + np.cumsum([0, *(r.size for r in weighted)])
-
-    def of_experiment(segments, rows_of):
-        """Rows of its segments one after the other, (samples, channels, ...)."""
-        return np.concatenate([_by_time(minimum.problem.batches[k], rows_of(k, row), n) for k, row, n in segments])
-
-    def jacobian_of(k, row):
-        begin = begins[k] + row * weighted[k].shape[1]
-        return J[begin : begin + weighted[k].shape[1]].astype(float)
-
-    segments_of_each = minimum.segments_of_each()
-    series = [of_experiment(segments, lambda k, row: weighted[k][row].astype(float)) for segments in segments_of_each]
+    batches, segments_of_each = minimum.problem.batches, minimum.segments_of_each()
+    series = [np.concatenate([_by_time(batches[k], weighted[k][row].astype(float), n) for k, row, n in of]) for of in segments_of_each]
     lengths = [correlation_length(autoregression(r[np.isfinite(r)]), len(r)) for rs in series for r in rs.T]
     if not any(lengths):
         return covariance, 0
     power = np.nanmean(np.concatenate([r.ravel() for r in series]) ** 2)
-    middle = J[:beside].T @ J[:beside]
+    middle = J.first.T @ J.first
     for segments, r in zip(segments_of_each, series, strict=True):
         sizes = np.ones(r.shape[1]) if minimum.absolute else np.sqrt(np.nanmean(r**2, axis=0) / power)
-        middle = middle + coloured_information(of_experiment(segments, jacobian_of), r, sizes)
+        columns, slopes = _of_experiment(batches, J, segments)
+        middle[np.ix_(columns, columns)] += coloured_information(slopes, r, sizes)
     return covariance @ middle @ covariance, max(lengths)
+
+
+def _of_experiment(batches, J, segments):
+    """The columns on which an experiment depends, and its rows, those of its segments one after the other, (samples, channels, columns)."""
+    columns = np.unique(np.concatenate([J.columns[k][row] for k, row, _ in segments]))
+    rows = []
+    for k, row, n in segments:
+        own = _by_time(batches[k], J.blocks[k][row], n)
+        wide = np.zeros((*own.shape[:2], columns.size))
+        wide[:, :, np.searchsorted(columns, J.columns[k][row])] = own
+        rows.append(wide)
+    return columns, np.concatenate(rows)
 
 
 def _by_time(batch, flat, samples):
@@ -101,9 +107,9 @@ def undetermined_parameters(minimum: Minimum, uncertainty: Uncertainty) -> Undet
     elsewhere = jnp.asarray(minimum.x).at[:p].add(0.1 * jnp.cos(jnp.arange(p)))
     found = linearise(minimum.problem, elsewhere)
     if failure_of(found) is None:
-        J = np.asarray(found.jacobian)[: len(found.residuals) - len(found.gaps)]
-        there = determined_by(J, np.asarray(found.gaps_jacobian), hidden=null.shape[1])
+        J = gathered(found.jacobian)
+        there = determined_by(np.asarray(J)[: len(J) - len(found.gaps)], np.asarray(found.gaps_jacobian), hidden=null.shape[1])
         nulls.append(np.asarray(free.slope(elsewhere[:p]))[:, None] * there.null[:p])
         thetas.append(np.asarray(free.theta(elsewhere[:p])))
-    idle = np.flatnonzero(~np.any(uncertainty.jacobian[:, :p], axis=0)).tolist()
+    idle = np.flatnonzero(norms(uncertainty.jacobian)[:p] == 0).tolist()
     return undetermined(minimum.theta, nulls, thetas, idle)

@@ -14,43 +14,38 @@ from .weak_form import Record
 from .window_scatter import COLOUR, OVERLAP, scatter
 from .windows import APART
 
-TINY = 1e-20  # of a term: its variation counts as none
 CANCELLED = 1e4  # roundings of terms that are subtracted, integrated over windows in which they cancel
 ROUNDING = 1e-9  # of the terms of an equation, what is left of them
 ROUNDS = 3  # of weighting the equations by their residuals
+ENOUGH = 1000  # windows of a record, by which an estimate is judged
 
 
 class Estimate(NamedTuple):
-    """y from so many `windows`, and its standard errors: infinite where y is not determined.
+    """y from so many `windows`, its covariance, and its standard errors: infinite where y is not determined.
 
-    `spare`: how many windows could be left out if none overlapped and y were to be determined still. `explained`: the logarithm of
-    how much larger the variations of the known terms are than the residuals, on average over the equations.
+    `spare`: how many windows could be left out if none overlapped and y were to be determined still.
     """
 
     half: float
     near_rest: float  # the largest part of a window that was near rest
     y: np.ndarray
+    covariance: np.ndarray
     errors: np.ndarray
     windows: int
     spare: float
-    explained: float
-
-    @property
-    def intervals(self) -> np.ndarray:
-        """Half the lengths of the 95 % intervals, by the distribution of Student: long where there are few windows."""
-        from scipy import special  # SciPy is a dependency of JAX; imported here because that takes a while
-
-        return special.stdtrit(self.spare, 0.975) * self.errors
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Problem:
-    """Records and the free parameters; `terms` of a record at y, with their Jacobian; whether they are `linear` in y."""
+    """Records and the free parameters; `terms` of a record at y, with their Jacobian; whether they are `linear` in y; what is `kept` of
+    the windows of each width.
+    """
 
     records: Sequence[Record]
     free: Free
     linear: bool
     terms: Sequence[Callable[[Any], tuple[np.ndarray, np.ndarray]]]
+    kept: dict[float, tuple] = dataclasses.field(default_factory=dict)
 
     @classmethod
     def of(cls, records: Sequence[Record], free: Free, linear: bool) -> "Problem":
@@ -59,9 +54,7 @@ class Problem:
 
     def estimate(self, half: float, near_rest: float, y: np.ndarray) -> Estimate | None:
         """From windows of this half width, of which no larger part is near rest; None where there are fewer than parameters."""
-        windows = [record.windows(half) for record in self.records]
-        used = [w.near_rest <= near_rest for w in windows]
-        residuals = self._integrated(windows, used)
+        windows, used, residuals = self._integrated(half, near_rest)
         parts = residuals(y)
         count, equations = sum(len(r) for r, _ in parts), self.records[0].form.motion[0].shape[1]
         spare = max(APART * count - self.free.size / equations, APART)
@@ -73,22 +66,43 @@ class Problem:
             y = (self._solve_linear if self.linear else self._solve_nonlinear)(residuals, weights, y)
             parts = residuals(y)
             weights = [_one_over(_rms(r), size) for (r, _), size in zip(parts, sizes, strict=True)]
-        errors = self._errors(parts, weights, windows, used)
-        return Estimate(half, near_rest, y, errors, count, spare, self._explained(parts, weights, y) + np.log(spare / (APART * count)))
+        covariance, determined = self._covariance(parts, weights, windows, used)
+        errors = np.where(determined, np.sqrt(np.maximum(np.diag(covariance), 0)), np.inf)
+        return Estimate(half, near_rest, y, covariance, errors, count, spare)
 
-    def _integrated(self, windows, used):
-        """The residuals of the windows that are used, (K, n + m) for each record, and their Jacobian, as a function of y."""
+    def unexplained(self, half: float, near_rest: float, found: Estimate) -> np.ndarray:
+        """For each equation the mean square of its residuals with an estimate from windows of any width, and the variance by the error
+        of the estimate, over the mean square of its terms, (n + m,).
+        """
+        parts = [tuple(x[:: max(len(x) // ENOUGH, 1)] for x in part) for part in self._integrated(half, near_rest)[2](found.y)]
+        r, J = (np.concatenate([part[i] for part in parts]) for i in (0, 1))
+        variance = np.einsum("kcp,pq,kcq->c", J, found.covariance, J, optimize=True) / len(J)
+        size = self._sizes(r, J, found.y)
+        return (_rms(r) ** 2 + variance) / np.where(size > 0, size, 1) ** 2
+
+    def _integrated(self, half, near_rest):
+        """The windows of each record; which of them are used; their residuals, (K, n + m) for each record, and the Jacobian of these, as
+        a function of y.
+        """
+        if half not in self.kept:
+            self.kept[half] = self._of_all_windows(half)
+        windows, residuals = self.kept[half]
+        used = [w.near_rest <= near_rest for w in windows]
+        return windows, used, lambda y: [(r[u], J[u]) for (r, J), u in zip(residuals(y), used, strict=True)]
+
+    def _of_all_windows(self, half):
+        """Of linear equations the integrals are kept, and not the sums by which they are found."""
+        windows = [record.windows(half) for record in self.records]
 
         def at(y):
-            return [
-                tuple(w.integrals(*record.parts(x))[u] for x in terms(y))
-                for record, terms, w, u in zip(self.records, self.terms, windows, used, strict=True)
-            ]
+            along = zip(self.records, self.terms, windows, strict=True)
+            return [tuple(w.integrals(*record.parts(x)) for x in terms(y)) for record, terms, w in along]
 
-        if not self.linear:
-            return at
-        origin = at(np.zeros(self.free.size))
-        return lambda y: [(r + J @ y, J) for r, J in origin]
+        if self.linear:
+            origin = at(np.zeros(self.free.size))
+            return [w.without_sums() for w in windows], lambda y: [(r + J @ y, J) for r, J in origin]
+        begin = self._scales(np.zeros(self.free.size), half)[0]
+        return windows, lambda y: [_over(begin, *self._scales(y, half), *part) for part in at(y)]
 
     def _solve_linear(self, residuals, weights, y):
         """In one step; what is not determined keeps its value."""
@@ -110,6 +124,17 @@ class Problem:
         found = levenberg_marquardt(linearise, jnp.asarray(y), freedom=freedom, max_steps=100, tolerance=1e-3, bounds=self.free.bounds)
         return np.asarray(found.best.y)
 
+    def _scales(self, y, half):
+        """The size of the terms of each equation of motion, of momentum over half a window and force, (n,), and its slope, (n, p)."""
+        square, slope = 0.0, 0.0
+        for record, terms in zip(self.records, self.terms, strict=True):
+            value, J = terms(y)
+            for x, dx, unit in zip(record.parts(value)[:2], record.parts(J)[:2], (half, 1.0), strict=True):
+                square = square + np.mean(x**2, axis=0) / unit**2
+                slope = slope + np.mean(x[:, :, None] * dx, axis=0) / unit**2
+        size = np.sqrt(np.where(square > 0, square, 1))
+        return size, slope / size[:, None]
+
     def _sizes(self, r, J, y):
         """Of the terms of each equation, (n + m,), in its unit. Where the equations are linear, of those without a free parameter, and of
         the others with parameters as large as they can be beside these: a start, which may be 1 in any unit, has no part in it.
@@ -128,18 +153,10 @@ class Problem:
 
     def _from_zero(self, y):
         """y as counted from where all free parameters are zero."""
-        return np.asarray(self.free.theta(jnp.asarray(y)) / self.free.slope(jnp.asarray(y)))
+        return np.asarray(self.free.start / self.free.scale) + y
 
-    def _explained(self, parts, weights, y):
-        """Terms without a free parameter against the residuals, whose size is one over the weight."""
-        here = self._from_zero(y)
-        known = [(r - J @ here) * w for (r, J), w in zip(parts, weights, strict=True)]
-        varies = np.mean([np.var(x, axis=0) for x in known if len(x)], axis=0)
-        there = varies > TINY * np.mean([np.mean(x**2, axis=0) for x in known if len(x)], axis=0)
-        return float(np.mean(np.log(varies[there]))) if there.any() else 0.0
-
-    def _errors(self, parts, weights, windows, used):
-        """Standard errors by the scatter of the windows."""
+    def _covariance(self, parts, weights, windows, used):
+        """By the scatter of the windows; and which entries of y are determined."""
         known = determined_by(_stacked(parts, weights)[1], np.zeros((0, self.free.size)))
         spread, lags = [], []
         for (r, J), weight, record, w, u in zip(parts, weights, self.records, windows, used, strict=True):
@@ -148,14 +165,31 @@ class Problem:
             spread.append((all_r, all_J))
             correlated = max(OVERLAP * w.half, COLOUR * (record.span[1] - record.span[0]))
             lags.append(1 + int(np.ceil(correlated / (APART * w.half))))
-        return np.where(known.determined, np.sqrt(np.diag(scatter(known.covariance, spread, lags))), np.inf)
+        return scatter(known.covariance, spread, lags), known.determined
 
 
 def _terms(record, free, linear):
     if not linear:
-        return lambda y: record.form.linearised(free, jnp.asarray(y))
+        last: dict[bytes, tuple] = {}
+
+        def at(y):
+            key = np.asarray(y).tobytes()
+            if key not in last:
+                last.clear()
+                last[key] = record.form.linearised(free, jnp.asarray(y))
+            return last[key]
+
+        return at
     value, J = record.form.linearised(free, jnp.zeros(free.size))
     return lambda y: (value + J @ y, J)
+
+
+def _over(begin, size, slope, r, J):
+    """Residuals over the size of the terms, in units of that at the start: parameters for which all terms vanish solve no equation."""
+    n = len(size)
+    ratio, falls = np.ones(r.shape[1]), np.zeros(J.shape[1:])
+    ratio[:n], falls[:n] = begin / size, slope / size[:, None]
+    return r * ratio, (J - r[:, :, None] * falls) * ratio[:, None]
 
 
 def _rms(x):

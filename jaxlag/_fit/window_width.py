@@ -1,4 +1,4 @@
-"""The width of the windows, chosen by the data."""
+"""The width of the windows, chosen by how well an estimate predicts windows of all widths."""
 
 from collections.abc import Sequence
 
@@ -11,58 +11,43 @@ GROWTH = 1.4  # from one width to the next that is tried
 WIDEST = 0.25  # half a window, as a part of the longest record
 NARROWEST = 2.0  # intervals between samples in half a window
 SPARE = 3  # windows that do not overlap, beyond those needed, from which on standard errors can be trusted
-ROUNDING = 1e-13  # of a parameter
-HOPELESS = 4.0  # a fall of what is explained, to noise seven times as large, from which on narrower windows are not tried
 SLIDING, REVERSING = 0.0, 0.4  # the largest part of a window near rest: where friction slides, and where it may reverse
-STICKS = 2.0  # a growth of the intervals by windows in which friction may reverse, which means that it sticks there
+NEGLIGIBLE = 0.003  # of the size of an equation's terms: residuals below it count as that
+ALIKE = 0.8  # of the signal-to-noise ratio of the best: estimates that predict as well, whose scatter is part of its error
 
 
 def best_estimate(problem: Problem, halves: np.ndarray) -> Estimate | None:
-    """The best estimate from windows of these half widths, the widest first: of those in which friction may reverse, unless it sticks
-    there. None where windows are too few.
-
-    Where friction sticks its force is unknown, so that windows scatter: those in which it only slides are then used alone.
-    """
-    y = np.zeros(problem.free.size)
-    sliding = _best_width(problem, halves, SLIDING, y)
-    if all(np.all(record.moves) for record in problem.records):
-        return sliding
-    reversing = _best_width(problem, halves, REVERSING, y if sliding is None else sliding.y)
-    if reversing is None or sliding is None or sliding.spare < SPARE:
-        return reversing or sliding
-    undetermined, size = np.subtract(_uncertainty(reversing), _uncertainty(sliding))
-    sticks = undetermined > 0 or (undetermined == 0 and size > y.size * np.log(STICKS))
-    return sliding if sticks or not _agree(sliding, reversing) else reversing
-
-
-def _best_width(problem, halves, near_rest, y):
-    """The estimate with the smallest 95 % intervals among those that agree with all that explain more.
+    """The best estimate from windows of these half widths, the widest first; None where windows are too few.
 
     In narrow windows the noise is large, in windows of many oscillations the terms average to nothing; in both cases noise in the motion
-    draws estimates towards zero, with standard errors that know nothing of it. In between they do not depend on the width. The more of
-    the known terms is explained, the smaller the noise in the equations is, and so the bias: in this order the intervals are compared, as
-    those of wider and wider windows are by Goldenshluger and Nemirovski.
+    draws estimates towards zero. In windows of steady motion some terms do not vary. In those where friction sticks its force is
+    unknown. Standard errors of one width know nothing of all that, but windows of other widths contradict it. So the best estimate is
+    the one with the largest ratio of signal to noise on average over all widths: of the terms of the equations to what is left of them,
+    to which the error of the prediction is added. Where estimates that are as good scatter by more than their standard errors allow, as
+    they do where the model misses something, the error grows by that scatter.
 
-    **Source:** Goldenshluger & Nemirovski, Math. Methods Stat. 6 (1997) 135 (the intersection of confidence intervals); Fuller,
-    Measurement Error Models (1987), section 1.1 (attenuation).
+    **Source:** Stone, J. R. Stat. Soc. B 36 (1974) 111 (choice by prediction); Hausman, Econometrica 46 (1978) 1251 (the variance of the
+    difference of two estimates).
     """
-    sure, unsure = [], None
-    for half in halves:
-        found = problem.estimate(half, near_rest, y)
-        if found is None:
-            continue
-        if found.spare < SPARE:
-            unsure = found
-            continue
-        y = found.y
-        sure.append(found)
-        if found.explained < max(map(_explained, sure)) - HOPELESS:
-            break
-    agreeing: list[Estimate] = []
-    for found in sorted(sure, key=_explained, reverse=True):
-        if all(_agree(found, other) for other in agreeing):
-            agreeing.append(found)
-    return min(agreeing, key=_uncertainty) if agreeing else unsure
+    slides = all(np.all(record.moves) for record in problem.records)
+    tried: list[Estimate] = []
+    for near_rest in (SLIDING,) if slides else (SLIDING, REVERSING):
+        y = tried[-1].y if tried else np.zeros(problem.free.size)
+        for half in halves:
+            found = problem.estimate(half, near_rest, y)
+            if found is not None:
+                y = found.y
+                tried.append(found)
+    sure = [found for found in tried if found.spare >= SPARE]
+    if not sure:
+        return tried[-1] if tried else None
+    fewest = min(_undetermined(found) for found in sure)
+    sure = [found for found in sure if _undetermined(found) == fewest]
+    windows = [(found.half, found.near_rest) for found in sure]
+    ratios = np.array([_signal_to_noise(problem, found, windows) for found in sure])
+    best = sure[int(np.argmax(ratios))]
+    as_good = [found for found, ratio in zip(sure, ratios, strict=True) if ratio >= ALIKE * np.max(ratios)]
+    return best._replace(errors=np.sqrt(best.errors**2 + _scatter(best, as_good)))
 
 
 def half_widths(records: Sequence[Record]) -> np.ndarray:
@@ -73,16 +58,18 @@ def half_widths(records: Sequence[Record]) -> np.ndarray:
     return WIDEST * longest / GROWTH ** np.arange(count)
 
 
-def _explained(found):
-    return found.explained
+def _undetermined(found):
+    return int(np.sum(np.isinf(found.errors)))
 
 
-def _agree(one, other):
-    """Whether their 95 % intervals touch."""
-    return bool(np.all(np.abs(one.y - other.y) <= one.intervals + other.intervals))
+def _signal_to_noise(problem, found, windows):
+    """On average over all windows and the equations; of those in which nothing is explained it is one."""
+    left = np.array([problem.unexplained(*which, found) for which in windows])
+    return float(np.mean(1 / np.sqrt(np.minimum(left, 1) + NEGLIGIBLE**2)))
 
 
-def _uncertainty(found):
-    """How many parameters are not determined, then the product of the intervals of the others, as a logarithm."""
-    known = found.intervals[np.isfinite(found.errors)]
-    return found.y.size - known.size, float(np.sum(np.log(np.maximum(known, ROUNDING))))
+def _scatter(best, others):
+    """The median square by which they differ from the best beyond the difference of their variances."""
+    known = np.isfinite(best.errors)
+    excess = [(one.y - best.y) ** 2 - np.abs(np.where(known, one.errors, 0) ** 2 - np.where(known, best.errors, 0) ** 2) for one in others]
+    return np.where(known, np.median(np.maximum(excess, 0), axis=0), 0)

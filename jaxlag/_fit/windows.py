@@ -36,6 +36,10 @@ class Windows(NamedTuple):
         value, rate = matrix(bump**POWER), matrix(-2 * POWER * s * bump ** (POWER - 1) / half)
         return cls(half, value, rate, value @ (~moves).astype(float) / np.maximum(value.sum(axis=1).A1, 1e-300))
 
+    def without_sums(self) -> "Windows":
+        """The same, to be kept where all integrals are known."""
+        return self._replace(value=None, rate=None)
+
     def integrals(self, momentum: np.ndarray, force: np.ndarray, constraints: np.ndarray) -> np.ndarray:
         """∫φ̇ p + φ F dt, and the means of the constraints: (K, n + m, ...), from values at the nodes, (N, n or m, ...)."""
         against = lambda A, x: (A @ x.reshape(len(x), int(np.prod(x.shape[1:])))).reshape(A.shape[0], *x.shape[1:])

@@ -171,7 +171,7 @@ def steady(
 
 def _entries(q, names, label):
     """Indices of the entries of q that the names stand for."""
-    names, entries = listed(names, label), entry_names(q, "q")
+    names, entries = listed(names), entry_names(q, "q")
     for name in names:
         if not any(is_within(entry, name) for entry in entries):
             raise ValueError(f"`{label}` must name coordinates, but holds {name!r}. The coordinates are {', '.join(entries)}.")

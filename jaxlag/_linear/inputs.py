@@ -28,7 +28,7 @@ class Input(NamedTuple):
 
 def find_inputs(names: Sequence[str], params: PyTree, q: PyTree, flat: Flat, sampled: PyTree) -> tuple[Input, ...]:
     """The inputs that the names stand for, one for each number."""
-    names, known = listed(names, "inputs"), list(_candidates(params, q, flat, sampled))
+    names, known = listed(names), list(_candidates(params, q, flat, sampled))
     found: list[Input] = []
     for name in names:
         meant = [entry for entry in known if is_within(entry.name, name)]

@@ -160,9 +160,7 @@ class _Near:
         rows, _, off = jax.tree.map(np.asarray, constraint_slopes(self.system, *values))
         if not off <= np.sqrt(np.finfo(rows.dtype).eps):
             raise ValueError(f"`q` and `qdot` must satisfy the constraints, but are off by {off:.2g} of their size. {CURE}")
-        return partition(
-            rows, positions.shape[0], [i for name in listed(independent or (), "independent") for i in self._entries_within(name)]
-        )
+        return partition(rows, positions.shape[0], [i for name in listed(independent or ()) for i in self._entries_within(name)])
 
     def _entries_within(self, name):
         found = [i for i, entry in enumerate(self.entries) if is_within(entry, name)]

@@ -177,7 +177,7 @@ def _given(section, longest, t, dtype):
 def _returning(system, q, states, cyclic):
     """Indices of the entries of the state that return."""
     entries, beside = entry_names(q, "q"), len(ravel_pytree(states)[0])
-    cyclic = listed(cyclic, "cyclic")
+    cyclic = listed(cyclic)
     for name in cyclic:
         if not any(is_within(entry, name) for entry in entries):
             raise ValueError(f"`cyclic` must name coordinates, but holds {name!r}. The coordinates are {', '.join(entries)}.")

@@ -237,7 +237,7 @@ def consistent_state(
     jl.consistent_state(rod, jnp.array([3.0, 4.0]), jnp.array([1.0, 0.0]), {"l": 10.0})  # [6, 8], [0.64, −0.48]
     ```
     """
-    core = _StateOn(_fixed_indices(coordinates(q, "q"), listed(fixed, "fixed")))
+    core = _StateOn(_fixed_indices(coordinates(q, "q"), listed(fixed)))
     (new_q, new_qdot), (reached, determined, affine, defined) = at_state(core, system, q, qdot, params, t, states)
     if is_concrete(reached):
         for passed, reason in ((defined, UNDEFINED), (determined, NO_INERTIA), (affine, NOT_AFFINE), (reached, IMPOSSIBLE)):

@@ -31,8 +31,6 @@ def is_within(entry: str, name: str) -> bool:
     return entry == name or entry.startswith((f"{name}.", f"{name}["))
 
 
-def listed(names: Iterable[Any], label: str) -> tuple[Any, ...]:
-    """The names in a list; a string, which would be read letter by letter, is refused."""
-    if isinstance(names, str):
-        raise ValueError(f"`{label}` must be a list of names, but is the string {names!r}. Write `{label}=[{names!r}]`.")
-    return tuple(names)
+def listed(names: str | Iterable[Any]) -> tuple[Any, ...]:
+    """The names in a list; a string is one name."""
+    return (names,) if isinstance(names, str) else tuple(names)

@@ -129,28 +129,27 @@ def state_and_params(q: Any, qdot: Any, params: PyTree, names: tuple[str, str] =
     return found
 
 
-def sample_times(ts: Any, dtype: Any) -> Float[Array | np.ndarray, " T"]:
-    """The sample times as a vector, at least two and increasing."""
+def sample_times(ts: Any, dtype: Any, *, repeated: bool = False) -> Float[Array | np.ndarray, " T"]:
+    """The sample times as a vector, at least two and increasing; with `repeated`, some may be equal."""
     if isinstance(ts, Mapping):
         raise TypeError(f"`ts` must be a list of times, but is a {type(ts).__name__}. Pass `ts` before `params`.")
     ts = numbers(ts, "`ts`", dtype)
     if ts.ndim != 1 or ts.size < 2:
         raise ValueError(f"`ts` must be a list of at least two times, but has shape {ts.shape}. Start it with the time of q0.")
     if is_concrete(ts):
-        _check_order(np.asarray(ts))
+        _check_order(np.asarray(ts), repeated)
     return ts
 
 
-def _check_order(ts):
-    increasing = ts[1:] > ts[:-1]
+def _check_order(ts, repeated):
+    increasing = (ts[1:] >= ts[:-1]) & (ts[-1] > ts[0]) if repeated else ts[1:] > ts[:-1]
     if increasing.all() and np.isfinite(ts[[0, -1]]).all():
         return
     if not np.isfinite(ts).all():
         raise ValueError("`ts` must be finite, but has a NaN or an infinity. Drop the rows without a time.")
     i = int(np.argmin(increasing))
-    raise ValueError(
-        f"`ts` must increase, but ts[{i}] = {ts[i]:g} is followed by ts[{i + 1}] = {ts[i + 1]:g}. Sort the times and drop repeated ones."
-    )
+    cure = "Sort the times, of which two must differ." if repeated else "Sort the times and drop repeated ones."
+    raise ValueError(f"`ts` must increase, but ts[{i}] = {ts[i]:g} is followed by ts[{i + 1}] = {ts[i + 1]:g}. {cure}")
 
 
 def check(system: System, t: Array, q: Arrays, qdot: Arrays, params: PyTree, states: Mapping[str, PyTree]) -> None:

@@ -95,7 +95,7 @@ def simulate_many(
     system = system if events is None else system.with_events(events)
     everything = {"q0": coordinates(q0, "q0"), "qdot0": coordinates(qdot0, "qdot0")}
     everything["params"] = parameters(params, everything["q0"])
-    own, shared = eqx.partition(everything, _differing(everything, listed(over, "over")))
+    own, shared = eqx.partition(everything, _differing(everything, listed(over)))
     dtype = jnp.result_type(*jax.tree.leaves((everything["q0"], everything["qdot0"])))
     options = SolverOptions.of(solver, Formulation(stabilisation, friction), max_steps)
     if common_steps not in (None, True, False):

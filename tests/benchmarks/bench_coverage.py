@@ -1,7 +1,8 @@
 """Do 95 % intervals contain the true value in 95 % of cases when the noise is correlated?
 
 A damped oscillator, c and b fitted to 200 recordings for each correlation; and a pendulum in Cartesian coordinates whose rod is a
-constraint, its length l and damping b fitted to as many (seeds 0 to 199). Run:
+constraint, its length l and damping b fitted to as many (seeds 0 to 199). Then the corners: few samples, one or two sensors of unknown
+noise, times at random, 400 recordings each. Run:
 
 python tests/benchmarks/bench_coverage.py
 """
@@ -83,6 +84,31 @@ def constrained_fits_of(rho, seeds):
     return jl.fit_each(PENDULUM, records, PENDULUM_START, free=("l", "b"))
 
 
+SENSORS = {"a": 0.02, "b": 0.1}  # standard deviations
+
+
+def both(q):
+    """Two sensors of one motion."""
+    return dict.fromkeys(SENSORS, q)
+
+
+def in_the_corners(samples, sensors, at_random, rho=0.0, seeds=400):
+    """One fit of each recording, all in one batch; noise that decays as a process of Ornstein and Uhlenbeck, by ρ a mean interval."""
+    records, length = [], 5.0 if samples < 10 else 10.0
+    for seed in range(seeds):
+        random = np.random.default_rng(seed)
+        ts = np.r_[0.0, np.sort(random.uniform(0.0, length, samples - 1))] if at_random else np.linspace(0.0, length, samples)
+        keeps = rho ** (np.diff(ts) * samples / length) if rho else np.zeros(samples - 1)
+        seen = {}
+        for name in list(SENSORS)[:sensors]:
+            e = random.standard_normal(samples)
+            for i, keep in enumerate(keeps):
+                e[i + 1] = keep * e[i] + np.sqrt(1 - keep**2) * e[i + 1]
+            seen[name] = position(ts, **TRUE) + SENSORS[name] * e
+        records.append(jl.Experiment(ts, seen if sensors == 2 else seen["a"], 1.0, 0.0, observe=both if sensors == 2 else None))
+    return jl.fit_each(SYSTEM, records, START, free=FREE)
+
+
 def coverage(fits, true=TRUE):
     """The fraction of intervals that contain the true value, for each parameter."""
     return {n: np.mean([f.interval(n).lower < true[n] < f.interval(n).upper for f in fits]) for n in true}
@@ -114,8 +140,20 @@ def main() -> None:
             )
 
 
+def corners() -> None:
+    """Prints the table of the corners."""
+    print(f"{'samples':>8} {'sensors':>8} {'rho':>5} {'at random':>10} {'inside: c':>10} {'b':>7}")
+    white = itertools.product((8, 20, 200), (1, 2), (0.0,), (False, True))
+    coloured = itertools.product((200, 1000), (1,), (0.5, 0.8, 0.95), (False, True))
+    for samples, sensors, rho, at_random in (*white, *coloured):
+        held = coverage(in_the_corners(samples, sensors, at_random, rho))
+        inside = f"{100 * held['c']:8.1f} % {100 * held['b']:5.1f} %"
+        print(f"{samples:8d} {sensors:8d} {rho:5.2f} {at_random!s:>10} {inside}", flush=True)
+
+
 CASES = (("oscillator", fits_of, position, TRUE), ("pendulum", constrained_fits_of, bob, PENDULUM_TRUE))
 
 
 if __name__ == "__main__":
     main()
+    corners()

@@ -5,6 +5,9 @@
 with the figures of A. Janot, M. Gautier & M. Brunot, Data set and reference models of EMPS, Workshop on Nonlinear System Identification
 Benchmarks (2019), rounded: K 35.15 N/V, K_p 160.18 1/s, K_v 243.45 V s/m. The controller sees a quantised position, and its difference
 as q̇. Nothing of jaxlag enters.
+
+`worn` is the same drive as machines are: F_v and F_c are unlike in both directions, friction builds up over some micrometres (Dahl, A solid
+friction model, Aerospace Corp. TOR-158 (1968)), and the screw pulls by its turn.
 """
 
 import numpy as np
@@ -54,3 +57,46 @@ def recording(quantum=QUANTUM):
         before = seen[k]
         q, v = held(q, v, K * commands[k], STEP, **TRUE)
     return ts, seen, speeds, commands
+
+
+FORTH, BACK = {"Fv": 212.0, "Fc": 22.0}, {"Fv": 195.0, "Fc": 18.5}
+PRESLIDING, PITCH = 2e-5, 0.05  # m
+
+
+def strokes():
+    """There and back, each stroke at a constant speed, as EMPS is led."""
+    r, at, k = np.zeros(SAMPLES), 0.0, 500
+    for goal, speed in zip([0.24, 0.0] * 6, np.tile([0.2, 0.12, 0.06, 0.16], 3), strict=True):
+        rise, T = speed / 1.0, abs(goal - at) / speed + speed / 1.0
+        t = np.arange(int(T / STEP) + 1) * STEP
+        way = np.where(t < rise, t**2 / 2, np.where(t < T - rise, speed * (t - rise / 2), abs(goal - at) - (T - t) ** 2 / 2))
+        way = (at + np.sign(goal - at) * way)[: max(SAMPLES - k, 0)]
+        r[k : k + len(way)], r[k + len(way) :] = way, goal
+        at, k = goal, k + len(t) + 150
+    return r
+
+
+def worn(ripple=1.0, steps=10):
+    """As `recording`, and the true accelerations: ten steps of Euler's scheme a sample, in which friction builds up exactly."""
+    ts, r, h = np.arange(SAMPLES) * STEP, strokes(), STEP / steps
+    q, v, before, built = 0.0, 0.0, 0.0, 0.0
+    seen, speeds, commands, accelerations = (np.empty(SAMPLES) for _ in range(4))
+    for k in range(SAMPLES):
+        seen[k], speeds[k] = np.round(q / QUANTUM) * QUANTUM, v
+        commands[k] = np.clip(KV * (KP * (r[k] - seen[k]) - (seen[k] - before) / STEP), -LIMIT, LIMIT)
+        before = seen[k]
+        for _ in range(steps):
+            way = FORTH if v > 0 else BACK
+            built = np.sign(v) - (np.sign(v) - built) * np.exp(-abs(v) * h / PRESLIDING)
+            pull = K * commands[k] - TRUE["offset"] - ripple * np.sin(2 * np.pi * q / PITCH)
+            v += h * (pull - way["Fc"] * built - way["Fv"] * v) / TRUE["M"]
+            q += h * v
+        accelerations[k] = (v - speeds[k]) / STEP
+    return ts, seen, speeds, commands, accelerations
+
+
+def inverse_dynamics(speeds, commands, accelerations):
+    """M, Fv, Fc and the offset by least squares in the true motion, where it slides."""
+    slides, v = np.abs(speeds) > 0.01, speeds + accelerations * STEP / 2
+    columns = np.stack([accelerations, v, np.sign(v), np.ones_like(v)], axis=1)[slides]
+    return dict(zip(TRUE, np.linalg.lstsq(columns, K * commands[slides], rcond=None)[0], strict=True))

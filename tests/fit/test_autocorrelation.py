@@ -208,3 +208,10 @@ def test_the_95_percent_intervals_hold_the_truth_with_a_constraint(rho, within):
     for (name, held), deviation in zip(bench_coverage.coverage(fits, true).items(), exact, strict=True):
         assert all(f.converged for f in fits) and 0.87 <= held <= 1.0
         np.testing.assert_allclose(np.median([f.standard_errors[name] for f in fits]), deviation, rtol=within)
+
+
+@pytest.mark.parametrize("at_random", [False, True])
+def test_the_card_says_where_times_are_uneven(at_random):
+    """Correlation is counted in samples, which say little of a time then."""
+    fits = bench_coverage.in_the_corners(200, 1, at_random, rho=0.95, seeds=2)
+    assert all(found.correlated and ("samples that are not evenly spaced in time" in repr(found)) == at_random for found in fits)

@@ -5,6 +5,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
+import oscillator as osc
 import pytest
 from oscillator import START, SYSTEM, TIMES, TRUE, noisy, position
 from scipy.optimize import least_squares
@@ -217,3 +218,20 @@ def test_a_network_may_have_more_weights_than_there_are_samples():
     assert found.costs[-1] < 0.3 * found.costs[0] and "nan" not in repr(found)
     with pytest.raises(ValueError, match="must name no more than was measured"):
         jl.fit(pushed, record, {"net": net}, free="net")
+
+
+def test_the_interval_on_the_card_ends_at_a_bound():
+    found = jl.fit(osc.SYSTEM, osc.record(0), osc.START | {"b": 0.31}, free=("c", "b"), bounds={"b": (0.2999, None)})
+    (row,) = [line for line in repr(found).splitlines() if line.startswith("  b ")]
+    assert found.standard_errors["b"] > 1e-3 and row.split("95 %: ")[1].startswith("0.2999 … ")
+
+
+def test_starts_of_many_records_are_one_row_each():
+    """The noise is 0.01, so that of 14 starts at rest all lie within some 3 standard errors."""
+    records = [osc.record(seed, np.linspace(0.0, 6.0, 60), unknown=("q0", "qdot0")) for seed in range(14)]
+    found = jl.fit(osc.SYSTEM, records, osc.START, free=("c", "b"))
+    rows = [line for line in repr(found).splitlines() if "14 experiments: " in line]
+    assert [row.split()[2] for row in rows] == ["q0", "qdot0"] and "experiment 3" not in repr(found)
+    least, most = min(of["qdot0"] for of in found.unknowns), max(of["qdot0"] for of in found.unknowns)
+    np.testing.assert_allclose([float(word) for word in rows[1].replace(",", "").split()[3:6:2]], [least, most], atol=6e-5)
+    assert len(found.to_dict()["parameters"]) == 2 + 28

@@ -74,6 +74,40 @@ def test_nothing_but_clicks():
 
 
 @pytest.mark.slow
+def test_more_clicks_than_samples():
+    """Seven, with a noise of a millisecond, in a record whose ends alone are sampled: planned and fitted as on the closed form."""
+    heard = clicks(0.83, 0.62) + 1e-3 * np.random.default_rng(0).standard_normal(7)
+    ends = jnp.array([0.0, 3.0])
+    no_sensor = lambda q: {}
+    recorded = lambda times, **more: jl.Experiment(
+        ends, None, 0.62, 0.0, observe=no_sensor, events={"click": times}, sigma={"click": 1e-3}, **more
+    )
+    found = jl.fit(ball, recorded(heard), {"e": 0.82}, free="e")
+    e = 0.82
+    for _ in range(20):
+        J = jax.jacfwd(lambda e: clicks(e, 0.62))(e)
+        e = e + J @ (heard - clicks(e, 0.62)) / (J @ J)
+    np.testing.assert_allclose(found.params["e"], e, rtol=1e-7)
+    np.testing.assert_allclose(found.standard_errors["e"], 1e-3 / jnp.sqrt(J @ J), rtol=1e-4)
+    assert found.measurements == 7
+    planned = jl.information(ball, recorded(clicks(e, 0.62)), {"e": e}, free="e")
+    np.testing.assert_allclose(planned.standard_errors["e"], 1e-3 / jnp.sqrt(J @ J), rtol=1e-4)
+    shown = found.predict(recorded(np.full(7, np.nan), delay={"click": 0.25}))  # of a microphone that is far away
+    np.testing.assert_allclose(shown.values["click"], clicks(e, 0.62) + 0.25, rtol=1e-6)
+
+
+@pytest.mark.parametrize("given", [0.25, [0.25, 0.5]])
+def test_a_sigma_for_each_sample_beside_more_events(given):
+    e = jl.Experiment(
+        [0.0, 3.0], {"q": [1.0, 2.0]}, {"q": 0.0}, {"q": 1.0}, events={"click": [0.5, 1.0, 1.5]}, sigma={"q": given, "click": 0.1}
+    )
+    np.testing.assert_array_equal(e.ts, [0.0, 3.0, 3.0])
+    np.testing.assert_array_equal(e.values["q"], [1.0, 2.0, np.nan])
+    np.testing.assert_array_equal(e.sigma["q"][:2], np.broadcast_to(given, 2))
+    np.testing.assert_array_equal(e.sigma["click"], [0.1, 0.1, 0.1])
+
+
+@pytest.mark.slow
 def test_clear_errors():
     experiment, _ = recording(sigma=1e-3)
     with pytest.raises(ValueError, match="must name events of the system, but holds 'click'"):
@@ -83,7 +117,25 @@ def test_clear_errors():
     with pytest.raises(ValueError, match="must have no events in `regress`"):
         counted = jl.System(lambda q, qdot, m: 0.5 * m * qdot**2, events={"zero": jl.Event(lambda q: q)})
         jl.regress(counted, jl.Experiment(TS, TS, 0.0, 1.0), {"m": 1.0}, free=["m"])
-    with pytest.raises(ValueError, match="at most 16 times"):
-        jl.Experiment(TS, {"q": TS}, {"q": 1.0}, {"q": 0.0}, events={"click": np.ones(17)})
+    with pytest.raises(ValueError, match=r"`events\['click'\]` must be a list of times, but has shape \(1, 7\). Give one number for each"):
+        jl.Experiment(TS, {"q": TS}, {"q": 1.0}, {"q": 0.0}, events={"click": np.ones((1, 7))})
+    with pytest.raises(ValueError, match=r"`events\['click'\]` of experiment 0 must hold the times that are expected, but all are missing"):
+        plan = jl.Experiment(TS, None, {"q": 0.7}, {"q": 0.0}, events={"click": np.full(3, np.nan)}, sigma=1e-3)
+        jl.information(ball, plan, {"e": 0.8}, free="e")
     with pytest.raises(TypeError, match="must be a mapping of channels"):
         jl.Experiment(TS, TS, 1.0, 0.0, events={"click": np.ones(3)})
+
+
+def test_clicks_belong_to_the_half_of_the_record_in_which_they_were_heard():
+    """An oscillator is heard whenever it passes its rest, six times in either half: at (k + ½) π/√c, of which c is greater later on."""
+    heard = jl.System(lambda q, qdot, c: 0.5 * qdot**2 - 0.5 * c * q**2, events={"click": jl.Event(lambda q: q)})
+    phases = (np.arange(12) + 0.5) * np.pi
+    clicks = phases / np.repeat([2.0, 2.002], 6) + 1e-4 * np.random.default_rng(2).standard_normal(12)
+    ts = np.linspace(0.0, clicks[5] + clicks[6], 60)
+    record = jl.Experiment(ts, None, 1.0, 0.0, events={"click": clicks}, sigma={"click": 1e-4})
+    (remark,) = [remark for remark in jl.fit(heard, record, {"c": 4.02}, free="c").remarks if "half" in remark]
+    by_hand = [
+        (np.sum(phase**2) / np.sum(phase * times)) ** 2 for phase, times in zip(np.split(phases, 2), np.split(clicks, 2), strict=True)
+    ]
+    said = [float(word) for word in remark.replace(",", "").split() if word.startswith(("4.0", "3.9"))]
+    np.testing.assert_allclose(said, by_hand, atol=2e-5)

@@ -22,7 +22,6 @@ def experiment(ts=T, values=X, **more):
 
 BAD = {
     "times that are not sorted": (lambda: experiment(ts=[0.0, 0.2, 0.1, 0.3, 0.4]), "`ts` must increase, but ts[1] = 0.2 is followed"),
-    "a time twice": (lambda: experiment(ts=[0.0, 0.1, 0.1, 0.3, 0.4]), "drop repeated ones"),
     "one time": (lambda: experiment(ts=[0.0], values=[1.0]), "at least two times"),
     "a channel of another length": (lambda: experiment(values={"x": X[:3]}), "`values['x']` must have one row for each of the 5 times"),
     "a channel without a sample": (lambda: experiment(values={"x": X, "y": X * np.nan}), "every sample of a channel is missing"),

@@ -184,6 +184,21 @@ def test_a_mode_that_looks_like_none_is_in_doubt():
     assert "and by 1.00 with another" in fit.remarks[1]
 
 
+REVERSED = pytest.param([[0.0, 1.0], [1.0, 0.0]], [1, 0], marks=pytest.mark.slow)
+
+
+@pytest.mark.parametrize(("shapes", "order"), [(None, [1, 0]), ([[1.0, 0.0], [0.0, 1.0]], [0, 1]), REVERSED])
+def test_equal_stiffnesses_at_the_start(shapes, order):
+    """Where both modes have one frequency, its mean alone has a derivative. k = (2π f)²; shapes say which mass belongs to which."""
+    pair = jl.System(lambda q, qdot, k: 0.5 * qdot @ qdot - 0.5 * jnp.sum(k * q**2))
+    more = {} if shapes is None else {"shapes": np.array(shapes), "observe": lambda q: q}
+    found = jl.fit(pair, jl.ModalTest([1.0, 1.01], np.zeros(2), sigma=1e-3, **more), {"k": np.array([40.0, 40.0])}, free="k")
+    expected = (2 * np.pi * np.array([1.0, 1.01])) ** 2
+    assert found.converged
+    np.testing.assert_allclose(found.estimates["k"], expected[order], rtol=1e-9)
+    np.testing.assert_allclose(found.standard_errors["k"], 2e-3 * (expected / [1.0, 1.01])[order], rtol=1e-6)
+
+
 @pytest.mark.slow
 def test_predictions_of_another_test():
     fit = jl.fit(CHAIN, modal_test(1), GUESS, free=("k", "c"))
@@ -326,6 +341,25 @@ def test_many_starts_an_optimiser_and_a_profile_go_through_tests():
     assert sorted(alone.parameters.values()) == [1, 2]
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("free", "bounds"),
+    [(("c",), None), (("c", "b"), {"b": (0, None)}), (("c", "b"), {"b": (0.2, None)}), (("c", "b"), None)],
+)
+def test_the_other_sign_of_time_is_said(free, bounds):
+    """A compliance in mm/N; without a bound conjugates would mean a negative damping, with one none."""
+    omega = np.linspace(1.0, 12.0, 40)
+    G = 1e3 / (80.0 - 2.0 * omega**2 + 1.5j * omega)
+    G[3] = np.nan
+    draw = np.random.default_rng(0)
+    G = G + 0.2 * (draw.standard_normal(40) + 1j * draw.standard_normal(40))
+    start = {"m": 2.0, "c": 110.0, "k": 0.0, "g": 0.0, "b": 1.5 if free == ("c",) else 1.0}
+    for values, is_said in ((G, False), (G.conj(), True)):
+        test = jl.FrequencyResponseTest(omega, values, 0.0, inputs=["q"], observe=lambda q: 1e3 * q, sigma=0.2)
+        found = jl.fit(SPRING, test, start, free=free, bounds=bounds)
+        assert any("look like complex conjugates" in remark and "`values.conj()`" in remark for remark in found.remarks) == is_said
+
+
 # What is refused
 
 OSCILLATION = {"frequency": [1.0, 2.0], "q": np.zeros(2), "sigma": 0.01}
@@ -359,8 +393,7 @@ def test_a_wrong_modal_test_is_refused(wrong, said):
         ({"values": ["a", "b"]}, "`values` must be numbers with a row"),
         ({"values": [np.nan, np.nan]}, "`values` must be finite, but are infinite or missing throughout"),
         ({"omega": [-1.0, 2.0]}, "`omega` must hold frequencies of 0 or more"),
-        ({"inputs": "q"}, "`inputs` must be a list of what was excited, but is 'q'"),
-        ({"inputs": []}, r"`inputs` must be a list of what was excited, but is \[\]"),
+        ({"inputs": []}, r"`inputs` must name what was excited, but is \[\]"),
         ({"sigma": None}, "`sigma` or `coherence` must say how exact"),
         ({"sigma": 1.0, "coherence": 0.9}, "`sigma` or `coherence` must say how exact"),
         ({"sigma": 0.0}, "`sigma` must be positive and finite"),

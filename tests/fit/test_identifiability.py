@@ -196,7 +196,7 @@ def test_is_there_really_a_damper():
 @pytest.mark.slow
 def test_information_is_what_a_fit_then_has():
     plan = jl.Experiment(osc.TIMES, None, 1.0, 0.0, sigma=0.01)
-    expected = jl.information(osc.SYSTEM, plan, osc.TRUE, FREE)
+    expected = jl.information(osc.SYSTEM, plan, osc.TRUE, free=FREE)
     h = 1e-6
     J = np.stack(
         [
@@ -208,12 +208,12 @@ def test_information_is_what_a_fit_then_has():
     J /= 2 * h * 0.01
     np.testing.assert_allclose(expected.matrix, J.T @ J, rtol=1e-5)
     np.testing.assert_allclose([expected.standard_errors[name] for name in FREE], np.sqrt(np.diag(np.linalg.inv(J.T @ J))), rtol=1e-5)
-    unsure = jl.information(osc.SYSTEM, jl.Experiment(osc.TIMES, None, 1.0, 0.0, sigma=0.01, unknown=("q0", "qdot0")), osc.TRUE, FREE)
+    unsure = jl.information(osc.SYSTEM, jl.Experiment(osc.TIMES, None, 1.0, 0.0, sigma=0.01, unknown=("q0", "qdot0")), osc.TRUE, free=FREE)
     assert unsure.standard_errors["b"] > expected.standard_errors["b"]
     np.testing.assert_allclose(np.linalg.inv(unsure.matrix), unsure.covariance, rtol=1e-6)
-    assert "not determined" in repr(jl.information(osc.SYSTEM, plan, osc.TRUE, ("b", "c", "m")))
+    assert "not determined" in repr(jl.information(osc.SYSTEM, plan, osc.TRUE, free=("b", "c", "m")))
     with pytest.raises(ValueError, match="has no `sigma`"):
-        jl.information(osc.SYSTEM, jl.Experiment(osc.TIMES, None, 1.0, 0.0), osc.TRUE, FREE)
+        jl.information(osc.SYSTEM, jl.Experiment(osc.TIMES, None, 1.0, 0.0), osc.TRUE, free=FREE)
 
 
 @pytest.mark.slow
@@ -282,10 +282,10 @@ def test_a_profile_ends_at_a_bound():
 
 def test_a_hopeless_end_is_not_called_converged():
     """A start from which the motion explodes, and a record in other units than the model's."""
-    exploding = fit(osc.record(0, ts=osc.TIMES / 4), osc.START | {"c": -1e4})
+    exploding = fit(osc.record(0, ts=osc.TIMES / 4), osc.START | {"c": -1e4}, start=None)
     assert not exploding.converged and any("times as large as the measurements: check the units" in said for said in exploding.remarks)
     assert max(len(line) for line in repr(exploding).splitlines()) < 180
-    other_units = fit(jl.Experiment(osc.TIMES, 1e-3 * osc.noisy(0), 1.0, 0.0))
+    other_units = fit(jl.Experiment(osc.TIMES, 1e-3 * osc.noisy(0), 1.0, 0.0), start=None)
     assert not other_units.converged and "unrelated to the measurements" in other_units.reason
 
 

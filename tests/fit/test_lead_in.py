@@ -75,7 +75,7 @@ def test_an_estimate_at_its_bound_is_moved_inside():
 def test_bad_leads_are_refused():
     record = osc.record(0)
     refused = lambda text: pytest.raises(ValueError, match=text)
-    with refused(r"`start` must be `Regress\(\)`, `MultiStart\(\)` or None, but is 'regress'. Write `start=jl.Regress"):
+    with refused(r"`start` must be `Regress\(\)`, `MultiStart\(\)`, 'auto' or None, but is 'regress'. Write `start=jl.Regress"):
         jl.fit(osc.SYSTEM, record, osc.START, free=FREE, start="regress")
     with refused("`segments`, `start` and `method` must be used one at a time"):
         jl.fit(osc.SYSTEM, record, osc.START, free=FREE, start=jl.Regress(), segments=3)
@@ -136,3 +136,15 @@ def fit_of_friction(seed):
     x = np.asarray(jl.simulate(TRUTH, 0.5, 0.0, ts, {"c": 1.0, "b": 0.2, "F": 0.6, "u": u}).q)
     record = jl.Experiment(ts, x + 1e-3 * rng.standard_normal(601), 0.5, 0.0)
     return jl.fit(COULOMB, record, {"m": 1.4, "c": 0.8, "b": 0.5, "F": 0.3, "u": u}, free=("m", "c", "b", "F"))
+
+
+@pytest.mark.parametrize("c", [300.0, 2000.0])
+def test_a_start_from_which_nothing_is_explained_is_mended_without_being_asked(c):
+    """True: 4."""
+    record = osc.record(0, np.linspace(0.0, 12.0, 240))
+    given = {"m": 1.0, "c": c, "b": 0.1}
+    alone, found = (jl.fit(osc.SYSTEM, record, given, free=("c", "b"), start=start) for start in (None, "auto"))
+    assert not alone.converged and not alone.led_in
+    assert found.converged and "explaining too little" in found.led_in[0] and found.led_in[1] == "regress"
+    assert abs(found.estimates["c"] - 4.0) < 3 * found.standard_errors["c"] < 0.05
+    assert not jl.fit(osc.SYSTEM, record, given, free=("c", "b"), max_steps=5).led_in  # a limit is a limit

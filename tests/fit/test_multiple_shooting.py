@@ -99,9 +99,9 @@ def test_everything_free_leaves_the_common_factor_of_masses_and_damping():
         holonomic={"rods": along},
     )
     e = record(3.0, 150, 1.0, 1)
-    plan = jl.information(weighed, e, TRUE | {"m1": 1.0}, ("m1", "m2", "b1", "b2"), **LOOSE)
+    plan = jl.information(weighed, e, TRUE | {"m1": 1.0}, free=("m1", "m2", "b1", "b2"), **LOOSE)
     assert all(np.isinf(plan.standard_errors[name]) for name in ("m1", "m2", "b1", "b2"))
-    known = jl.information(weighed, e, TRUE | {"m1": 1.0}, ("m2", "b1", "b2"), **LOOSE)
+    known = jl.information(weighed, e, TRUE | {"m1": 1.0}, free=("m2", "b1", "b2"), **LOOSE)
     assert all(np.isfinite(known.standard_errors[name]) for name in ("m2", "b1", "b2"))
 
 

@@ -273,3 +273,53 @@ def test_a_resonance_in_a_long_record(samples):
     for name, true in truth.items():
         error = float(found.standard_errors[name])
         assert abs(float(found.estimates[name]) - true) < 4 * error < 0.02 * true, name
+
+
+ARM = {"m1": 0.5, "m2": 0.3, "a1": 0.12, "I1": 0.004, "L1": 0.25, "a2": 0.1, "I2": 0.002}  # kg, m, kg m²
+
+
+def swinging_arm(q, qdot, m1, m2, a1, I1, L1, a2, I2):
+    """A double pendulum without a torque, so that only ratios of the terms of L are determined."""
+    kinetic = 0.5 * (I1 + m1 * a1**2 + m2 * L1**2) * qdot["u"] ** 2 + 0.5 * (I2 + m2 * a2**2) * qdot["w"] ** 2
+    coupled = m2 * L1 * a2 * jnp.cos(q["u"] - q["w"]) * qdot["u"] * qdot["w"]
+    return kinetic + coupled + 9.81 * ((m1 * a1 + m2 * L1) * jnp.cos(q["u"]) + m2 * a2 * jnp.cos(q["w"]))
+
+
+@pytest.fixture(scope="module")
+def swung():
+    """By SciPy, with noise."""
+    from scipy.integrate import solve_ivp
+
+    m1, m2, a1, I1, L1, a2, I2 = ARM.values()
+    c = m2 * L1 * a2
+
+    def rate(t, s):
+        u, w, du, dw = s
+        M = [[I1 + m1 * a1**2 + m2 * L1**2, c * np.cos(u - w)], [c * np.cos(u - w), I2 + m2 * a2**2]]
+        load = [-c * np.sin(u - w) * dw**2 - 9.81 * (m1 * a1 + m2 * L1) * np.sin(u), c * np.sin(u - w) * du**2 - 9.81 * m2 * a2 * np.sin(w)]
+        return [du, dw, *np.linalg.solve(M, load)]
+
+    ts = np.linspace(0, 6, 600)
+    angles = solve_ivp(rate, (0, 6), [1.5, -1.0, 0, 0], t_eval=ts, rtol=1e-10, atol=1e-12).y[:2]
+    angles = angles + 1e-3 * np.random.default_rng(0).standard_normal((2, 600))
+    return jl.Experiment(ts, dict(zip("uw", angles, strict=True)), {"u": 1.5, "w": -1.0}, {"u": 0.0, "w": 0.0})
+
+
+def test_a_lagrangian_that_vanishes_solves_nothing(swung):
+    """With a₁ = −m₂ L₁/m₁, I₁ = −m₁ a₁² − m₂ L₁² and a₂ = I₂ = 0 all terms are zero, which solved the equations "exactly"."""
+    arm, free = jl.System(swinging_arm), ("a1", "L1", "a2")
+    found = jl.regress(arm, swung, ARM | {"a1": 0.2, "L1": 0.4, "a2": 0.2}, free=free)
+    for name in free:
+        assert abs(found.estimates[name] - ARM[name]) < min(3 * found.standard_errors[name], 4e-3 * ARM[name]), found
+    scaled = jl.regress(arm, swung, ARM | {"a1": 0.2, "I1": 0.01, "L1": 0.4, "a2": 0.2, "I2": 0.01}, free=(*free, "I1", "I2"))
+    assert all(np.isinf(scaled.standard_errors[name]) for name in ("a1", "I1", "a2", "I2"))
+    assert abs(scaled.estimates["L1"] / ARM["L1"] - 1) < 0.003
+
+
+@pytest.mark.slow
+def test_the_regression_of_a_machine_without_torque_is_a_start(swung):
+    """From it the whole motion is explained to the noise, whatever of the parameters is determined."""
+    start = ARM | {"a1": 0.15, "I1": 0.006, "L1": 0.22, "a2": 0.12, "I2": 0.003}
+    found = jl.fit(jl.System(swinging_arm), swung, start, free=("a1", "I1", "L1", "a2", "I2"), start=jl.Regress())
+    assert found.converged and abs(found.estimates["L1"] - ARM["L1"]) < 3 * found.standard_errors["L1"] < 1e-4
+    assert all(0.9e-3 < sigma < 1.1e-3 for sigma in found.sigmas[0].values())

@@ -40,6 +40,18 @@ def test_a_drive_that_sticks_at_times_under_a_digital_controller():
         assert abs(found.estimates[name] / true - 1) < 1e-3, name
 
 
+def test_a_worn_drive_whose_friction_is_unlike_in_both_directions():
+    """Strokes at constant speeds: in wide windows M, Fv and Fc are hardly told apart, and their errors there know nothing of the rest."""
+    ts, q, v, u, a = drive.worn()
+    record = jl.Experiment(ts, q, 0.0, 0.0, params={"u": jl.Signal(ts, u)})
+    found, true = jl.regress(DRIVE, record, dict.fromkeys(drive.TRUE, np.nan), free=tuple(drive.TRUE)), drive.inverse_dynamics(v, u, a)
+    for name in drive.TRUE:
+        off = abs(found.estimates[name] - true[name])
+        assert off < 2 * found.standard_errors[name], (name, found, true)
+        assert off < 0.03 * abs(true[name]) or name == "offset", (name, found, true)
+    assert all(found.standard_errors[name] < 0.05 * true[name] for name in ("M", "Fv", "Fc"))
+
+
 @pytest.mark.parametrize("sensors", ["angle", "angle and rate", "with their sigma"])
 def test_a_real_pendulum_whose_torque_chatters(driven, sensors):
     """A point mass on a rod of 0.5 m, so J/(m l) is 0.5 m; its accelerations gave J = 0.0009 kg m²."""

@@ -47,7 +47,7 @@ WRONG = {
     "nothing in q0": (lambda: run(q0={"x": None}, qdot0={"x": 0.0}), r"`q0\['x'\]` must be a real number or array, but is a NoneType"),
     "no coordinates": (lambda: run(q0={}, qdot0={}), "`q0` must hold at least one coordinate"),
     "a sample of a motion for q0": (lambda: jl.simulate(jl.System(energy), run()[-1], TS + 1.0, {"c": 4.0}), r"`q0` must be coordinates, but is of class Instant, which holds them. Pass its parts, .*simulate\(system, last.q, last.qdot, ts, params"),
-    "a letter for a list of names": (lambda: jl.consistent_state(jl.System(energy), {"a": 0.0, "b": 0.0}, {"a": 0.0, "b": 0.0}, fixed="ab"), r"`fixed` must be a list of names, but is the string 'ab'. Write `fixed=\['ab'\]`"),
+    "a name of no coordinate": (lambda: jl.consistent_state(jl.System(energy), {"a": 0.0, "b": 0.0}, {"a": 0.0, "b": 0.0}, fixed="ab"), "`fixed` must name coordinates of q, but holds 'ab'"),
     "mismatched structures": (lambda: run(q0={"x": 1.0}, qdot0={"y": 0.0}), "`qdot0` must be structured like `q0`"),
     "mismatched shapes": (lambda: run(q0=np.ones(2), qdot0=np.ones(3)), r"`qdot0` must have the shape of `q0`, \(2,\), but has \(3,\)"),
     "unknown argument name": (lambda: run(jl.System(lambda q, qdto, c: 0.5 * qdto**2)), "`lagrangian` must name arguments that exist, but it names 'qdto'. There are t, q, qdot, params; the entries of params: c. Did you mean 'qdot'"),

@@ -91,7 +91,7 @@ def test_dry_friction_takes_steps_of_its_own():
     "over, common_steps, message",
     [
         (("k",), None, "`over` must name q0, qdot0 or entries of params, but holds 'k'"),
-        ("bc", None, r"`over` must be a list of names, but is the string 'bc'. Write `over=\['bc'\]`"),
+        ("bc", None, "`over` must name q0, qdot0 or entries of params, but holds 'bc'"),
         ((), None, "`over` must name what differs between members, but is empty"),
         (("b", "c"), None, r"first axes are b: \[\(3,\)\], c: \[\(\)\]"),
     ],
