@@ -89,15 +89,20 @@ def gathered(J: Any) -> Any:
     if not isinstance(J, Arrow):
         return J
     xnp = numpy_for(J)
-    rows = [J.first]
+    blocks = tuple(xnp.linalg.qr(block, mode="r") if block.shape[1] > block.shape[2] else block for block in J.blocks)
+    return whole(Arrow(J.first, blocks, J.columns, J.last))
+
+
+def whole(J: Arrow) -> Any:
+    """The matrix with all its zeros."""
+    xnp, rows = numpy_for(J), [J.first]
     for block, columns in zip(J.blocks, J.columns, strict=True):
-        R = xnp.linalg.qr(block, mode="r") if block.shape[1] > block.shape[2] else block
-        at = np.arange(len(R))[:, None, None], np.arange(R.shape[1])[:, None], columns[:, None]
-        wide = xnp.zeros((*R.shape[:2], J.size), R.dtype)
+        at = np.arange(len(block))[:, None, None], np.arange(block.shape[1])[:, None], columns[:, None]
+        wide = xnp.zeros((*block.shape[:2], J.size), block.dtype)
         if xnp is np:
-            wide[at] = R
+            wide[at] = block
         else:
-            wide = wide.at[at].set(R)
+            wide = wide.at[at].set(block)
         rows.append(wide.reshape(-1, J.size))
     return xnp.concatenate([*rows, J.last])
 

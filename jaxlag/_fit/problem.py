@@ -13,7 +13,7 @@ from jaxtyping import Array, Float
 from .._motion.members import of_each
 from .._motion.results import reason_of
 from .._program.jit import compiled, numpy_for
-from .arrow import Arrow
+from .arrow import Arrow, whole
 from .experiment import Experiment
 from .experiment_batch import ExperimentBatch, batches_of, map_batch
 from .measurement import Evaluated, Prepared, Test
@@ -121,34 +121,23 @@ class Problem:
         tests = tuple(test.linearised(self.model.system, self.free, y) for test in self.tests)
         slope = jnp.diag(self.free.slope(y) / self.free.prior_deviation)
         of_free = [(self.free.prior_residual(y), slope), *(test[:2] for test in tests)]
-        blocks = [(r, jnp.zeros((len(r), self.size), x.dtype).at[:, : self.free.size].set(J)) for r, J in of_free]
-        if self._is_wide:
-            return self._with_arrow(blocks, parts, tests)
-        for k, part in enumerate(parts):
-            blocks.append((part.residuals, self._over_all_unknowns(k, np.arange(len(part.residuals)), part.jacobian)))
+        first = jnp.concatenate([J for _, J in of_free])
+        first = jnp.zeros((len(first), self.size), x.dtype).at[:, : self.free.size].set(first)
         gaps, gaps_J = jnp.zeros(0), jnp.zeros((0, self.size))
+        last, last_J = gaps, gaps_J
         if self.continuity is not None:
             gaps, gaps_J = self._gaps(parts)
-            blocks.append((self.continuity.weight * (gaps + self.continuity.dual), self.continuity.weight * gaps_J))
-        residuals, jacobians = zip(*((r.ravel(), J.reshape(-1, self.size)) for r, J in blocks), strict=True)
-        return Linearisation(jnp.concatenate(residuals), jnp.concatenate(jacobians), parts, gaps, gaps_J, tests)
+            last, last_J = self.continuity.weight * (gaps + self.continuity.dual), self.continuity.weight * gaps_J
+        columns = tuple(self.columns(k) for k in range(len(parts)))
+        jacobian = Arrow(first, tuple(part.jacobian for part in parts), columns, last_J)
+        residuals = jnp.concatenate([*(r for r, _ in of_free), *(part.residuals.ravel() for part in parts), last])
+        return Linearisation(residuals, jacobian if self._is_wide else whole(jacobian), parts, gaps, gaps_J, tests)
 
     @property
     def _is_wide(self):
         """Whether a Jacobian would have little but zeros in it, in too large a number."""
         rows = sum(leaf.size for batch in self.batches for leaf in jax.tree.leaves(batch.values))
         return rows * (self.size - self.free.size) > WIDE and sum(len(batch.members) for batch in self.batches) > 1
-
-    def _with_arrow(self, of_free, parts, tests):
-        gaps, gaps_J = jnp.zeros(0), jnp.zeros((0, self.size))
-        weight, dual = 0.0, 0.0
-        if self.continuity is not None:
-            (gaps, gaps_J), weight, dual = self._gaps(parts), self.continuity.weight, self.continuity.dual
-        columns = tuple(self.columns(k) for k in range(len(parts)))
-        first = jnp.concatenate([J for _, J in of_free])
-        jacobian = Arrow(first, tuple(part.jacobian for part in parts), columns, weight * gaps_J)
-        residuals = jnp.concatenate([*(r for r, _ in of_free), *(part.residuals.ravel() for part in parts), weight * (gaps + dual)])
-        return Linearisation(residuals, jacobian, parts, gaps, gaps_J, tests)
 
     def columns(self, k: int) -> np.ndarray:
         """Indices in x of what each experiment of batch k depends on, (experiments, p + unknowns)."""

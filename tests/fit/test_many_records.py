@@ -58,6 +58,7 @@ def test_products_and_triangles_are_those_of_the_whole_matrix():
         np.testing.assert_allclose(arrow.times(arrow.over(of, 1 + x**2), x), whole / (1 + x**2) @ x, atol=1e-13)
         R, along = arrow.triangular(of, r)
         np.testing.assert_allclose([*(R.T @ R), R.T @ along], [*(whole.T @ whole), whole.T @ r], atol=1e-12)
+        np.testing.assert_allclose(arrow.whole(of), whole, atol=1e-15)
         np.testing.assert_allclose(arrow.gathered(of).T @ arrow.gathered(of), whole.T @ whole, atol=1e-12)
         np.testing.assert_allclose(arrow.times(arrow.without(of, 1), x[1:]), np.delete(whole, 1, axis=1) @ x[1:], atol=1e-13)
 
@@ -100,6 +101,15 @@ def test_all_statistics_are_those_of_the_whole_matrix(case, monkeypatch):
         assert found.correlated
         np.testing.assert_allclose(found.interval("c", profile=True), whole.interval("c", profile=True), rtol=1e-6)
         np.testing.assert_allclose(found.prediction_errors[2], whole.prediction_errors[2][:-1], rtol=1e-3)
+
+
+def test_many_starts_of_many_records(without_zeros):
+    """And a parameter that starts at zero."""
+    one = jl.fit(osc.SYSTEM, records(4), START | {"c": 6.0}, free=FREE, start=jl.MultiStart(4))
+    other = jl.fit(osc.SYSTEM, records(4), START | {"b": 0.0}, free=FREE)
+    assert one.converged and other.converged
+    np.testing.assert_allclose([*one.estimates.values()], [*other.estimates.values()], rtol=1e-6)
+    assert abs(one.estimates["c"] - 4.0) < 4 * one.standard_errors["c"] and abs(one.estimates["b"] - 0.3) < 4 * one.standard_errors["b"]
 
 
 def test_a_singular_value_decomposition_that_fails_is_no_convergence(monkeypatch):
