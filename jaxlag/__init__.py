@@ -24,7 +24,7 @@ from ._fit.frequency_response_test import FrequencyResponseTest as FrequencyResp
 from ._fit.fit import fit as fit
 from ._fit.fit_each import fit_each as fit_each
 from ._fit.robust_loss import Huber as Huber
-from ._fit.lead_in import MultiStart as MultiStart, Regress as Regress
+from ._fit.starts import MultiStart as MultiStart, Regress as Regress
 from ._fit.measurement import Measurement as Measurement
 from ._fit.modal_test import ModalTest as ModalTest
 from ._fit.regress import regress as regress

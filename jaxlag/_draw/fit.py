@@ -23,8 +23,9 @@ def fit(fit: Fit, *, number: int = 0, level: float = 0.95, units: Units = None, 
        \qquad |r_i| < 2\sigma $$
 
     The band of the fit shows the uncertainty of the motion that follows from its parameters and initial states; it is often thinner than
-    the line. The band of the residuals is ±2σ, with the sigma of the experiment if one was given, otherwise the estimated one. If the
-    residuals are noise, 95 % of them lie in it, without any pattern; a pattern points to something that the model lacks.
+    the line. Times of events are drawn over those that are fitted. The band of the residuals is ±2σ, with the sigma of the experiment if
+    one was given, otherwise the estimated one. If the residuals are noise, 95 % of them lie in it, without any pattern; a pattern points
+    to something that the model lacks.
 
     **Arguments:**
 
@@ -64,7 +65,6 @@ def fit(fit: Fit, *, number: int = 0, level: float = 0.95, units: Units = None, 
         sigma = jax.tree.map(lambda own, value: np.broadcast_to(own, value.shape), fit.sigmas[number], experiment.values)
     trees = (experiment.values, fit.predictions[number], fit.band(number, level)[1], fit.residuals[number], sigma)
     measured, fitted, upmost, residuals, sigma = (channels(tree, "z") for tree in trees)
-    ts = np.asarray(experiment.ts)
 
     size = (max(5.0, 3.6 * len(measured)), 4.8)
     drawn = panels(axes, (2, len(measured)), "two for each channel", figsize=size, height_ratios=(3, 2))
@@ -72,12 +72,11 @@ def fit(fit: Fit, *, number: int = 0, level: float = 0.95, units: Units = None, 
         several = len(entries) > 1
         for i, (entry, z) in enumerate(entries.items()):
             model, noise = fitted[name][entry], 2 * sigma[name][entry]
+            ts = model if name in experiment.events else np.asarray(experiment.ts)
             upper.plot(ts, z, ".", color=GREY, markersize=3, label=None if i else "measured")
             upper.plot(ts, model, color=colour(i), label=f"{entry} fitted" if several else "fitted")
             reach = upmost[name][entry] - model
-            known = np.isfinite(reach)
-            if known.any():
-                reach = np.interp(ts, ts[known], reach[known])  # interpolated where a sample is missing
+            if np.isfinite(reach).any():
                 text = None if i else f"{100 * level:g} % confidence"
                 upper.fill_between(ts, model - reach, model + reach, color=colour(i), alpha=0.3, linewidth=0, label=text)
             lower.fill_between(ts, -noise, noise, color=GREY, alpha=0.3 / len(entries), linewidth=0)

@@ -98,7 +98,7 @@ def _heading(fit: Fit, title: str) -> str:
     first = html.escape(repr(fit).splitlines()[0])
     remarks = "".join(f"<li>{html.escape(remark)}</li>" for remark in fit.remarks)
     kind = "" if fit.converged and not fit.remarks else ' class="doubt"'
-    found = f"<p>Start found by {html.escape(', then '.join(fit.led_in))}.</p>" if fit.led_in else ""
+    found = f"<p>Start found by {html.escape(', then '.join(fit.start_log))}.</p>" if fit.start_log else ""
     return f"<h1>{html.escape(title)}</h1>\n<div{kind}><p><b>{first}</b></p>{found}{f'<ul>{remarks}</ul>' if remarks else ''}</div>"
 
 
@@ -138,10 +138,11 @@ def _model(fit: Fit) -> str:
 
 def _recordings(fit: Fit, level: float) -> Iterator[tuple[int, str]]:
     """Pictures of each recording in time: measured, fitted, residuals and their spectrum."""
-    recorded = [k for k, e in enumerate(fit.experiments) if isinstance(e, Experiment)]
-    for k in recorded[:MOST_DRAWN]:
+    recorded = [(k, e) for k, e in enumerate(fit.experiments) if isinstance(e, Experiment)]
+    for k, e in recorded[:MOST_DRAWN]:
         motion = _picture(fitted(fit, number=k, level=level), f"Recording {k}: measured and fitted, and the residuals")
-        yield k, motion + _picture(_spectra(fit, k), f"Recording {k}: spectrum of the residuals")
+        has_samples = len(channels(fit.residuals[k], "z")) > len(e.events)
+        yield k, motion + (_picture(_spectra(fit, k), f"Recording {k}: spectrum of the residuals") if has_samples else "")
     if len(recorded) > MOST_DRAWN:
         yield len(recorded), f"<p>{len(recorded) - MOST_DRAWN} more recordings are not drawn.</p>"
 
@@ -151,6 +152,7 @@ def _spectra(fit: Fit, number: int) -> Any:
     experiment, units = fit.experiments[number], units_of(fit.units, None)
     assert isinstance(experiment, Experiment)
     residuals, ts = channels(fit.residuals[number], "z"), np.asarray(experiment.ts)
+    residuals = {name: entries for name, entries in residuals.items() if name not in experiment.events}
     drawn = panels(None, (1, len(residuals)), "one for each channel", figsize=(max(5.0, 3.6 * len(residuals)), 2.4))
     for ax, (name, entries) in zip(np.ravel(drawn), residuals.items(), strict=True):
         for entry, r in entries.items():

@@ -14,14 +14,14 @@ from .._model.recorded import deviations
 from .._model.system import System
 from .arrow import gathered
 from .channels import Channel, channels_of
-from .experiment import Experiment, measured
+from .experiment import Experiment, validate_inputs
 from .fit import fit
 from .fit_card import channel_rows
 from .identifiability import correlation_of, determined_by
 from .linear_test_statistics import channels_of_test
-from .measurement import Test, apart
+from .measurement import Test, split_by_kind
 from .parameters import Free
-from .problem import Problem, failure_of, linearise, with_zero_values
+from .problem import LeastSquaresProblem, failure_of, linearise, with_zero_values
 from .residuals import Model
 from .result import Fit, Prediction
 
@@ -106,7 +106,7 @@ def information(
     jl.information(oscillator, plan, {"c": 4.0}, free=("c",)).standard_errors["c"]
     ```
     """
-    experiments, params = measured(experiments, params, planned=True, tests=(Test,))
+    experiments, params = validate_inputs(experiments, params, planned=True, tests=(Test,))
     for i, e in enumerate(experiments):
         if e.sigma is None:
             raise ValueError(
@@ -120,8 +120,8 @@ def information(
                 )
     chosen = Free.of(params, free, bounds, priors)
     model = Model.of(system, numerics)
-    recordings, tests = apart(experiments)
-    problem = Problem.of(model, chosen, [_with_values(model, chosen, e) for e in recordings], tests)
+    recordings, tests = split_by_kind(experiments)
+    problem = LeastSquaresProblem.of(model, chosen, [_with_values(model, chosen, e) for e in recordings], tests)
     found = linearise(problem, jnp.zeros(problem.size))
     reason = failure_of(found)
     if reason:

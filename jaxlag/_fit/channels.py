@@ -20,7 +20,7 @@ class Channel(NamedTuple):
     - `rms`: root mean square of the residuals, in the unit of the channel.
     - `whiteness`: the p-value of the Ljung–Box test that residuals are independent; small where the model misses something. NaN for modes
       and frequency responses.
-    - `correlated`: the number of samples over which the residuals are correlated, 0 if they are white.
+    - `correlation_length`: the number of samples over which the residuals are correlated, 0 if they are white.
 
     **Source:** Ljung, System Identification, 2nd ed., sections 16.4 and 16.6; Ljung & Box, Biometrika 65 (1978) 297.
 
@@ -41,13 +41,13 @@ class Channel(NamedTuple):
     r_squared: float
     rms: float
     whiteness: float
-    correlated: int
+    correlation_length: int
 
 
 def channels_of(number: int, values: PyTree, residuals: PyTree) -> list[Channel]:
     """Each scalar channel of an experiment, in flat order."""
-    flat = lambda tree: np.concatenate([np.reshape(np.asarray(leaf), (len(leaf), -1)) for leaf in jax.tree.leaves(tree)], axis=1).T
-    return [channel(number, *one) for one in zip(channel_names(values), flat(values), flat(residuals), strict=True)]
+    columns = lambda tree: [z for leaf in jax.tree.leaves(tree) for z in np.reshape(np.asarray(leaf), (len(leaf), -1)).T]
+    return [channel(number, *one) for one in zip(channel_names(values), columns(values), columns(residuals), strict=True)]
 
 
 def channel_names(values: PyTree) -> list[str]:

@@ -16,8 +16,8 @@ class Comparison:
     - `names`: the models, best first by Schwarz's criterion.
     - `aic`, `bic`: by name, the differences from the smallest value of each criterion; dimensionless.
     - `parameters`: by name, the number of unknowns.
-    - `correlated`: the number of samples over which the residuals of the best model are correlated, 0 if they are white. Both criteria
-      assume independent residuals, and otherwise overstate the evidence.
+    - `correlation_length`: the number of samples over which the residuals of the best model are correlated, 0 if they are white. Both
+      criteria assume independent residuals, and otherwise overstate the evidence.
     - `unconverged`: names of the models whose fits have not converged, which may be better than they look.
     - `priors`: by name of a model, the numbers on which its fit had priors; they are no part of the likelihood.
 
@@ -32,7 +32,7 @@ class Comparison:
     aic: dict[str, float]
     bic: dict[str, float]
     parameters: dict[str, int]
-    correlated: int
+    correlation_length: int
     unconverged: tuple[str, ...] = ()
     priors: Mapping[str, tuple[str, ...]] = dataclasses.field(default_factory=dict)
 
@@ -47,8 +47,8 @@ class Comparison:
         if {best, second} & set(self.unconverged):
             strength = "none, until both fits have converged"
         evidence = [f"  evidence for {best!r} against {second!r}: {strength}"]
-        if self.correlated:
-            evidence.append(f"  ! overstated: residuals of {best!r} are correlated over {self.correlated} samples")
+        if self.correlation_length:
+            evidence.append(f"  ! overstated: residuals of {best!r} are correlated over {self.correlation_length} samples")
         evidence += [f"  ! the fit of {name!r} has not converged: the model may be better than it looks" for name in self.unconverged]
         evidence += [f"  {name!r} had priors on {', '.join(numbers)}; only data count here" for name, numbers in self.priors.items()]
         return "\n".join(["Comparison: smaller is better", *rows, *evidence])
@@ -93,7 +93,7 @@ def compare(fits: Mapping[str, Fit]) -> Comparison:
     counts, unconverged = {name: fits[name].unknown_count for name in names}, tuple(name for name in names if not fits[name].converged)
     known = lambda f: [n for n, s in zip(f.names, np.asarray(f.problem.free.prior_deviation), strict=True) if np.isfinite(s)]
     priors = {name: tuple(known(fits[name])) for name in names if known(fits[name])}
-    return Comparison(names, above("aic"), above("bic"), counts, fits[names[0]].correlated, unconverged, priors)
+    return Comparison(names, above("aic"), above("bic"), counts, fits[names[0]].correlation_length, unconverged, priors)
 
 
 def _fingerprint(f):

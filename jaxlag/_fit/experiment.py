@@ -11,7 +11,7 @@ from jaxtyping import Array, Float, PyTree
 
 from .._model.injection import check_function
 from .._model.paths import entry_names, is_within, listed
-from .._model.recorded import delays, deviations, measured_values, of_equal_length, with_events
+from .._model.recorded import delays, deviations, measured_values, with_events
 from .._model.tables import of_frame, of_text, scaled
 from .._model.validation import parameters, sample_times, state
 from .._program.jit import is_concrete
@@ -41,14 +41,14 @@ class Experiment(eqx.Module):
     - `delay`: the time by which the sensors lag behind the motion: a number, or a function of parameters, for all channels but `events`;
       or by channel, `{"laser": lambda lag: lag}`, where the others have none. Until it has passed, they show the state at ts[0]; `events`
       are heard so much later.
-    - `events`: by the name of an event of the system, the times at which it was observed, in order, such as clicks in a sound recording;
-      NaN for one that was missed. Each is a further channel, with its own `sigma`; `values` must then be a mapping, or None. A motion with
-      fewer events cannot be fitted. If there are more of them than samples, the last time is repeated, without measurements.
+    - `events`: by the name of an event of the system, the times at which it was observed, in order, such as clicks in a sound recording,
+      between ts[0] and ts[-1]; NaN for one that was missed. Each is a further channel, with its own `sigma`; `values` must then be a
+      mapping, or None. A motion with fewer events cannot be fitted.
 
     Units are any consistent set.
 
-    **Raises:** `ValueError` or `TypeError` if times, values and sigma are not real numbers or do not fit each other, the start is not
-    finite, `observe` is missing though `values` does not name coordinates, or `unknown` names something else.
+    **Raises:** `ValueError` or `TypeError` if times, values and sigma are not real numbers or do not fit each other, an event lies outside
+    the record, the start is not finite, `observe` is missing though `values` does not name coordinates, or `unknown` names something else.
 
     **Source:** Ljung, System Identification, 2nd ed., section 7.2.
 
@@ -69,7 +69,7 @@ class Experiment(eqx.Module):
     observe: Callable = eqx.field(static=True)
     unknown: tuple[str, ...] = eqx.field(static=True)
     delay: Callable | float | tuple[tuple[str, Any], ...] | None = eqx.field(static=True)  # pairs, where it is by channel
-    events: tuple[str, ...] = eqx.field(static=True)  # channels of `values` that are times of events, in their first rows
+    events: tuple[str, ...] = eqx.field(static=True)  # channels of `values` that are times of events, (K,)
 
     def __init__(
         self,
@@ -90,11 +90,10 @@ class Experiment(eqx.Module):
             if is_concrete(tree) and not all(np.all(np.isfinite(leaf)) for leaf in jax.tree.leaves(tree)):
                 raise ValueError(f"`{which}` must be finite, but has a missing value. Give a guess, and name it in `unknown`.")
         dtype = jax.tree.leaves(self.q0)[0].dtype
-        ts = sample_times(ts, dtype, repeated=True)
-        values = {} if values is None and events else measured_values(values, ts, dtype)
-        channels = with_events(values, events, dtype)
-        sigma = None if sigma is None else deviations(sigma, channels)
-        self.ts, self.values, self.sigma = of_equal_length(ts, channels, sigma)
+        self.ts = sample_times(ts, dtype, repeated=True)
+        values = {} if values is None and events else measured_values(values, self.ts, dtype)
+        self.values = with_events(values, events, self.ts, dtype, late=delay if isinstance(delay, Mapping) else ())
+        self.sigma = None if sigma is None else deviations(sigma, self.values)
         self.events = tuple(events or ())
         self.observe = Coordinates.named_by(values, self.q0) if observe is None else observe
         if params is not None and not isinstance(params, Mapping):
@@ -175,7 +174,9 @@ class Experiment(eqx.Module):
         return cls(ts, values, q0, qdot0, **more)
 
 
-def measured(experiments: Any, params: PyTree, *, planned: bool = False, tests: tuple[type, ...] = ()) -> tuple[tuple[Any, ...], PyTree]:
+def validate_inputs(
+    experiments: Any, params: PyTree, *, planned: bool = False, tests: tuple[type, ...] = ()
+) -> tuple[tuple[Any, ...], PyTree]:
     """One experiment or several as a tuple, and `params` as arrays, both checked; `tests`: classes of what may stand among them."""
     kinds = (Experiment, *tests)
     experiments = (experiments,) if isinstance(experiments, eqx.Module) else tuple(experiments)

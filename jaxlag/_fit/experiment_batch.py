@@ -27,7 +27,8 @@ from .experiment import Experiment, start_entries, with_own
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True, eq=False)
 class ExperimentBatch:
-    """Experiments of one kind: each array has them as its first axis. Shorter records are padded with missing samples.
+    """Experiments of one kind: each array has them as its first axis. Shorter records are padded with missing samples, and events that
+    fewer of were observed with missing ones.
 
     `tangent_basis`: (experiments, 2n, k), directions in which the flat start (q0, qdot0) moves with the first k of an experiment's own
     unknowns z; the other entries of z are its unknown parameters.
@@ -42,7 +43,7 @@ class ExperimentBatch:
     tangent_basis: Any
     observe: Callable = dataclasses.field(metadata={"static": True})
     delay: Any = dataclasses.field(metadata={"static": True})
-    events: tuple[str, ...] = dataclasses.field(metadata={"static": True})  # channels that are times of events
+    events: tuple[str, ...] = dataclasses.field(metadata={"static": True})  # channels that are times of events, (experiments, K)
     own: tuple[str, ...] = dataclasses.field(metadata={"static": True})  # entries of params that are unknown
     members: tuple[int, ...] = dataclasses.field(metadata={"static": True})  # indices of the experiments
     mesh: Mesh | None = dataclasses.field(default=None, metadata={"static": True})  # the devices they are distributed over
@@ -56,8 +57,13 @@ class ExperimentBatch:
     @property
     def times(self) -> list[Any]:
         """For each leaf of the values when its rows were measured, (experiments, T): those of events are times themselves."""
-        leaves = jax.tree_util.tree_flatten_with_path(self.values)[0]
-        return [leaf if self.events and path[0].key in self.events else self.ts for path, leaf in leaves]
+        leaves = jax.tree.leaves(self.values)
+        return [leaf if of_event else self.ts for leaf, of_event in zip(leaves, of_events(self), strict=True)]
+
+    def flat(self, tree: PyTree) -> np.ndarray:
+        """What is structured like the values, one channel after the other, (experiments, N); without the copies that may follow."""
+        count = len(self.members)
+        return np.concatenate([np.reshape(np.asarray(x)[:count], (count, -1)) for x in jax.tree.leaves(tree)], axis=1)
 
     def start(self, z: Float[Array, " d"]) -> tuple[PyTree, PyTree, dict[str, Any]]:
         """q0, qdot0 and the own parameters of one experiment (a batch without its first axis) at its unknowns z."""
@@ -87,32 +93,28 @@ def _unknown_params(e):
     return tuple(name for name in e.unknown if name in e.params)
 
 
+def of_events(e: Any) -> list[bool]:
+    """For each leaf of the values of an experiment or a batch, whether it holds times of events."""
+    paths = jax.tree_util.tree_flatten_with_path(e.values)[0]
+    return [bool(e.events) and path[0].key in e.events for path, _ in paths]
+
+
 def _batch(experiments, bases, members):
-    longest = max(e.ts.size for e in experiments)
     xnp = numpy_for(experiments, bases)
 
-    def pad(x, e, padding=None):
-        x = xnp.asarray(x)
-        return xnp.concatenate([x, xnp.broadcast_to(x[-1] if padding is None else padding, (longest - e.ts.size, *x.shape[1:]))])
+    def padded(leaves, padding=None):
+        longest, leaves = max(map(len, leaves)), [xnp.asarray(x) for x in leaves]
+        more = lambda x: xnp.broadcast_to(x[-1] if padding is None else padding, (longest - len(x), *x.shape[1:]))
+        return xnp.stack([xnp.concatenate([x, more(x)]) for x in leaves])
 
-    sigma = lambda e: e.sigma if e.sigma is not None else jax.tree.map(xnp.ones_like, e.values)
-    padded = [
-        (
-            pad(e.ts, e),
-            jax.tree.map(lambda v, e=e: pad(v, e, jnp.nan), e.values),
-            jax.tree.map(lambda s, e=e: pad(s, e, 1.0), sigma(e)),
-            e.q0,
-            e.qdot0,
-            e.params,
-            basis,
-        )
-        for e, basis in zip(experiments, bases, strict=True)
-    ]
-    arrays, others = eqx.partition(padded, eqx.is_array)
-    together = eqx.combine(jax.tree.map(lambda *leaves: xnp.stack(leaves), *arrays), others[0])
+    together = lambda trees, padding: jax.tree.map(lambda *leaves: padded(leaves, padding), *trees)
+    sigmas = [e.sigma if e.sigma is not None else jax.tree.map(xnp.ones_like, e.values) for e in experiments]
+    recorded = padded([e.ts for e in experiments]), together([e.values for e in experiments], jnp.nan), together(sigmas, 1.0)
+    arrays, others = eqx.partition([(e.q0, e.qdot0, e.params, basis) for e, basis in zip(experiments, bases, strict=True)], eqx.is_array)
+    rest = eqx.combine(jax.tree.map(lambda *leaves: xnp.stack(leaves), *arrays), others[0])
     first = experiments[0]
     kind = first.observe, first.delay, first.events, _unknown_params(first)
-    return _distributed(ExperimentBatch(*together, *kind, tuple(members)))
+    return _distributed(ExperimentBatch(*recorded, *rest, *kind, tuple(members)))
 
 
 def _distributed(batch):

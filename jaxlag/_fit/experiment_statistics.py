@@ -31,11 +31,7 @@ def _own_estimates(minimum, k, row, e, known, scale):
     own_columns = minimum.problem.own_columns(k, np.array([row]))[0]
     z, columns = minimum.x[own_columns], np.r_[0:p, own_columns]
 
-    def errors(J):
-        variance = np.einsum("ij,jk,ik->i", J, known.covariance[np.ix_(columns, columns)], J)
-        loose = np.any(np.abs(J @ known.null[columns]) > 1e-6 * np.max(np.abs(J), initial=1e-300), axis=1)
-        return np.where(loose, np.inf, scale * np.sqrt(np.maximum(variance, 0)))
-
+    errors = lambda J: scale * known.deviations(J, columns)
     one = jax.tree.map(lambda leaf: leaf[row] if eqx.is_array(leaf) else leaf, batch)
     own_params = lambda z: ravel_pytree({name: one.start(z)[2][name] for name in batch.own})
     own, unravel_own = own_params(jnp.asarray(z))
@@ -80,37 +76,31 @@ class Predicted(NamedTuple):
     deviations: PyTree
 
 
-def predictions_of(minimum: Minimum, covariance: np.ndarray) -> list[Predicted]:
+def predictions_of(minimum: Minimum, known: Determined) -> list[Predicted]:
     """For each experiment, its segments put together."""
     found = []
-    joined = lambda parts: jax.tree.map(lambda *leaves: np.concatenate(leaves), *parts)
     for e, segments in zip(minimum.recordings, minimum.segments_of_each(), strict=True):
-        seen, deviations = [], []
-        for k, row, n in segments:
-            own_samples = lambda tree, n=n: jax.tree.map(lambda x: x[:n], tree)
-            seen.append(own_samples(jax.tree.map(lambda x, row=row: np.asarray(x)[row], minimum.found.batches[k].channels)))
-            deviations.append(own_samples(_deviations(minimum, k, row, covariance)))
-        predictions = joined(seen)
-        found.append(Predicted(jax.tree.map(lambda z, p: np.asarray(z) - p, e.values, predictions), predictions, joined(deviations)))
+        parts = [jax.tree.map(lambda x, row=row: np.asarray(x)[row], minimum.found.batches[k].channels) for k, row, _ in segments]
+        counts = [n for *_, n in segments] if len(segments) > 1 else [None]
+        predictions = _joined(e.values, parts, counts)
+        deviations = _joined(e.values, [_deviations(minimum, k, row, known) for k, row, _ in segments], counts)
+        found.append(Predicted(jax.tree.map(lambda z, p: np.asarray(z) - p, e.values, predictions), predictions, deviations))
     return found
 
 
-def _deviations(minimum, k, row, covariance):
-    """√(J cov Jᵀ) of the predictions of one experiment; NaN where nothing was measured, for J is not known there."""
-    batch, part, loss = minimum.problem.batches[k], minimum.found.batches[k], minimum.problem.model.loss
-    values, sigma, seen = (jax.tree.map(lambda x: np.asarray(x)[row], tree) for tree in (batch.values, batch.sigma, part.channels))
-    if part.jacobian is None:
-        return jax.tree.map(lambda z: np.full(z.shape, np.nan), values)
-    flat = lambda tree: np.concatenate([np.ravel(leaf) for leaf in jax.tree.leaves(tree)])
-    columns = np.r_[0 : minimum.size, minimum.problem.own_columns(k, np.array([row]))[0]]
-    J = np.asarray(part.jacobian)[row] * flat(sigma)[:, None]
-    if loss is not None:
-        weighted = np.nan_to_num((flat(values) - flat(seen)) / flat(sigma))
-        J = J / np.asarray(loss.slope(weighted / minimum.problem.scale))[:, None]
-    deviation = np.sqrt(np.maximum(np.einsum("ij,jk,ik->i", J, covariance[np.ix_(columns, columns)], J), 0))
-    there = np.where(np.isfinite(flat(values)), deviation, np.nan)
-    leaves, structure = jax.tree.flatten(values)
-    parts = np.split(there, np.cumsum([leaf.size for leaf in leaves])[:-1])
+def _joined(values, parts, counts):
+    """The parts of an experiment, each with so many samples of its own, or None for all; beyond its `values` there may be padding."""
+    return jax.tree.map(lambda z, *xs: np.concatenate([x[:n] for x, n in zip(xs, counts, strict=True)])[: len(z)], values, *parts)
+
+
+def _deviations(minimum, k, row, known):
+    """√(J cov Jᵀ) of the predictions of one experiment, also of those that were not measured."""
+    leaves, structure = jax.tree.flatten(jax.tree.map(lambda z: z[row], minimum.problem.batches[k].values))
+    J = minimum.found.batches[k].channels_jacobian
+    if J is None:
+        return jax.tree.unflatten(structure, [np.full(leaf.shape, np.nan) for leaf in leaves])
+    deviations = known.deviations(np.asarray(J)[row], minimum.problem.columns(k)[row])
+    parts = np.split(deviations, np.cumsum([leaf.size for leaf in leaves])[:-1])
     return jax.tree.unflatten(structure, [part.reshape(leaf.shape) for part, leaf in zip(parts, leaves, strict=True)])
 
 

@@ -14,16 +14,16 @@ from .._model.numbers import count
 from .._model.system import System
 from .._model.validation import without_contacts, without_events
 from .._motion.progress import Steps, compiling
-from .experiment import Experiment, measured
-from .lead_in import MultiStart, Regress, explains_too_little, led_in, without_unknown
-from .measurement import Test, apart
+from .experiment import Experiment, validate_inputs
+from .measurement import Test, split_by_kind
 from .minimise import minimise
 from .multiple_shooting import Segments, cut
 from .parameters import Free
-from .problem import Problem
+from .problem import LeastSquaresProblem
 from .residuals import Model
 from .result import Fit
 from .robust_loss import Huber
+from .starts import MultiStart, Regress, explains_too_little, from_better_start, without_unknown
 from .statistics import report
 
 
@@ -99,15 +99,15 @@ def fit(
     if (segments > 1) + (method is not None) + (start is not None) > 1:
         raise ValueError("`segments`, `start` and `method` must be used one at a time, but more than one was given. Omit the others.")
     starts, start = (start.count, None) if isinstance(start, MultiStart) else (1, start)
-    experiments, params = measured(experiments, params, tests=(Test,))
-    recordings, tests = apart(experiments)
+    experiments, params = validate_inputs(experiments, params, tests=(Test,))
+    recordings, tests = split_by_kind(experiments)
     if tests:
         _check_options(recordings, loss, segments, start)
     common: dict[str, Any] = {"free": free, "bounds": bounds}
     steps = (100 if method is None else 1000) if max_steps is None else max_steps
     fit_from = partial(fit, system, priors=priors, loss=loss, tolerance=tolerance, progress=progress, start=None, **common, **numerics)
     if start is not None:
-        return led_in(fit_from, system, experiments, params, start, steps, **common)
+        return from_better_start(fit_from, system, experiments, params, start, steps, **common)
     params, done = without_unknown(system, experiments, params, **common)
     problem, experiments = checked_problem(system, experiments, params, free, bounds, priors, loss, method is None, numerics)
     line = Steps(steps) if progress else None
@@ -130,10 +130,10 @@ def fit(
         finally:
             if line:
                 line.end()
-        found = dataclasses.replace(report(problem, experiments, outcome, of_segments), led_in=done)
+        found = dataclasses.replace(report(problem, experiments, outcome, of_segments), start_log=done)
     if automatic and method is None and segments == starts == 1 and not tests and explains_too_little(found):
         with contextlib.suppress(ValueError):  # of what has no regression, or none from which a motion can be computed
-            return led_in(fit_from, system, experiments, params, Regress(), steps, first=found, **common)
+            return from_better_start(fit_from, system, experiments, params, Regress(), steps, first=found, **common)
     return found
 
 
@@ -164,9 +164,9 @@ def checked_problem(
     relative: bool,
     numerics: Mapping[str, Any],
     alone: bool = False,
-) -> tuple[Problem, tuple[Any, ...]]:
+) -> tuple[LeastSquaresProblem, tuple[Any, ...]]:
     """The problem after all checks of the arguments, and the experiments."""
-    experiments, params = measured(experiments, params, tests=(Test,))
+    experiments, params = validate_inputs(experiments, params, tests=(Test,))
     if len({e.sigma is None for e in experiments}) > 1:
         raise ValueError("`experiments` must all have a `sigma` or none, but only some have. Give each of them one.")
     chosen = Free.of(params, free, bounds, priors, relative)
@@ -177,7 +177,7 @@ def checked_problem(
             raise ValueError(
                 f"`free` must name parameters that experiments share, but each has a {name!r} of its own. Name it `unknown` there."
             )
-    problem = Problem.of(Model.of(system, numerics, loss), chosen, *apart(experiments))
+    problem = LeastSquaresProblem.of(Model.of(system, numerics, loss), chosen, *split_by_kind(experiments))
     if problem.size == 0:
         raise ValueError("`free` must name at least one entry of params, but is empty. Say which parameters to identify.")
     if relative:  # optimisers of optax, which stop early, are for networks, which have more weights than there are samples

@@ -10,8 +10,8 @@ from jax.flatten_util import ravel_pytree
 
 from .._model.paths import entry_names, is_within
 from .autocorrelation import COLOURED
-from .channel_sigma import sigmas_of
 from .channels import Channel
+from .noise import sigmas_of
 from .rounding import plus_minus, rounded
 
 ROWS = 40  # of a table at most
@@ -25,7 +25,7 @@ def card(fit: Any) -> str:
     """The card of a `Fit`, a line for each element."""
     rows = [
         _heading(fit),
-        *([f"  start found by {', then '.join(fit.led_in)}"] if fit.led_in else []),
+        *([f"  start found by {', then '.join(fit.start_log)}"] if fit.start_log else []),
         *_parameter_rows(fit),
         *_correlation_rows(fit),
         *_inflation_rows(fit),
@@ -122,13 +122,13 @@ def _correlation_rows(fit):
 
 
 def _inflation_rows(fit):
-    if not fit.correlated:
+    if not fit.correlation_length:
         return []
     known = fit.inflation[np.isfinite(fit.inflation) & np.isfinite(np.diag(fit.covariance))]
     factors = dict.fromkeys(f"{x:.2g}" for x in (np.min(known), np.max(known))) if known.size else ()
     larger = f": {' to '.join(factors)} times those for white residuals" if known.size else ""
     uneven = " that are not evenly spaced in time" if any(map(_is_uneven, fit.experiments)) else ""
-    return [f"  standard errors account for residuals correlated over {fit.correlated} samples{uneven}{larger}"]
+    return [f"  standard errors account for residuals correlated over {fit.correlation_length} samples{uneven}{larger}"]
 
 
 def _is_uneven(e):

@@ -8,14 +8,14 @@ from jaxtyping import PyTree
 
 from .._model.system import System
 from .._motion.progress import Steps, compiling
-from .experiment import Experiment, measured
+from .experiment import Experiment, validate_inputs
 from .fit import absolute, checked_problem, count_measured, fit
-from .lead_in import without_unknown
-from .measurement import Test, apart
-from .minimise import each_apart, minimise_each
+from .measurement import Test, split_by_kind
+from .minimise import minimise_each, split_by_experiment
 from .multiple_shooting import Segments
 from .result import Fit
 from .robust_loss import Huber
+from .starts import without_unknown
 from .statistics import report
 
 
@@ -59,8 +59,8 @@ def fit_each(
     [fit.estimates["c"] for fit in jl.fit_each(oscillator, records, {"c": 3.0}, free=("c",))]  # [4.0, 4.41]
     ```
     """
-    experiments, params = measured(experiments, params, tests=(Test,))
-    if apart(experiments)[1]:
+    experiments, params = validate_inputs(experiments, params, tests=(Test,))
+    if split_by_kind(experiments)[1]:
         raise ValueError("`experiments` must be recordings in time, to be fitted in a batch, but some are tests. Call `fit` for each.")
     if start is not None or method is not None or segments != 1:
         how = {"free": free, "bounds": bounds, "priors": priors, "loss": loss, "method": method, "segments": segments, "start": start}
@@ -86,6 +86,6 @@ def fit_each(
         finally:
             if line:
                 line.end()
-        ends = each_apart(problem, outcome)
+        ends = split_by_experiment(problem, outcome)
         fits = [report(one, (e,), end, Segments(one, (0,), ())) for e, (one, end) in zip(experiments, ends, strict=True)]
-    return [dataclasses.replace(found, led_in=done) for found in fits]
+    return [dataclasses.replace(found, start_log=done) for found in fits]

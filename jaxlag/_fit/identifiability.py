@@ -2,26 +2,38 @@
 
 import fractions
 import itertools
-from collections.abc import Sequence
-from typing import NamedTuple
+from collections.abc import Iterable, Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
+
+from .base_parameters import NOISE, ROUNDING, Combination, Places, Point, base_parameters, column_space, parts_of
 
 MANY = 12  # parameters; among more, no combinations are looked for
 ZERO = 1e-9  # singular values below this part of the largest are zero: columns have norm one, and are as exact as the integration
 ZERO_ULPS = 300  # or this many units in the last place, in single precision
-NEGLIGIBLE = 1e-6  # entries of a null vector, relative to the parameters, that count as zero
+VISIBLE = 1e-6  # of the largest derivative, by which what is predicted depends on what is not determined
 
 
 class Determined(NamedTuple):
     """What the measurements determine of all unknowns.
 
-    `covariance` over σ², (x, x); `determined`, (x,): whether each unknown is; `null`, (x, k): directions that do not show, as columns.
+    `covariance` over σ², (x, x); `determined`, (x,): whether each unknown is; `null`, (x, k): directions that do not show, as columns;
+    `noise`: their error, relative.
     """
 
     covariance: np.ndarray
     determined: np.ndarray
     null: np.ndarray
+    noise: float = 0.0
+
+    def deviations(self, J: np.ndarray, columns: Any = slice(None)) -> np.ndarray:
+        """√(J cov Jᵀ) over σ of what depends on the unknowns `columns` by the rows J; infinite where it depends on what does not show."""
+        finite = np.all(np.isfinite(J), axis=1)
+        J = np.where(finite[:, None], J, 0)
+        variance = np.einsum("ij,jk,ik->i", J, self.covariance[columns][:, columns], J)
+        loose = np.any(np.abs(J @ self.null[columns]) > VISIBLE * np.max(np.abs(J), initial=1e-300), axis=1)
+        return np.where(finite, np.where(loose, np.inf, np.sqrt(np.maximum(variance, 0))), np.nan)
 
 
 def determined_by(J: np.ndarray, gaps_J: np.ndarray, hidden: int | None = None) -> Determined:
@@ -41,7 +53,8 @@ def determined_by(J: np.ndarray, gaps_J: np.ndarray, hidden: int | None = None) 
     directions = basis @ Vt.T
     inverse = directions[:, ~weak] / s[~weak] ** 2 @ directions[:, ~weak].T
     null = directions[:, weak]
-    return Determined(inverse * np.outer(scale, scale), np.all(np.abs(null) < 1e-4, axis=1), null * scale[:, None])
+    noise = np.max(s[weak], initial=0) / np.min(s[~weak], initial=np.inf)
+    return Determined(inverse * np.outer(scale, scale), np.all(np.abs(null) < 1e-4, axis=1), null * scale[:, None], float(noise))
 
 
 def correlation_of(covariance: np.ndarray) -> np.ndarray:
@@ -51,86 +64,93 @@ def correlation_of(covariance: np.ndarray) -> np.ndarray:
     return np.where(np.isfinite(covariance), covariance, np.nan) / np.outer(errors, errors)
 
 
-class Combinations(NamedTuple):
-    """What is determined of some parameters: θ_i Π θ_j^−x, or θ_i − Σ x θ_j; for each the index i, and the pairs (j, x)."""
+class Group(NamedTuple):
+    """Parameters, by their indices, that can change together along `directions`, (len(joint), k), but with no others.
 
-    products: bool
-    common_factor: bool  # whether a common factor is all that is not determined
-    terms: tuple[tuple[int, tuple[tuple[int, fractions.Fraction], ...]], ...]
+    `combinations`: what of them is determined, where it is simple; `common_factor`: whether nothing else than a common factor is not.
+    """
+
+    joint: list[int]
+    directions: np.ndarray
+    combinations: tuple[Combination, ...] = ()
+    common_factor: bool = False
 
 
 class Undetermined(NamedTuple):
     """Which of the parameters the measurements do not determine, by their indices.
 
     - `idle`: those that no measurement depends on. `with_start`: those that trade with the unknown starts.
-    - `joint`: the others, which can change together along `directions`, (len(joint), k). `combinations`: what of them is determined,
-      where it is simple.
+    - `groups`: the others.
     """
 
     idle: list[int]
     with_start: list[int]
-    joint: list[int]
-    directions: np.ndarray
-    combinations: Combinations | None
+    groups: list[Group]
+
+    @property
+    def combinations(self) -> list[Combination]:
+        """What of the groups is determined."""
+        return [combination for group in self.groups for combination in group.combinations]
 
 
-def undetermined(theta: np.ndarray, nulls: Sequence[np.ndarray], thetas: Sequence[np.ndarray], idle: Sequence[int] = ()) -> Undetermined:
+def undetermined(points: Iterable[Point], determined: Sequence[int] = (), idle: Sequence[int] = (), noise: float = 0.0) -> Undetermined:
     """Sorts the changes of θ that do not show.
 
-    `nulls`: at the points `thetas`, those changes, as columns. Where they are the same at two points relative to θ, products of the
-    parameters are determined; where they are the same absolutely, sums are. `idle`: parameters that no measurement depends on.
+    **Arguments:**
+
+    - `points`: θ and those changes, as columns: the estimate first, then points around it, of which no more are asked for than are needed.
+      Where the changes are the same at all points relative to θ, products of the parameters are determined; otherwise polynomials are
+      looked for.
+    - `determined`: parameters that are. `idle`: those that no measurement depends on. `noise`: of the changes.
 
     **Source:** Walter & Pronzato, Identification of Parametric Models (1997), section 2.6 (structural identifiability).
     """
-    scale = np.where(theta == 0, 1, np.abs(theta))
-    nulls = [_without_idle(null / scale[:, None], idle) * scale[:, None] for null in nulls]
-    with_start = [i for i in range(theta.size) if _alone(i, nulls, scale)]
-    for null in nulls:
-        null[with_start] = 0
-    nulls = [null[:, np.linalg.norm(null / scale[:, None], axis=0) > NEGLIGIBLE] for null in nulls]
-    joint = [i for i in range(theta.size) if np.max(np.abs(nulls[0][i] / scale[i]), initial=0) > NEGLIGIBLE]
-    combinations = _combinations(joint, nulls, thetas) if 0 < len(joint) <= MANY else None
-    return Undetermined(list(idle), with_start, joint, nulls[0][joint], combinations)
+    points, tolerance = iter(points), max(ROUNDING, NOISE * noise)
+    begin, fixed = list(itertools.islice(points, 2)), [*idle, *determined]
+    spaces = [space for _, space in Places(begin, fixed, tolerance).first(2)]
+    with_start = [i for i in range(len(spaces[0])) if all(_is_alone(i, space) for space in spaces)]
+    places = Places(itertools.chain(begin, points), [*fixed, *with_start], tolerance)
+    ((_, space),) = places.first(1)
+    return Undetermined(list(idle), with_start, [_group(joint, determined, places) for joint in parts_of(space)])
 
 
-def _without_idle(null, idle):
-    """A basis of the changes among the other parameters."""
-    size = np.linalg.norm(null, axis=0)
-    null[list(idle)] = 0
-    return _column_space(null[:, np.linalg.norm(null, axis=0) > NEGLIGIBLE * size])  # what is left out is rounding
-
-
-def _alone(i, nulls, scale):
+def _is_alone(i, space):
     """Whether a change of parameter i alone does not show."""
-    e = np.eye(scale.size)[:, [i]]
-    spaces = [null / scale[:, None] for null in nulls]
-    return all(space.size and np.linalg.norm(e - space @ (space.T @ e)) < 1e-5 for space in spaces)
+    e = np.eye(len(space))[:, i]
+    return np.linalg.norm(e - space @ (space.T @ e)) < 1e-5
 
 
-def _column_space(A):
-    U, s, _ = np.linalg.svd(A, full_matrices=False)
-    return U[:, s > 1e-6 * max(s[0], 1e-300)] if s.size else U
+def _group(joint, determined, places):
+    """Products of the joint parameters that are determined, or polynomials; neither where there are no simple ones, or too many."""
+    ((_, space),) = places.first(1)
+    group = Group(joint, column_space(space[joint]) * places.scale[joint, None])
+    if len(joint) > MANY:
+        return group
+    found = _products(joint, places)
+    if found is not None:
+        return group._replace(combinations=found[0], common_factor=found[1])
+    return group._replace(combinations=base_parameters(joint, determined, places) or ())
 
 
-def _combinations(joint, nulls, thetas):
-    """Products or sums of the joint parameters that are determined; None where there are no simple ones."""
-    for products in (True, False):
-        units = [theta if products else np.ones_like(theta) for theta in thetas]
-        if any(np.any(unit[joint] == 0) for unit in units):
-            continue
-        spaces = [_column_space((null / unit[:, None])[joint]) for null, unit in zip(nulls, units, strict=True)]
-        if spaces[0].shape != spaces[1].shape or np.linalg.norm(spaces[0] - spaces[1] @ (spaces[1].T @ spaces[0])) > 1e-4:
-            continue
-        simplest = _simplest(spaces[0])
-        if simplest is None or len(simplest[0]) == len(joint):
-            continue
-        pivots, exact = simplest
-        factors = {i: tuple((joint[p], x) for p, x in zip(pivots, row, strict=True) if x != 0) for i, row in enumerate(exact)}
-        if any(not factors[i] for i in factors if i not in pivots):  # which would be determined alone, but is not everywhere
-            continue
-        common = products and all(x == 1 for row in exact for x in row)
-        return Combinations(products, common, tuple((joint[i], factors[i]) for i in factors if i not in pivots))
-    return None
+def _products(joint, places):
+    """θ_i Π θ_j^−x, and whether all are ratios of one θ_j; None where the changes are not the same everywhere."""
+    points = places.first(3)
+    if len(points) < 2 or any(np.any(theta[joint] == 0) for theta, _ in points):
+        return None
+    first, *others = [column_space(space[joint] / theta[joint, None]) for theta, space in points]
+    if any(first.shape != other.shape or np.linalg.norm(first - other @ (other.T @ first)) > 1e-4 for other in others):
+        return None
+    simplest = _simplest(first)
+    if simplest is None or len(simplest[0]) == len(joint):
+        return None
+    pivots, exact = simplest
+    if any(not any(row) for i, row in enumerate(exact) if i not in pivots):  # which would be determined alone, but is not everywhere
+        return None
+    exponents = np.zeros((len(joint), places.scale.size), object)
+    exponents[range(len(joint)), joint] = 1
+    exponents[:, [joint[p] for p in pivots]] -= np.array(exact, object)
+    products = tuple(Combination((fractions.Fraction(1),), (tuple(row),)) for i, row in enumerate(exponents) if i not in pivots)
+    return products, all(x == 1 for row in exact for x in row)
 
 
 def _simplest(space):

@@ -9,6 +9,7 @@ from .channels import Channel, channel
 from .experiment import Experiment
 from .experiment_statistics import Predicted
 from .frequency_response_test import FrequencyResponseTest
+from .identifiability import Determined
 from .linear_test import LinearTest, linear_at
 from .measurement import Test, deviations
 from .minimum import Minimum
@@ -16,15 +17,14 @@ from .minimum import Minimum
 UNDAMPED = 1e-6  # damping ratio that counts as none
 
 
-def predicted_tests(minimum: Minimum, covariance: np.ndarray) -> list[Predicted]:
+def predicted_tests(minimum: Minimum, known: Determined) -> list[Predicted]:
     """For each test what is left of it, its predictions, and their standard errors over σ̂."""
-    p, pairs = minimum.size, zip(minimum.problem.tests, minimum.found.tests, strict=True)
-    return [_predicted(part.test, found, covariance[:p, :p]) for part, found in pairs]
+    return [_predicted(part.test, found, known) for part, found in zip(minimum.problem.tests, minimum.found.tests, strict=True)]
 
 
-def _predicted(test, found, covariance):
+def _predicted(test, found, known):
     predictions = jax.tree.map(np.asarray, found.predictions)
-    return Predicted(jax.tree.map(np.subtract, test.values, predictions), predictions, deviations(test, found, covariance))
+    return Predicted(jax.tree.map(np.subtract, test.values, predictions), predictions, deviations(test, found, known))
 
 
 def channels_of_test(number: int, test: Test, near: LinearSystem | None, residuals: PyTree) -> list[Channel]:

@@ -15,6 +15,7 @@ from .._model.numbers import numbers
 from .._model.system import System
 from .channels import channel_names
 from .experiment import Experiment, with_own
+from .identifiability import Determined
 from .parameters import Free
 
 
@@ -185,12 +186,12 @@ def parts(x: Any) -> Any:
     return jnp.stack([x.real, x.imag], axis=-1) if jnp.iscomplexobj(x) else x
 
 
-def deviations(test: Test, found: Evaluated, covariance: np.ndarray) -> PyTree:
+def deviations(test: Test, found: Evaluated, known: Determined) -> PyTree:
     """√(J cov Jᵀ) of the predictions; of complex ones those of both parts, as a complex number. NaN where nothing was measured."""
     if found.jacobian is None:
         return jax.tree.map(lambda z: np.full(z.shape, np.nan), test.values)
     J = np.asarray(found.jacobian)
-    rows = np.sqrt(np.maximum(np.einsum("ij,jk,ik->i", J, covariance, J), 0))
+    rows = known.deviations(J, np.arange(J.shape[1]))
     leaves, structure = jax.tree.flatten(test.values)
     ends = np.cumsum([z.size * (2 if np.iscomplexobj(z) else 1) for z in leaves])
     of_each = zip(np.split(rows, ends[:-1]), leaves, jax.tree.leaves(test.sigma), strict=True)
@@ -202,7 +203,7 @@ def _of_values(rows, z, sigma):
     return np.where(np.isfinite(z), own * sigma, np.nan)
 
 
-def apart(experiments: Sequence[Any]) -> tuple[tuple[Experiment, ...], tuple[Test, ...]]:
+def split_by_kind(experiments: Sequence[Any]) -> tuple[tuple[Experiment, ...], tuple[Test, ...]]:
     """The recordings in time, and the tests."""
     recordings = tuple(e for e in experiments if isinstance(e, Experiment))
     return recordings, tuple(e for e in experiments if not isinstance(e, Experiment))

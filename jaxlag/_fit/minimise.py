@@ -10,12 +10,13 @@ import numpy as np
 
 from .._motion.derivative_rule import FORWARD_LIMIT
 from .._program.jit import compiled
-from .channel_sigma import sigmas_of, weighted_by_residuals, weighted_by_spread
 from .experiment_batch import with_sigma
 from .levenberg_marquardt import INTERRUPTED, STEP_LIMIT, Iterate, Outcome, levenberg_marquardt
 from .multiple_shooting import join
+from .noise import Channels, sigmas_of, weighted_by_residuals, weighted_by_spread
 from .problem import (
-    Problem,
+    LeastSquaresProblem,
+    NoMotion,
     failure_of,
     held_by_jax,
     linearise,
@@ -33,18 +34,22 @@ SETTLED = 1e-4  # relative change of a sigma from one round to the next that cou
 AT_THE_START = "the motion at the start must be computable"
 
 
-def minimise(problem: Problem, *, method: Any, starts: int, estimate_sigma: bool, **limits: Any) -> tuple[Outcome, Problem]:
+def minimise(
+    problem: LeastSquaresProblem, *, method: Any, starts: int, estimate_sigma: bool, **limits: Any
+) -> tuple[Outcome, LeastSquaresProblem]:
     """The outcome, and the problem it belongs to: with the sigmas of the channels and the continuity of the last round.
 
     `limits`: `freedom`, `max_steps`, `tolerance` and `progress` of `levenberg_marquardt`.
     """
-    problem = weighted_by_spread(problem) if estimate_sigma else problem
+    if estimate_sigma:
+        channels = Channels.of(problem)
+        problem = weighted_by_spread(problem, channels)
     apart = problem.continuity  # the weight of the gaps grows anew in each round
     outcome, problem = _minimise(problem, problem.begin, method, starts, limits)
     for _ in range(_rounds(problem, method) if estimate_sigma else 0):
         if int(outcome.best.status) in (INTERRUPTED, STEP_LIMIT) and method is None:
             break
-        before, (reweighted, change) = outcome, weighted_by_residuals(problem, outcome.best.aux)
+        before, (reweighted, change) = outcome, weighted_by_residuals(problem, channels, outcome.best.aux)
         if change < SETTLED:
             break
         reweighted = dataclasses.replace(reweighted, continuity=apart)
@@ -60,7 +65,7 @@ def _rounds(problem, method):
     return SIGMA_ROUNDS if method is None and problem.model.loss is None else ROBUST_ROUNDS if method is None else OPTAX_ROUNDS
 
 
-def minimise_each(problem: Problem, *, estimate_sigma: bool, **limits: Any) -> tuple[Outcome, Problem]:
+def minimise_each(problem: LeastSquaresProblem, *, estimate_sigma: bool, **limits: Any) -> tuple[Outcome, LeastSquaresProblem]:
     """Each experiment of a problem with one batch by itself, with sigmas of its own; `limits` as for `minimise`."""
     (batch,) = problem.batches
     count = len(batch.members)
@@ -76,11 +81,14 @@ def minimise_each(problem: Problem, *, estimate_sigma: bool, **limits: Any) -> t
         return levenberg_marquardt(residuals, xs, bounds=bounds, size=sizes, noise=_noise_of(problem), **limits)
 
     if estimate_sigma:
-        problem = _each_weighted(problem, [weighted_by_spread(one) for one, _ in each_apart(problem)])
+        channels = [Channels.of(one) for one, _ in split_by_experiment(problem)]
+        problem = _each_weighted(
+            problem, [weighted_by_spread(one, of) for (one, _), of in zip(split_by_experiment(problem), channels, strict=True)]
+        )
     outcome = minimised(problem, jnp.zeros((count, problem.free.size + batch.unknowns)))
     for _ in range(_rounds(problem, None) if estimate_sigma else 0):
-        apart = [(one, end.best) for one, end in each_apart(problem, outcome)]
-        found = [weighted_by_residuals(one, best.aux) if np.isfinite(best.cost) else (one, 0.0) for one, best in apart]
+        apart = [(one, of, end.best) for (one, end), of in zip(split_by_experiment(problem, outcome), channels, strict=True)]
+        found = [weighted_by_residuals(one, of, best.aux) if np.isfinite(best.cost) else (one, 0.0) for one, of, best in apart]
         if max(change for _, change in found) < SETTLED or np.any(outcome.best.status == INTERRUPTED):
             break
         before, problem = outcome, _each_weighted(problem, [one for one, _ in found])
@@ -89,7 +97,7 @@ def minimise_each(problem: Problem, *, estimate_sigma: bool, **limits: Any) -> t
     return outcome, problem
 
 
-def each_apart(problem: Problem, outcome: Outcome | None = None) -> list[tuple[Problem, Any]]:
+def split_by_experiment(problem: LeastSquaresProblem, outcome: Outcome | None = None) -> list[tuple[LeastSquaresProblem, Any]]:
     """Each experiment of a problem with one batch as a problem by itself, with its part of the outcome."""
     batch, best = jax.tree.map(np.asarray, (problem.batches[0], outcome and outcome.best))  # slices of NumPy arrays cost nothing
     batch = dataclasses.replace(batch, members=(0,), mesh=None)
@@ -137,7 +145,7 @@ def _from_one_start(problem, x, limits):
     outcome = levenberg_marquardt(residuals, x, bounds=problem.bounds, size=size_of(problem), noise=_noise_of(problem), **limits)
     reason = failure_of(outcome.best.aux)
     if reason:
-        raise ValueError(f"{AT_THE_START}, but ended with: {reason} Start from other parameters.")
+        raise NoMotion(f"{AT_THE_START}, but ended with: {reason} Start from other parameters.")
     return outcome
 
 
@@ -153,7 +161,7 @@ def _from_many_starts(problem, starts, limits):
     outcome = levenberg_marquardt(residuals, xs, bounds=problem.bounds, size=size_of(problem), noise=_noise_of(problem), **limits)
     cost = np.nan_to_num(outcome.costs[-1], nan=np.inf)
     if not np.isfinite(cost).any():
-        raise ValueError("`start` must include one whose motion can be computed, but none can. Narrow the bounds.")
+        raise NoMotion("`start` must include one whose motion can be computed, but none can. Narrow the bounds.")
     best = int(np.argmin(cost))
     chosen = jax.tree.map(lambda leaf: leaf[best], outcome.best)
     if np.any(outcome.best.status == INTERRUPTED):  # another start might have come to a better end
@@ -180,7 +188,7 @@ def _by_optax(problem, method, x, limits):
     except KeyboardInterrupt:
         ended = INTERRUPTED
     if not np.isfinite(lowest):
-        raise ValueError(f"{AT_THE_START}, but was not. Start from other parameters.")
+        raise NoMotion(f"{AT_THE_START}, but was not. Start from other parameters.")
     found = linearise(problem, best) if problem.size <= FORWARD_LIMIT else without_jacobian(problem, best)
     none = jnp.zeros(0)
     iterate = Iterate(best, found.residuals, found.jacobian, found, lowest, *[none] * 6, np.asarray(ended))

@@ -1,18 +1,19 @@
 """The minimum of a least-squares problem: what the statistics of a fit are computed from."""
 
 import dataclasses
+import functools
 from collections.abc import Iterator, Sequence
 from typing import Any
 
-import jax
 import numpy as np
 
 from .._program.jit import compiled
 from .experiment import Experiment
 from .levenberg_marquardt import Outcome
-from .measurement import apart
+from .measurement import split_by_kind
 from .multiple_shooting import Segments
-from .problem import Linearisation, Problem
+from .noise import Channels
+from .problem import LeastSquaresProblem, Linearisation
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -24,7 +25,7 @@ class Minimum:
     - `weighted`: (measured − predicted) / sigma for each batch, (segments, samples · channels), NaN where nothing was measured.
     """
 
-    problem: Problem
+    problem: LeastSquaresProblem
     experiments: tuple[Any, ...]
     segments: Segments
     outcome: Outcome
@@ -35,12 +36,22 @@ class Minimum:
     weighted: list[np.ndarray]
 
     @classmethod
-    def of(cls, problem: Problem, experiments: Sequence[Any], outcome: Outcome, segments: Segments) -> "Minimum":
+    def of(cls, problem: LeastSquaresProblem, experiments: Sequence[Any], outcome: Outcome, segments: Segments) -> "Minimum":
         """At the best iterate of an outcome."""
         best = outcome.best
         theta, slope = map(np.asarray, _theta_and_slope(problem.free, np.asarray(best.y)[: problem.free.size]))
         weighted = list(weighted_residuals(problem, best.aux))
         return cls(problem, tuple(experiments), segments, outcome, np.asarray(best.y), best.aux, theta, slope, weighted)
+
+    @functools.cached_property
+    def channels(self) -> Channels:
+        """What each channel has measured."""
+        return Channels.of(self.problem)
+
+    @functools.cached_property
+    def residuals(self) -> dict[str, np.ndarray]:
+        """What is left of it, by channel."""
+        return self.channels.residuals(self.problem, self.found)
 
     @property
     def size(self) -> int:
@@ -55,7 +66,7 @@ class Minimum:
     @property
     def recordings(self) -> tuple[Experiment, ...]:
         """The experiments that are recordings in time."""
-        return apart(self.experiments)[0]
+        return split_by_kind(self.experiments)[0]
 
     @property
     def of_tests(self) -> np.ndarray:
@@ -93,10 +104,7 @@ def _theta_and_slope(free, y):
     return free.theta(y), free.slope(y)
 
 
-def weighted_residuals(problem: Problem, found: Linearisation) -> Iterator[np.ndarray]:
+def weighted_residuals(problem: LeastSquaresProblem, found: Linearisation) -> Iterator[np.ndarray]:
     """(measured − predicted) / sigma for each batch, flat for each experiment; NaN where nothing was measured."""
     for batch, part in zip(problem.batches, found.batches, strict=True):
-        count = len(batch.members)  # copies of the last one may follow
-        values, sigma = jax.tree.map(lambda x, count=count: np.asarray(x)[:count], (batch.values, batch.sigma))
-        r = jax.tree.map(lambda z, p, s: (z - np.asarray(p)) / s, values, part.channels, sigma)
-        yield np.concatenate([np.reshape(leaf, (count, -1)) for leaf in jax.tree.leaves(r)], axis=1)
+        yield (batch.flat(batch.values) - batch.flat(part.channels)) / batch.flat(batch.sigma)

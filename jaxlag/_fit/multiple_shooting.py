@@ -14,7 +14,7 @@ from jax.flatten_util import ravel_pytree
 from .._mechanics.consistent_state import consistent_state
 from .experiment import Experiment, with_own
 from .levenberg_marquardt import DISCONTINUOUS, INTERRUPTED, STEP_LIMIT, Outcome, levenberg_marquardt
-from .problem import Continuity, Problem, linearise
+from .problem import Continuity, LeastSquaresProblem, NoMotion, linearise
 from .smoothing_spline import smooth
 
 FIRST_WEIGHT = 0.1  # of the gaps in the first round, relative to the residuals
@@ -25,18 +25,19 @@ CLOSED = 1e-9  # gaps, relative to the size of the motion, that count as closed,
 CLOSED_ULPS = 300  # or this many units in the last place, in single precision,
 NEARLY_CLOSED = 1e-5  # or these, or rtol, where more weight does not reduce them: they are the error of the integration
 FALLING = 0.5  # gaps are falling where they are at most this part of the gaps before
+FEWEST = 3  # samples of a segment
 PATIENCE = 3  # rounds without falling gaps, after which the iteration stops
 
 
 class Segments(NamedTuple):
     """Experiments cut into segments: the `problem` of all segments; the experiment of each; how many samples are its own."""
 
-    problem: Problem
+    problem: LeastSquaresProblem
     of: tuple[int, ...]
     samples: tuple[int, ...]
 
 
-def cut(problem: Problem, experiments: Sequence[Experiment], count: int) -> Segments:
+def cut(problem: LeastSquaresProblem, experiments: Sequence[Experiment], count: int) -> Segments:
     """Each experiment in `count` segments, which start on splines through the measurements."""
     segments: list[Experiment] = []
     of, samples, pairs, starts = [], [], [], []
@@ -55,24 +56,25 @@ def cut(problem: Problem, experiments: Sequence[Experiment], count: int) -> Segm
             samples.append(int(b - a))
     deviation = np.std(np.array(starts), axis=0)
     size = jnp.asarray(np.where(deviation > 0, deviation, 1.0))
-    of_segments = Problem.of(problem.model, problem.free, segments)
+    of_segments = LeastSquaresProblem.of(problem.model, problem.free, segments)
     gaps = sum(of_segments.batches[of_segments.places[b][0]].tangent_basis.shape[-1] for _, b in pairs)
     continuity = Continuity(jnp.asarray(0.0), jnp.zeros(gaps), size, tuple(pairs))
     of_segments = dataclasses.replace(of_segments, scale=problem.scale, continuity=continuity, tests=problem.tests)
     return Segments(of_segments, tuple(of), tuple(samples))
 
 
-def whole(e: Experiment) -> bool:
-    """Whether a record cannot be cut."""
-    return bool(set(e.unknown) & set(e.params)) or e.delay is not None
+def can_be_cut(e: Experiment) -> bool:
+    """Whether the segments of a record are determined by their starts and by parameters that all share."""
+    return not (set(e.unknown) & set(e.params) or e.events or e.delay is not None)
 
 
 def _check(e, count):
-    if whole(e):
+    if not can_be_cut(e):
         raise ValueError(
-            "`segments` must be 1 where an experiment has unknown parameters of its own or a delay, but is more. Free them in `params`."
+            "`segments` must be 1 where an experiment has unknown parameters of its own, events or a delay, but is more. "
+            "Free parameters in `params`, and leave events and delays out."
         )
-    if count > e.ts.size // 3:
+    if count > e.ts.size // FEWEST:
         raise ValueError(f"`segments` must leave three samples to each segment, but there are {count} for {e.ts.size} samples. Use fewer.")
 
 
@@ -95,10 +97,12 @@ def _segment(problem, e, motion, a, b):
     return eqx.tree_at(lambda one: one.values, planned, jax.tree.map(masked, e.values), is_leaf=lambda x: x is None)  # some may see nothing
 
 
-def join(problem: Problem, x: Any, *, max_steps: int, tolerance: float, freedom: int, progress: Any) -> tuple[Outcome, Problem]:
+def join(
+    problem: LeastSquaresProblem, x: Any, *, max_steps: int, tolerance: float, freedom: int, progress: Any
+) -> tuple[Outcome, LeastSquaresProblem]:
     """Fits the segments without continuity, then closes the gaps in rounds of growing weight; the outcome, and the last problem."""
     if not jnp.all(jnp.isfinite(linearise(problem, x).residuals)):
-        raise ValueError(
+        raise NoMotion(
             "`params` must give a motion in each segment, but one could not be computed. Start from others, or use more segments."
         )
     continuity = problem.continuity

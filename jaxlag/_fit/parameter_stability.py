@@ -34,7 +34,7 @@ def different_halves(minimum: Minimum, uncertainty: Uncertainty) -> Halves | Non
     """
     from scipy import special
 
-    p, beside, J = minimum.size, minimum.problem.beside, uncertainty.jacobian
+    p, beside, J = minimum.size, minimum.problem.first_recorded, uncertainty.jacobian
     if J is None or not 0 < p <= MANY or minimum.problem.model.loss is not None or minimum.measured.size < 4 * J.size:
         return None
     both = _with_changes(J, p, _second_halves(minimum))

@@ -1,7 +1,7 @@
 """What an experiment should show according to a fit."""
 
 import dataclasses
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -14,8 +14,9 @@ from .._linear.linear_system import LinearSystem
 from .._motion.trajectory import Trajectory
 from .._program.jit import compiled
 from .experiment import Experiment
+from .identifiability import Determined
 from .measurement import Test, deviations
-from .problem import Problem, failure_of, linearise, with_zero_values
+from .problem import LeastSquaresProblem, failure_of, linearise, with_zero_values
 
 
 class Prediction(NamedTuple):
@@ -44,19 +45,19 @@ class Prediction(NamedTuple):
     motion: Trajectory | LinearSystem | None
 
 
-def predicted(problem: Problem, x: np.ndarray, covariance: Any, experiment: Experiment, t: float) -> Prediction:
-    """What the experiment should show at the unknowns x, whose covariance is known; `t` of the ends θ̂ ± t · standard error."""
+def predicted(problem: LeastSquaresProblem, x: np.ndarray, known: Determined, scale: float, experiment: Experiment, t: float) -> Prediction:
+    """What the experiment should show at the unknowns x; `scale` of all errors, `t` of the ends θ̂ ± t · standard error."""
     free = problem.free
     model = dataclasses.replace(problem.model, loss=None)
     y = jnp.asarray(x[: free.size])
-    single = Problem.of(model, free, [with_zero_values(model, free, experiment, y)])
+    single = LeastSquaresProblem.of(model, free, [with_zero_values(model, free, experiment, y)])
     found = linearise(single, jnp.concatenate([y, jnp.zeros(single.size - free.size)]))
     reason = failure_of(found)
     if reason:
         raise ValueError(f"`experiment` must have a motion at the estimates, but it ended with: {reason}")
     part = found.batches[0]
-    J = np.asarray(part.jacobian[0][:, : free.size])
-    errors = np.sqrt(np.maximum(np.einsum("ij,jk,ik->i", J, covariance[: free.size, : free.size], J), 0))
+    J = np.asarray(part.channels_jacobian[0][:, : free.size])
+    errors = scale * known.deviations(J, np.arange(free.size))
     values = jax.tree.map(lambda x: x[0], part.channels)
     standard_errors = ravel_pytree(values)[1](jnp.asarray(errors))
     lower, upper = (jax.tree.map(lambda v, e, s=s: v + s * t * e, values, standard_errors) for s in (-1, 1))
@@ -64,15 +65,15 @@ def predicted(problem: Problem, x: np.ndarray, covariance: Any, experiment: Expe
     return Prediction(values, standard_errors, lower, upper, _motion(single.model, free.insert(free.theta(y)), one))
 
 
-def predicted_test(problem: Problem, x: np.ndarray, covariance: Any, test: Test, t: float) -> Prediction:
+def predicted_test(problem: LeastSquaresProblem, x: np.ndarray, known: Determined, scale: float, test: Test, t: float) -> Prediction:
     """The same of a test; of complex values the ends are those of both parts."""
     free = problem.free
     y = jnp.asarray(x[: free.size])
     at_estimates = dataclasses.replace(free, params=free.insert(np.asarray(free.theta(y))))
-    single = Problem.of(dataclasses.replace(problem.model, loss=None), at_estimates, [], [test])
+    single = LeastSquaresProblem.of(dataclasses.replace(problem.model, loss=None), at_estimates, [], [test])
     found = linearise(single, y)
-    values, size = found.tests[0].predictions, free.size
-    errors = deviations(test, found.tests[0], covariance[:size, :size])
+    values = found.tests[0].predictions
+    errors = jax.tree.map(lambda deviation: scale * deviation, deviations(test, found.tests[0], known))
     lower, upper = (jax.tree.map(lambda v, e, s=s: v + s * t * e, values, errors) for s in (-1, 1))
     return Prediction(values, errors, lower, upper, single.tests[0].near)
 

@@ -42,8 +42,8 @@ class Continuity:
 
 
 class Linearisation(NamedTuple):
-    """A `Problem` at one point: all residuals and their Jacobian, the same for each batch of experiments and each test, and the gaps c of
-    segments.
+    """A `LeastSquaresProblem` at one point: all residuals and their Jacobian, the same for each batch of experiments and each test, and
+    the gaps c of segments.
     """
 
     residuals: Any
@@ -56,7 +56,7 @@ class Linearisation(NamedTuple):
 
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True, eq=False)
-class Problem:
+class LeastSquaresProblem:
     """Residuals as a function of all unknowns x: y of the free parameters, then z of each experiment, in one flat vector."""
 
     model: Model
@@ -67,7 +67,7 @@ class Problem:
     tests: tuple[Prepared, ...] = ()
 
     @classmethod
-    def of(cls, model: Model, free: Free, recordings: Sequence[Experiment], tests: Sequence[Test] = ()) -> "Problem":
+    def of(cls, model: Model, free: Free, recordings: Sequence[Experiment], tests: Sequence[Test] = ()) -> "LeastSquaresProblem":
         """The problem of these experiments; `params` are at x = 0."""
         prepared = tuple(test.prepared(model.system, free.params) for test in tests)
         batches = batches_of(model.system, free.params, recordings)
@@ -79,7 +79,7 @@ class Problem:
         return self.free.size + sum(len(batch.members) * batch.unknowns for batch in self.batches)
 
     @property
-    def beside(self) -> int:
+    def first_recorded(self) -> int:
         """The number of residuals beside those of recordings, and before them: of the priors, then of the tests."""
         return self.free.size + sum(test.size for test in self.tests)
 
@@ -117,7 +117,8 @@ class Problem:
     def linearise(self, x: Float[Array | np.ndarray, " x"]) -> Linearisation:
         """All residuals and their Jacobian: those of the priors, of the tests, of the recordings, of the gaps."""
         y, zs = self.split(x)
-        parts = tuple(linearise_batch(self.model, self.free, batch, y, z, self.scale) for batch, z in zip(self.batches, zs, strict=True))
+        of_batches = [linearise_batch(self.model, self.free, batch, y, z, self.scale) for batch, z in zip(self.batches, zs, strict=True)]
+        parts, blocks = tuple(part for part, _ in of_batches), tuple(J for _, J in of_batches)
         tests = tuple(test.linearised(self.model.system, self.free, y) for test in self.tests)
         slope = jnp.diag(self.free.slope(y) / self.free.prior_deviation)
         of_free = [(self.free.prior_residual(y), slope), *(test[:2] for test in tests)]
@@ -129,7 +130,7 @@ class Problem:
             gaps, gaps_J = self._gaps(parts)
             last, last_J = self.continuity.weight * (gaps + self.continuity.dual), self.continuity.weight * gaps_J
         columns = tuple(self.columns(k) for k in range(len(parts)))
-        jacobian = Arrow(first, tuple(part.jacobian for part in parts), columns, last_J)
+        jacobian = Arrow(first, blocks, columns, last_J)
         residuals = jnp.concatenate([*(r for r, _ in of_free), *(part.residuals.ravel() for part in parts), last])
         return Linearisation(residuals, jacobian if self._is_wide else whole(jacobian), parts, gaps, gaps_J, tests)
 
@@ -181,13 +182,13 @@ class Problem:
         return jnp.einsum("lij,lj->li", W, gap).ravel(), J.reshape(-1, self.size)
 
 
-def linearise(problem: Problem, x: Float[Array | np.ndarray, " x"]) -> Linearisation:
-    """`Problem.linearise`, compiled; results of several devices are gathered."""
+def linearise(problem: LeastSquaresProblem, x: Float[Array | np.ndarray, " x"]) -> Linearisation:
+    """`LeastSquaresProblem.linearise`, compiled; results of several devices are gathered."""
     found = _linearise(problem, x)
     return found if all(batch.mesh is None for batch in problem.batches) else jax.tree.map(np.asarray, found)
 
 
-def held_by_jax(problem: Problem) -> Problem:
+def held_by_jax(problem: LeastSquaresProblem) -> LeastSquaresProblem:
     """The same in arrays of JAX, for many calls: one of NumPy takes a program 2 µs, of which a problem has dozens."""
     return _held(problem) if all(batch.mesh is None for batch in problem.batches) else problem
 
@@ -203,13 +204,13 @@ def _linearise(problem, x):
 
 
 @compiled
-def without_jacobian(problem: Problem, x: Float[Array | np.ndarray, " x"]) -> Linearisation:
+def without_jacobian(problem: LeastSquaresProblem, x: Float[Array | np.ndarray, " x"]) -> Linearisation:
     """The residuals alone, where there are too many unknowns for a Jacobian."""
     y, zs = problem.split(x)
     parts = []
     for batch, z in zip(problem.batches, zs, strict=True):
         found = evaluate_batch(problem.model, problem.free, batch, y, z, problem.scale)
-        parts.append(Linearised(found.residuals, None, found.ends, None, found.channels, found.result))
+        parts.append(Linearised(found.residuals, found.ends, None, found.channels, None, found.result))
     params = problem.free.insert(problem.free.theta(y))
     tests = [test.evaluated(problem.model.system, params) for test in problem.tests]
     r = jnp.concatenate([problem.free.prior_residual(y), *(r for r, _ in tests), *(part.residuals.ravel() for part in parts)])
@@ -218,12 +219,12 @@ def without_jacobian(problem: Problem, x: Float[Array | np.ndarray, " x"]) -> Li
 
 
 @compiled
-def linearise_starts(problem: Problem, xs: Float[Array, "starts x"]) -> Linearisation:
+def linearise_starts(problem: LeastSquaresProblem, xs: Float[Array, "starts x"]) -> Linearisation:
     """One problem at many points."""
     return of_each(problem.linearise, xs)
 
 
-def linearise_each(problem: Problem, xs: Float[Array, "experiments x"]) -> Linearisation:
+def linearise_each(problem: LeastSquaresProblem, xs: Float[Array, "experiments x"]) -> Linearisation:
     """Each experiment of a problem with one batch as a problem by itself; each may have a `scale` of its own."""
     found = _linearise_each(problem, xs)
     return found if problem.batches[0].mesh is None else jax.tree.map(np.asarray, found)
@@ -241,7 +242,7 @@ def _linearise_each(problem, xs):
     return map_batch(of_one, batch, jnp.concatenate([xs, scales[:, None]], axis=1), dataclasses.replace(problem, batches=()))
 
 
-def size_of(problem: Problem) -> float:
+def size_of(problem: LeastSquaresProblem) -> float:
     """The norm of all that is measured, in units of its noise; infinite where there are tests, whose measurements are of another kind."""
     if problem.tests or not problem.batches:
         return np.inf
@@ -259,7 +260,8 @@ def with_zero_values(model: Model, free: Free, experiment: Experiment, y: Any = 
     """The experiment with measurements of zero and a sigma of one: its residuals are what its sensors see, and the times of as many events
     as happen with θ(y).
     """
-    bare = eqx.tree_at(lambda e: (e.values, e.sigma), experiment, (None, None), is_leaf=lambda x: x is None)
+    bare = {name: experiment.values[name] for name in experiment.events} or None  # how many there are
+    bare = eqx.tree_at(lambda e: (e.values, e.sigma), experiment, (bare, None), is_leaf=lambda x: x is None)
     (batch,) = batches_of(model.system, free.params, [bare])
     one = jax.tree.map(lambda x: x[0] if eqx.is_array(x) else x, batch)
     of = lambda e: model.predicted(free.insert(free.theta(y)), e, jnp.zeros(batch.unknowns))[0]
@@ -268,6 +270,10 @@ def with_zero_values(model: Model, free: Free, experiment: Experiment, y: Any = 
     else:
         zeros = jax.tree.map(lambda s: jnp.zeros(s.shape, s.dtype), eqx.filter_eval_shape(of, one))
     return eqx.tree_at(lambda e: e.values, bare, zeros, is_leaf=lambda x: x is None)
+
+
+class NoMotion(ValueError):
+    """There is a start from which no motion can be computed."""
 
 
 TOO_FEW = "fewer events happen than were measured, or what is observed is not finite."

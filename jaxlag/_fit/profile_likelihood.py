@@ -5,13 +5,22 @@ import numpy as np
 
 from .arrow import without
 from .levenberg_marquardt import levenberg_marquardt
-from .problem import Problem, linearise, size_of
+from .problem import LeastSquaresProblem, linearise, size_of
 
 FAR = 50  # times the linearised interval, within which an end is looked for
 
 
 def profile_end(
-    problem: Problem, x: np.ndarray, i: int, *, side: int, quantile: float, sigma: float, inflation: float, deviation: float, freedom: int
+    problem: LeastSquaresProblem,
+    x: np.ndarray,
+    i: int,
+    *,
+    side: int,
+    quantile: float,
+    sigma: float,
+    inflation: float,
+    deviation: float,
+    freedom: int,
 ) -> float:
     r"""The end of the interval of parameter i on one `side` (−1 or 1): where the cost S, minimised over all other unknowns, has risen to
 

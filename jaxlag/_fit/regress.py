@@ -12,12 +12,16 @@ from jaxtyping import PyTree
 from .._model.numbers import number
 from .._model.system import System
 from .._model.validation import without_contacts, without_events
-from .experiment import Experiment, measured
+from .base_parameters import nearby
+from .experiment import Experiment, validate_inputs
+from .identifiability import determined_by, undetermined
 from .parameters import Free
 from .rounding import plus_minus
+from .smoothing_spline import without_delay
+from .undetermined import on_undetermined
 from .weak_form import Record
-from .weak_regression import Problem
-from .window_width import SLIDING, best_estimate, half_widths
+from .weak_regression import WeakFormProblem
+from .window_width import SLIDING, best_estimate, half_widths, with_scatter
 
 LINEAR = 1e-9  # relative change of a Jacobian that counts as zero
 
@@ -31,6 +35,7 @@ class Regression:
     - `names`: the p numbers, in flat order.
     - `linear`: whether the equations are linear in the free parameters, so that one step solved them.
     - `width`: of the windows, a time; `windows`: their number. `reversals`: whether dry friction reverses in some of them.
+    - `remarks`: which combinations are determined of parameters that are not, with standard errors.
 
     ```python
     import jax.numpy as jnp
@@ -51,6 +56,7 @@ class Regression:
     width: float
     windows: int
     reversals: bool
+    remarks: list[str]
 
     def __repr__(self) -> str:
         kind = "linear, solved in one step" if self.linear else "nonlinear"
@@ -66,6 +72,7 @@ class Regression:
             [
                 f"Regression: {len(self.names)} parameters, {kind}; starting values for `fit`",
                 *rows,
+                *(f"  ! {remark}" for remark in self.remarks),
                 f"  {self.windows} windows, {self.width:.3g} wide{reversals}",
             ]
         )
@@ -89,15 +96,15 @@ def regress(
     for test functions φ = (1 − s²)⁴ on overlapping windows, −1 ≤ s ≤ 1 (the weak form). Integration by parts has moved the time derivative
     from the momentum p to φ, so that no acceleration is needed and inputs need no filter: a `Signal` that is held is integrated exactly. P
     eliminates the unknown constraint forces, also nonholonomic ones. q and q̇ come from smoothing splines of all channels, including
-    measured velocities and accelerations; the means of the constraints over the windows are further residuals. If the equations are linear
-    in the parameters, which is checked by differentiation, one step solves them. Each equation is weighted by the inverse of the size of
-    its residuals. Windows in which dry friction may stick are left out; windows in which it only reverses are used if that predicts all
-    windows better.
+    measured velocities and accelerations, which may jump where dry friction reverses or sticks; the means of the constraints over the
+    windows are further residuals. If the equations are linear in the parameters, which is checked by differentiation, one step solves
+    them. Each equation is weighted by the inverse of the size of its residuals. Windows in which dry friction may stick are left out;
+    those in which it only reverses are used if that predicts all windows better.
 
     **Arguments:**
 
-    - `experiments`: one `Experiment` or several, with T samples each; T may differ. An `unknown` start is not used, and other unknowns of
-      an experiment keep their value.
+    - `experiments`: one `Experiment` or several, with T samples each; T may differ. An `unknown` start is not used; other unknowns of an
+      experiment, and the delays of sensors, keep their value.
     - `params`: all parameters, as for `fit`; a free one that is NaN needs no starting value.
     - `free`, `bounds`: as for `fit`.
     - `width`: of the windows, a time. In narrow windows the noise of the motion biases the estimates; wide windows are few. The default is
@@ -110,7 +117,7 @@ def regress(
     is wrong, estimates of `fit` are more accurate.
 
     **Raises:** `ValueError` if the system has further states, `free` names no parameter, the equations contain only ratios of the
-    parameters, the sensors do not see the motion, or they have a delay; if `width` is not positive, or fits no window into the records.
+    parameters, the sensors do not see the motion, or a delay is NaN; if `width` is not positive, or fits no window into the records.
 
     **Source:** Shinbrot, Trans. ASME 79 (1957) 582 (method of modulating functions); Messenger & Bortz, J. Comput. Phys. 443 (2021)
     110525 (weak form); Gautier & Khalil, IEEE Trans. Robot. Autom. 6 (1990) 368; Stone, J. R. Stat. Soc. B 36 (1974) 111 (choice by
@@ -132,7 +139,10 @@ def regress(
         )
     without_contacts(system, "`regress`")
     without_events(system, "`regress`")
-    experiments, params = measured(experiments, params)
+    experiments, params = validate_inputs(experiments, params)
+    if any(e.events for e in experiments):
+        raise ValueError("`experiments` must be sampled motions, but one holds times of events. Leave its `events` out.")
+    experiments = [without_delay(e, params) for e in experiments]
     given = Free.of(params, free, bounds)
     if given.size == 0:
         raise ValueError("`free` must name at least one entry of params, but is empty. Say which parameters to identify.")
@@ -140,7 +150,7 @@ def regress(
     half = None if width is None else _half(width, experiments)
     records = [Record.of(system, e, params) for e in experiments]
     chosen, linear = _start(records, given, free, bounds)
-    problem = Problem.of(records, chosen, linear)
+    problem = WeakFormProblem.of(records, chosen, linear)
     found = best_estimate(problem, half_widths(records) if half is None else np.array([half]))
     if found is None:
         raise ValueError(
@@ -149,8 +159,8 @@ def regress(
         )
     theta, slope = chosen.theta(jnp.asarray(found.y)), np.asarray(chosen.slope(jnp.asarray(found.y)))
     errors = chosen.by_name(jnp.asarray(found.errors * slope))
-    reversals = found.near_rest > SLIDING
-    return Regression(chosen.insert(theta), chosen.by_name(theta), errors, chosen.entries, linear, 2 * found.half, found.windows, reversals)
+    windows = 2 * found.half, found.windows, found.near_rest > SLIDING
+    return Regression(chosen.insert(theta), chosen.by_name(theta), errors, chosen.entries, linear, *windows, _remarks(problem, found))
 
 
 def _half(width, experiments):
@@ -193,6 +203,37 @@ def _is_linear(records, free):
             "only their ratios are determined. Fix one of them."
         )
     return True
+
+
+def _remarks(problem, found):
+    """Which parameters are not determined, and the estimates of the combinations that are."""
+    if not found.null.size:
+        return []
+    free, J = problem.free, problem.jacobian(found.y, found)
+    determined, idle = np.flatnonzero(np.isfinite(found.errors)), np.flatnonzero(np.linalg.norm(J, axis=0) == 0)
+    known = undetermined(_points(problem, found), determined.tolist(), idle.tolist(), found.noise)
+    estimates = [_estimate(free, combination, found) for combination in known.combinations]
+    return on_undetermined(free.entries, known, estimates, {})
+
+
+def _points(problem, found):
+    """θ and the changes that do not show, at the estimate, then around it wherever the equations can be computed."""
+    free, slope = problem.free, np.asarray(problem.free.slope(jnp.asarray(found.y)), float)
+    theta = np.asarray(free.theta(jnp.asarray(found.y)), float)
+    yield theta, slope[:, None] * found.null
+    for near in nearby(theta, np.asarray(free.lower), np.asarray(free.upper)):
+        J = problem.jacobian((near - np.asarray(free.start)) / np.asarray(free.scale), found)
+        if np.all(np.isfinite(J)):
+            yield near, slope[:, None] * determined_by(J, np.zeros((0, free.size)), hidden=found.null.shape[1]).null
+
+
+def _estimate(free, combination, found):
+    """Value and standard error of a combination, with its scatter between windows of different widths."""
+    of = lambda one: combination.estimate(
+        np.asarray(free.theta(one.y), float), one.covariance * np.outer(free.slope(one.y), free.slope(one.y))
+    )
+    value, error = of(found)
+    return value, float(with_scatter(value, error, [of(one) for one in found.as_good]))
 
 
 def _sizes(record, terms):

@@ -1,15 +1,15 @@
-"""The remarks on the card of a fit: sentences on what is not determined, held at a bound, or not explained by the model."""
+"""The remarks on the card of a fit: sentences on what is held at a bound, or not explained by the model."""
 
 from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
 
-from .._model.paths import is_within
 from .channels import Channel
-from .identifiability import MANY, Undetermined
+from .identifiability import MANY
 from .parameter_stability import Halves
 from .parameters import Free
 from .rounding import plus_minus
+from .undetermined import joined
 
 NO_ERRORS = "standard errors are not computed for so many parameters"
 UNEXPLAINED = 3.0  # residuals this many times the noise are not noise
@@ -18,60 +18,6 @@ UNRELATED_SIZE = 10.0  # residuals this many times the measurements belong to an
 WELL_PREDICTED = 0.99  # R² of a channel from which on the table alone reports correlated residuals,
 DRIFT = 1 / 6  # unless they are correlated over this part of the record;
 EXACT = 1 - 1e-8  # R² from which on residuals are those of the integration
-
-
-def on_undetermined(names: Sequence[str], found: Undetermined, deciding: Mapping[str, str]) -> list[str]:
-    """What the measurements do not determine; `deciding`: what decides where a function jumps or bends, and in which line."""
-    remarks = [_on_idle(names[i], next((line for name, line in deciding.items() if is_within(names[i], name)), "")) for i in found.idle]
-    remarks += [f"{names[i]} cannot be distinguished from the unknown starts" for i in found.with_start]
-    joint = [names[i] for i in found.joint]
-    if len(joint) > MANY:
-        remarks.append(f"{joint[0]}, … {joint[-1]}, {len(joint)} numbers, are not determined individually")
-    elif found.combinations is not None:
-        remarks.append(_on_combinations(names, joint, found.combinations))
-    elif joint:
-        changes = "; ".join(
-            ", ".join(f"{name} by {change:+.3g}" for name, change in zip(joint, column, strict=True)) for column in found.directions.T
-        )
-        remarks.append(f"{_listed(joint)} are not determined individually: they can change together without visible effect ({changes})")
-    return remarks
-
-
-def _on_idle(name, line):
-    if not line:
-        return f"{name} has no influence on these measurements"
-    return (
-        f"{name} decides where a function of the system jumps or bends ({line}), and its influence is not seen there: give the system an "
-        "event that is zero where it does"
-    )
-
-
-def _on_combinations(names, joint, found):
-    of_one = _product if found.products else _sum
-    determined = [of_one(names[i], [(names[j], x) for j, x in factors]) for i, factors in found.terms]
-    rest = "their common factor is not" if found.common_factor else f"{_listed(joint)} individually are not"
-    return f"only {_listed(determined)} {'is' if len(determined) == 1 else 'are'} determined; {rest}"
-
-
-def _product(name, factors):
-    """name · Π p^−x."""
-    above, below = [name], []
-    for p, x in factors:
-        (below if x > 0 else above).append(p if abs(x) == 1 else f"{p}^{abs(x) if abs(x).denominator == 1 else f'({abs(x)})'}")
-    under = below[0] if len(below) == 1 else f"({' '.join(below)})"
-    return " ".join(above) + (f"/{under}" if below else "")
-
-
-def _sum(name, terms):
-    """name − Σ x p."""
-    text = name
-    for p, x in terms:
-        text += f" {'-' if x > 0 else '+'} {p if abs(x) == 1 else f'{abs(x)} {p}'}"
-    return text
-
-
-def _listed(names):
-    return names[0] if len(names) == 1 else f"{', '.join(names[:-1])} and {names[-1]}"
 
 
 def on_bounds(free: Free, theta: np.ndarray, gradient: np.ndarray) -> Iterator[str]:
@@ -87,7 +33,7 @@ def on_too_short(names: Sequence[str]) -> list[str]:
     if not names:
         return []
     have, own = ("has", "a sigma of its own") if len(names) == 1 else ("have", "sigmas of their own")
-    shown = _listed(names) if len(names) <= MANY else f"{names[0]}, … {names[-1]}"
+    shown = joined(names) if len(names) <= MANY else f"{names[0]}, … {names[-1]}"
     return [f"{shown} {have} too few measurements for {own}: each channel is weighted by its spread; give `sigma`"]
 
 
@@ -144,18 +90,18 @@ def on_misfit(
             "the errors above take `sigma` as it is"
         )
     elif not (explained or halves):
-        yield from _on_correlation([c for c in channels if c.correlated and not _well_predicted(c)])
+        yield from _on_correlation([c for c in channels if c.correlation_length and not _well_predicted(c)])
 
 
 def _well_predicted(channel):
-    drifts = channel.correlated >= DRIFT * channel.samples and channel.r_squared < EXACT
+    drifts = channel.correlation_length >= DRIFT * channel.samples and channel.r_squared < EXACT
     return channel.r_squared >= WELL_PREDICTED and not drifts
 
 
 def _on_correlation(missed):
     if missed:
         names = ", ".join(dict.fromkeys(c.name for c in missed[:MANY])) + (", …" if len(missed) > MANY else "")
-        length = max(c.correlated for c in missed)
+        length = max(c.correlation_length for c in missed)
         yield f"the model misses something, or the noise is not white: residuals of {names} are correlated over {length} samples"
 
 

@@ -45,7 +45,7 @@ class Model:
         """The predicted measurements of one experiment, and the motion behind them."""
         q0, qdot0, own = e.start(z)
         params = with_own(params, own)
-        late = _delays(e, params)
+        late = delays_of(e, params)
         ts, rows = _sampled(e.ts, late)
         motion = simulate(self.system, q0, qdot0, ts, params, **{**dict(self.numerics), "throw": False})
 
@@ -65,8 +65,8 @@ class Model:
 ALL = ""  # stands for all channels that have no delay of their own
 
 
-def _delays(e, params):
-    """The delays by channel."""
+def delays_of(e: Any, params: PyTree) -> dict[str, Any]:
+    """The delays by channel of an experiment or a batch."""
     given = e.delay if isinstance(e.delay, tuple) else () if e.delay is None else ((ALL, e.delay),)
     return {name: call(delay, "`delay`", params) if callable(delay) else delay for name, delay in given}
 
@@ -83,19 +83,23 @@ def _sampled(ts, late):
 
 
 def _times(e, motion, late):
-    """When events happen, in rows of the length of the samples; NaN beyond the last."""
+    """When events happen, as many as were observed; NaN beyond the last."""
     for name in e.events:
         if name not in motion.events:
             there = ", ".join(motion.events) or "none"
             raise ValueError(f"`events` must name events of the system, but holds {name!r}. There are {there}.")
-    times = {name: motion.events[name].ts[: e.ts.size] + late.get(name, 0.0) for name in e.events}
-    return {name: jnp.concatenate([ts, jnp.full(e.ts.size - ts.size, jnp.nan, ts.dtype)]) for name, ts in times.items()}
+    counts = {name: e.values[name].size for name in e.events}
+    times = {name: motion.events[name].ts[:count] + late.get(name, 0.0) for name, count in counts.items()}
+    return {name: jnp.concatenate([ts, jnp.full(counts[name] - ts.size, jnp.nan, ts.dtype)]) for name, ts in times.items()}
 
 
 class Evaluation(NamedTuple):
-    """Experiments at given unknowns: weighted residuals, first and last state as (q, q̇, q, q̇), predictions, how the motion ended."""
+    """Experiments at given unknowns: weighted residuals, their derivatives by the predictions, first and last state as (q, q̇, q, q̇),
+    predictions, how the motion ended.
+    """
 
     residuals: Any
+    slopes: Any
     ends: Any
     channels: PyTree
     result: RESULTS
@@ -105,15 +109,17 @@ def _evaluate(model, free, e, y, z, scale):
     """One experiment at the scaled free parameters y and its own unknowns z."""
     channels, motion = model.predicted(free.insert(free.theta(y)), e, z)
     _check(e, channels)
-
-    def weighted(p, v, s):
-        there = jnp.isfinite(v)
-        r = jnp.where(there, (jnp.where(there, p, 0) - jnp.where(there, v, 0)) / s, 0)
-        return r if model.loss is None else scale * model.loss.root(r / scale)
-
-    r = ravel_pytree(jax.tree.map(weighted, channels, e.values, e.sigma))[0]
+    r, slopes = _weighted(model.loss, scale, *(ravel_pytree(tree)[0] for tree in (channels, e.values, e.sigma)))
     ends = ravel_pytree([jax.tree.map(lambda x, i=i: x[i], (motion.q, motion.qdot)) for i in (0, -1)])[0]
-    return Evaluation(jnp.where(motion.succeeded, r, jnp.inf), ends, channels, motion.result)
+    return Evaluation(jnp.where(motion.succeeded, r, jnp.inf), slopes, ends, channels, motion.result)
+
+
+def _weighted(loss, scale, predicted, measured, sigma):
+    """Residuals over sigma, as the loss counts them, and their derivatives by what is predicted; zero where nothing was measured."""
+    there = jnp.isfinite(measured)
+    r = jnp.where(there, (jnp.where(there, predicted, 0) - jnp.where(there, measured, 0)) / sigma, 0)
+    slopes = jnp.where(there, 1 / sigma, 0)
+    return (r, slopes) if loss is None else (scale * loss.root(r / scale), slopes * loss.slope(r / scale))
 
 
 def _check(e, channels):
@@ -138,27 +144,30 @@ def evaluate_batch(model: Model, free: Free, batch: ExperimentBatch, y: Any, z: 
 
 
 class Linearised(NamedTuple):
-    """An `Evaluation` with the Jacobians of residuals and ends with respect to (y, z); experiments are the first axis."""
+    """Experiments at given unknowns: residuals, predictions and ends, the last two with their Jacobians with respect to (y, z), flat;
+    experiments are the first axis.
+    """
 
     residuals: Any
-    jacobian: Any
     ends: Any
     ends_jacobian: Any
     channels: PyTree
+    channels_jacobian: Any
     result: RESULTS
 
 
-def linearise_batch(model: Model, free: Free, batch: ExperimentBatch, y: Any, z: Any, scale: Any = 1.0) -> Linearised:
-    """The experiments of a batch at y and z (experiments, unknowns) with their Jacobians, in one forward pass."""
+def linearise_batch(model: Model, free: Free, batch: ExperimentBatch, y: Any, z: Any, scale: Any = 1.0) -> tuple[Linearised, Any]:
+    """The experiments of a batch at y and z (experiments, unknowns), in one forward pass; and the Jacobian of their residuals."""
 
     def of_one(e, z, y, free, scale):
-        def residuals_and_ends(x):
+        def channels_and_ends(x):
             found = _evaluate(model, free, e, x[: y.size], x[y.size :], scale)
-            return (found.residuals, found.ends), found
+            return (ravel_pytree(found.channels)[0], found.ends), found
 
-        (J, ends_J), found = jax.jacfwd(residuals_and_ends, has_aux=True)(jnp.concatenate([y, z]))
+        (channels_J, ends_J), found = jax.jacfwd(channels_and_ends, has_aux=True)(jnp.concatenate([y, z]))
+        J = jnp.where(found.slopes[:, None] > 0, found.slopes[:, None] * channels_J, 0)
         finite = jnp.all(jnp.isfinite(found.residuals)) & jnp.all(jnp.isfinite(J))
         r, J = jnp.where(finite, found.residuals, jnp.inf), jnp.where(finite, J, 0)
-        return Linearised(r, J, found.ends, ends_J, found.channels, found.result)
+        return Linearised(r, found.ends, ends_J, found.channels, channels_J, found.result), J
 
     return map_batch(of_one, batch, z, y, free, scale)

@@ -11,13 +11,14 @@ import numpy as np
 from jaxtyping import Float, PyTree
 
 from .._motion.export import frame_of, jsonable, write_json
-from .channel_sigma import sigmas_of
 from .channels import Channel
 from .experiment import Experiment
 from .fit_card import card, estimates_by_name, unit_of
+from .identifiability import Determined
 from .measurement import Test
+from .noise import sigmas_of
 from .prediction import Prediction, predicted, predicted_test
-from .problem import Problem
+from .problem import LeastSquaresProblem
 from .profile_likelihood import profile_end
 
 
@@ -57,15 +58,15 @@ class Fit:
       what they would be if residuals were white. `remarks`: sentences about what the measurements do not determine, about bounds, and about
       a model that does not explain the measurements.
     - `names`: the p numbers, in the order of `covariance` (p, p), `correlation` (p, p), and `inflation` (p,), the factors by which
-      correlated residuals enlarge the standard errors. `correlated`: the number of samples over which they are correlated, 0 if they are
-      white.
+      correlated residuals enlarge the standard errors. `correlation_length`: the number of samples over which they are correlated, 0 if
+      they are white.
 
     Experiments (lists with one entry for each of the E experiments):
 
     - `experiments`: with estimated starts and parameters filled in; `unknowns`: these estimates by name, `"q0"`, `"qdot0"` and parameters;
       `unknown_errors`: their standard errors.
     - `predictions`, `residuals` (measured minus predicted): structured like the values of the experiment, leaves (T, ...).
-      `prediction_errors`: standard errors of the predictions, NaN where nothing was measured.
+      `prediction_errors`: standard errors of the predictions, also where nothing was measured.
     - `channels`: a flat list of how well each `Channel` is predicted.
 
     The values of a `ModalTest` have the names `"frequency"` and `"damping_ratio"`; those of a `FrequencyResponseTest` are complex, and so
@@ -76,12 +77,14 @@ class Fit:
     - `sigma`: σ̂, in units of the given sigma; if none was given, the geometric mean of those of the channels, in units of the
       measurements. `sigmas`: for each experiment, one for each channel, estimated or given; structured like a row of its values.
       `absolute`: whether sigma was given.
-    - `misfit`: −2 ln L of the data, up to a constant; priors are no part of it. `cost`: ½ Σ r² at the estimates; `measurements`: N;
-      `unknown_count`: the number of determined unknowns, of parameters and experiments; `exact`: the number of measurements in channels
-      that are predicted exactly; `freedom_of_channels`: the degrees of freedom of intervals where channels have sigmas of their own.
+    - `neg2_log_likelihood`: −2 ln L of the data, up to a constant; priors are no part of it. `cost`: ½ Σ r² at the estimates.
+    - `measurements`: N; `unknown_count`: the number of determined unknowns, of parameters and experiments; `noise_free_count`: that of
+      measurements in channels that are predicted exactly; `freedom_of_channels`: the degrees of freedom of intervals where channels have
+      sigmas of their own.
     - `converged`; `reason`: why the iteration ended; `steps`: the number of steps; `costs`: the cost at the start and after each step.
-    - `led_in`: the steps by which the start was found, if it was not `params` (`Regress`).
-    - `problem`, `x`, `x_covariance`: the least-squares problem, all its unknowns at the minimum, and their covariance divided by σ̂².
+    - `start_log`: the steps by which the start was found, if it was not `params` (`Regress`).
+    - `problem`, `x`, `known`: the least-squares problem, all its unknowns at the minimum, their covariance divided by σ̂², and the
+      directions in which they are not determined.
 
     Quantities have the units of the parameters and measurements, any consistent set. `fit.plot()` draws it, with all that `plot.fit` takes;
     `fit.report("report.html")` writes it as one page for a colleague.
@@ -123,15 +126,15 @@ class Fit:
     costs: Float[np.ndarray, " n"]
     measurements: int
     absolute: bool
-    problem: Problem
+    problem: LeastSquaresProblem
     unknown_count: int
     x: Float[np.ndarray, " x"]
-    x_covariance: Float[np.ndarray, "x x"]
+    known: Determined
     inflation: Float[np.ndarray, " p"]
-    correlated: int
-    led_in: tuple[str, ...] = ()
-    misfit: float = np.nan
-    exact: int = 0
+    correlation_length: int
+    start_log: tuple[str, ...] = ()
+    neg2_log_likelihood: float = np.nan
+    noise_free_count: int = 0
     freedom_of_channels: float = np.inf
 
     if TYPE_CHECKING:  # put here by `jaxlag.plot`
@@ -146,7 +149,7 @@ class Fit:
     @property
     def freedom(self) -> int:
         """Degrees of freedom: measurements minus determined unknowns, and minus those of channels that are predicted exactly."""
-        return max(self.measurements - self.exact - self.unknown_count, 0)
+        return max(self.measurements - self.noise_free_count - self.unknown_count, 0)
 
     @property
     def white_standard_errors(self) -> dict[str, PyTree]:
@@ -156,12 +159,12 @@ class Fit:
     @property
     def aic(self) -> float:
         """Akaike's criterion; of two models of the same data the one with the smaller value is better. Assumes independent residuals."""
-        return self.misfit + 2 * self._fitted
+        return self.neg2_log_likelihood + 2 * self._fitted
 
     @property
     def bic(self) -> float:
         """Schwarz's criterion, which penalises parameters more than Akaike's. Assumes independent residuals."""
-        return self.misfit + float(np.log(self.measurements)) * self._fitted
+        return self.neg2_log_likelihood + float(np.log(self.measurements)) * self._fitted
 
     @property
     def _fitted(self) -> int:
@@ -208,7 +211,7 @@ class Fit:
             raise ValueError("`profile` must be False for a fit with a robust loss, but is True. Use `profile=False`.")
         if not np.isfinite(error):
             return Interval(-np.inf, np.inf)
-        deviation, inflation = float(np.sqrt(self.x_covariance[i, i])), float(self.inflation[i])
+        deviation, inflation = float(np.sqrt(self.known.covariance[i, i])), float(self.inflation[i])
         scales = {"quantile": t, "sigma": self.sigma_scale, "inflation": inflation, "deviation": deviation}
         ends = (profile_end(self.problem, self.x, i, side=side, freedom=self.freedom, **scales) for side in (-1, 1))
         return Interval(*ends)
@@ -237,9 +240,8 @@ class Fit:
 
         **Raises:** `ValueError` if the motion cannot be computed, or `level` is out of range.
         """
-        covariance = self.sigma_scale**2 * self.x_covariance
         of = predicted_test if isinstance(experiment, Test) else predicted
-        return of(self.problem, self.x, covariance, experiment, self.quantile(level))  # type: ignore[operator]
+        return of(self.problem, self.x, self.known, self.sigma_scale, experiment, self.quantile(level))  # type: ignore[operator]
 
     def to_dict(self, *, level: float = 0.95) -> dict[str, Any]:
         """The fit as plain data for `json.dumps`. None stands for a number that does not exist, such as the error of an undetermined
@@ -251,7 +253,7 @@ class Fit:
         - `"channels"`, and the fields and properties of `Fit` that are numbers or text, under their names.
         """
         copied = ("names", "correlation", "covariance", "remarks", "sigma", "absolute", "cost", "costs", "aic", "bic", "measurements")
-        parts = {name: getattr(self, name) for name in (*copied, "freedom", "converged", "reason", "steps", "led_in", "params")}
+        parts = {name: getattr(self, name) for name in (*copied, "freedom", "converged", "reason", "steps", "start_log", "params")}
         rows, channels = list(self._rows(level)), [channel._asdict() for channel in self.channels]
         return jsonable({"parameters": rows, "level": level} | parts | {"channels": channels})
 

@@ -1,5 +1,7 @@
 """The motion behind a recording without the equations of motion: splines fitted to what the sensors saw."""
 
+import itertools
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
@@ -11,6 +13,7 @@ from .._model.injection import call
 from .._model.paths import is_within
 from .._program.jit import jitted
 from .experiment import Experiment, start_entries, with_own
+from .residuals import ALL, delays_of
 
 DEGREE = 5  # accelerations are twice differentiable
 MOST_INTERVALS = 0.65  # of the samples
@@ -18,6 +21,7 @@ MOST_COEFFICIENTS = 0.7  # of the measurements
 ITERATIONS = 8  # of Gauss and Newton, where sensors are not linear in the motion
 START_WEIGHT = 1e3  # of the known start, relative to the sensors
 REWEIGHTED = 2  # times, where channels have no sigma
+KINKED = 2  # times, where the acceleration may jump: at kinks of the motion found without them, and of that with them
 RESOLVED = 1e-6  # of the spread of a channel: no sensor is trusted more
 PENALTY = 1e-6  # of differences of third order, relative to the sensors: decides only where nothing is measured
 
@@ -31,36 +35,71 @@ class Smooth(NamedTuple):
     a: np.ndarray
 
 
-def smooth(experiment: Experiment, params: Any, at: np.ndarray | None = None) -> Smooth:
+def smooth(
+    experiment: Experiment, params: Any, at: np.ndarray | None = None, kinks_of: Callable[[Smooth], np.ndarray] | None = None
+) -> Smooth:
     """The motion at the times `at`, by default at the samples.
 
     Splines of degree five, fitted by least squares to what the sensors saw. Generalised cross-validation chooses how many intervals
     between knots there are. Channels without `sigma` are weighted by their residuals. A known start is kept; where no sensor tells, the
-    splines are as smooth as possible.
+    splines are as smooth as possible. `kinks_of` a motion are the times at which its acceleration may jump; if splines that can do so
+    have the better score, they are taken.
 
     **Source:** Craven & Wahba, Numer. Math. 31 (1979) 377-403; de Boor, A Practical Guide to Splines, chapter XIV.
     """
-    if experiment.delay is not None:
-        raise ValueError("`delay` must be None where the motion is read off the measurements, but there is one. Shift `ts` by it.")
     ts = np.asarray(experiment.ts)
     sensors = _Sensors(experiment, with_own(params, experiment.params))
-    splines, C = _cross_validated(sensors, ts)
+    score, splines, C = _cross_validated(sensors, ts)
     for _ in range(REWEIGHTED if experiment.sigma is None and sensors.channels > 1 else 0):
         if not sensors.weigh(splines, C):
             break
-        splines, C = _cross_validated(sensors, ts)
+        score, splines, C = _cross_validated(sensors, ts)
     at = ts if at is None else at
-    return Smooth(at, *(splines.motion(at, C, d) for d in range(3)))
+    motion = lambda splines, C: Smooth(at, *(splines.motion(at, C, d) for d in range(3)))
+    for _ in range(KINKED):
+        kinks = np.zeros(0) if kinks_of is None else kinks_of(motion(splines, C))
+        other = _cross_validated(sensors, ts, kinks) if kinks.size else (np.inf, splines, C)
+        if other[0] >= score:
+            break
+        score, splines, C = other
+    return motion(splines, C)
 
 
-def _cross_validated(sensors, ts):
-    """The splines with the least score, and their coefficients."""
+def without_delay(e: Experiment, params: Any) -> Experiment:
+    """The same measurements at the times of what they show, those of one delay after those of another; without the ones that show the
+    start only because the delay had not passed.
+    """
+    late = {name: float(delay) for name, delay in delays_of(e, with_own(params, e.params)).items()}
+    if not late:
+        return e
+    if not np.all(np.isfinite(list(late.values()))):
+        raise ValueError("`delay` must be known where the motion is read off the measurements, but is NaN. Give its parameters a value.")
+    ts, paths = np.asarray(e.ts), jax.tree_util.tree_flatten_with_path(e.values)[0]
+    by_leaf = [late[ALL] if ALL in late else late.get(path[0].key, 0.0) for path, _ in paths]
+    shifts = sorted(set(by_leaf))
+    times = np.concatenate([ts[:1], *(ts - shift for shift in shifts)])
+    order = np.argsort(np.where(times >= ts[0], times, np.inf), kind="stable")[: np.count_nonzero(times >= ts[0])]
+
+    def moved(x, shift, padding):
+        rows = [np.full((1, *x.shape[1:]), padding)] + [np.asarray(x) if shift == one else np.full(x.shape, padding) for one in shifts]
+        return np.concatenate(rows)[order]
+
+    of_leaves = lambda tree, padding: jax.tree.unflatten(
+        jax.tree.structure(e.values), [moved(x, shift, padding) for x, shift in zip(jax.tree.leaves(tree), by_leaf, strict=True)]
+    )
+    sigma = None if e.sigma is None else of_leaves(e.sigma, 1.0)
+    values = of_leaves(e.values, np.nan)
+    return Experiment(times[order], values, e.q0, e.qdot0, observe=e.observe, sigma=sigma, params=e.params, unknown=e.unknown)
+
+
+def _cross_validated(sensors, ts, kinks=()):
+    """The least score, the splines that have it, and their coefficients."""
     measured = int(np.sum(np.isfinite(sensors.measured)))
     most = max(4, int(MOST_INTERVALS * min(len(np.unique(ts)), measured / sensors.n)))
     found = {}
 
     def attempt(intervals):
-        splines = _Splines(ts, intervals)
+        splines = _Splines(ts, intervals, kinks)
         C, squares = _fitted(sensors, splines)
         if C.size < MOST_COEFFICIENTS * measured:
             found[squares * measured / (measured - C.size) ** 2] = splines, C
@@ -69,12 +108,12 @@ def _cross_validated(sensors, ts):
         attempt(2**doubled)
     if not found:
         splines = _Splines(ts, 1)
-        return splines, _fitted(sensors, splines)[0]
+        return np.inf, splines, _fitted(sensors, splines)[0]
     best = found[min(found)][0].intervals
     for between in (best / 2**0.5, min(best * 2**0.5, most)):
         if 4 <= between <= most:
             attempt(int(between))
-    return found[min(found)]
+    return min(found), *found[min(found)]
 
 
 class _Sensors:
@@ -147,10 +186,17 @@ class _UnknownForces(dict):
 
 
 class _Splines:
-    """A basis of splines whose knots are quantiles of the times; values and derivatives are B_d C with coefficients C (splines, n)."""
+    """A basis of splines whose knots are quantiles of the times; values and derivatives are B_d C with coefficients C (splines, n).
 
-    def __init__(self, ts, intervals):
-        knots = np.quantile(np.unique(ts), np.linspace(0, 1, intervals + 1))
+    At a kink there are so many knots that the second derivative may jump; in between they are equally spaced.
+    """
+
+    def __init__(self, ts, intervals, kinks=()):
+        times = np.unique(ts)
+        ends = _apart(np.interp(kinks, times, np.linspace(0, 1, times.size)), 1 / intervals)
+        pieces = [np.linspace(*piece, max(round(intervals * (piece[1] - piece[0])), 1) + 1) for piece in itertools.pairwise(ends)]
+        levels = np.concatenate([ends[:1], *(piece[1:] for piece in pieces), np.repeat(ends[1:-1], DEGREE - 2)])
+        knots = np.quantile(times, np.sort(levels))
         self.ts, self.intervals, self.interval = ts, intervals, (ts[-1] - ts[0]) / intervals
         self.knots = np.concatenate([np.full(DEGREE, knots[0]), knots, np.full(DEGREE, knots[-1])])
         self.count = len(self.knots) - DEGREE - 1
@@ -185,6 +231,15 @@ class _Splines:
         column = (self.near[:, :, None] * n + np.arange(n))[:, None]
         row, column = (np.broadcast_to(index, entries.shape).ravel() for index in (row, column))
         return sparse.csr_matrix((entries.ravel(), (row, column)), shape=(T * channels, self.count * n))
+
+
+def _apart(levels, least):
+    """0, those of the levels that are at least so far from the ends and from the one before, and 1."""
+    ends = [0.0]
+    for level in levels:
+        if least <= level - ends[-1] and level <= 1 - least:
+            ends.append(level)
+    return np.array([*ends, 1.0])
 
 
 def _fitted(sensors, splines):

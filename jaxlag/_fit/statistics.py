@@ -11,7 +11,6 @@ import numpy as np
 
 from .arrow import transposed
 from .autocorrelation import independent_samples
-from .channel_sigma import freedom_of_channels, neg2_log_likelihood, predicted_exactly, sigmas_of, too_short
 from .channels import channels_of
 from .doubt import PARTNERS, doubt_of
 from .experiment import Experiment
@@ -22,8 +21,9 @@ from .linear_test_statistics import channels_of_test, doubts, predicted_tests
 from .measurement import in_given_order
 from .minimum import Minimum
 from .multiple_shooting import Segments
+from .noise import freedom_of_channels, neg2_log_likelihood, noise_free, too_short
 from .parameter_stability import different_halves
-from .problem import Problem
+from .problem import LeastSquaresProblem
 from .remarks import (
     NO_ERRORS,
     UNEXPLAINED,
@@ -35,15 +35,15 @@ from .remarks import (
     on_misfit,
     on_no_freedom,
     on_too_short,
-    on_undetermined,
 )
 from .result import Fit
 from .uncertainty import Uncertainty, uncertainty_of, undetermined_parameters
+from .undetermined import on_undetermined
 
 Fields = dict[str, Any]  # of a Fit, by name
 
 
-def report(problem: Problem, experiments: Sequence[Any], outcome: Outcome, segments: Segments) -> Fit:
+def report(problem: LeastSquaresProblem, experiments: Sequence[Any], outcome: Outcome, segments: Segments) -> Fit:
     """The fit that the outcome of an iteration means."""
     minimum = Minimum.of(problem, experiments, outcome, segments)
     uncertainty = uncertainty_of(minimum)
@@ -51,7 +51,7 @@ def report(problem: Problem, experiments: Sequence[Any], outcome: Outcome, segme
     scale = 1.0 if minimum.absolute and problem.model.loss is None else noise["sigma"]
     predictions = _predictions(minimum, uncertainty, scale)
     parameters = _parameters(minimum, uncertainty, scale)
-    unknowns = noise["exact"] + noise["unknown_count"]
+    unknowns = noise["noise_free_count"] + noise["unknown_count"]
     is_noise = minimum.absolute and noise["sigma"] <= UNEXPLAINED
     doubt = doubt_of(parameters, minimum.theta, minimum.problem.free.start, predictions["channels"], is_noise)
     return Fit(
@@ -62,20 +62,20 @@ def report(problem: Problem, experiments: Sequence[Any], outcome: Outcome, segme
         **_unknowns(minimum, uncertainty, scale),
         **predictions,
         **_end(minimum, doubt),
-        remarks=[*_on_sigma(minimum), *_remarks(minimum, uncertainty, noise["sigma"], predictions["channels"], unknowns)],
+        remarks=[*_on_sigma(minimum), *_remarks(minimum, uncertainty, scale, noise["sigma"], predictions["channels"], unknowns)],
     )
 
 
 def _noise(minimum: Minimum, uncertainty: Uncertainty) -> Fields:
     """How many measurements and unknowns there are, and how large the residuals are."""
-    r, beside = np.append(minimum.measured, minimum.of_tests), minimum.problem.beside
+    r, beside = np.append(minimum.measured, minimum.of_tests), minimum.problem.first_recorded
     unknown_count = minimum.x.size - uncertainty.known.null.shape[1] - len(np.asarray(minimum.found.gaps_jacobian))
     squares = np.sum(np.asarray(minimum.found.residuals)[: beside + minimum.flat.size] ** 2)
-    exact = 0 if minimum.absolute else sum(predicted_exactly(minimum.problem, minimum.found).values())
+    exact = 0 if minimum.absolute else sum(noise_free(minimum.channels, minimum.residuals).values())
     sigma = _sigma(r, minimum.problem, max(minimum.measurements - exact - unknown_count, 0))
     priors = float(np.sum(np.asarray(minimum.found.residuals)[: minimum.size] ** 2))
     return {
-        "exact": exact,
+        "noise_free_count": exact,
         "measurements": minimum.measurements,
         "unknown_count": unknown_count,
         "absolute": minimum.absolute,
@@ -89,11 +89,11 @@ def _noise(minimum: Minimum, uncertainty: Uncertainty) -> Fields:
 def _likelihood(minimum, squares):
     """−2 ln L of the data, from the sum of squares of residuals over sigma; degrees of freedom where channels have sigmas of their own."""
     if minimum.absolute:
-        return {"misfit": squares}
-    if minimum.problem.model.loss is not None or len(sigmas_of(minimum.problem)) == 1 or minimum.found.jacobian is None:
-        return {"misfit": minimum.measurements * float(np.log(squares / minimum.measurements))}
-    at = minimum.problem, minimum.found
-    return {"misfit": neg2_log_likelihood(*at), "freedom_of_channels": freedom_of_channels(*at)}
+        return {"neg2_log_likelihood": squares}
+    if minimum.problem.model.loss is not None or minimum.channels.is_one or minimum.found.jacobian is None:
+        return {"neg2_log_likelihood": minimum.measurements * float(np.log(squares / minimum.measurements))}
+    freedom = freedom_of_channels(minimum.problem, minimum.channels, minimum.found)
+    return {"neg2_log_likelihood": neg2_log_likelihood(minimum.channels, minimum.residuals), "freedom_of_channels": freedom}
 
 
 def _sigma(r, problem, freedom):
@@ -120,7 +120,7 @@ def _sigmas(minimum, sigma):
 def _parameters(minimum: Minimum, uncertainty: Uncertainty, scale: float) -> Fields:
     """Estimates of the free parameters, and their errors."""
     free, p, known = minimum.problem.free, minimum.size, uncertainty.known
-    covariance = known.covariance[:p, :p] * np.outer(minimum.slope, minimum.slope) * scale**2
+    covariance = _covariance(minimum, known, scale)
     covariance[np.diag_indices(p)] = np.where(known.determined[:p], np.diag(covariance), np.inf)
     theta = minimum.theta
     return {
@@ -130,10 +130,16 @@ def _parameters(minimum: Minimum, uncertainty: Uncertainty, scale: float) -> Fie
         "standard_errors": free.by_name(np.sqrt(np.diag(covariance))),
         "covariance": covariance,
         "correlation": correlation_of(covariance),
-        "x_covariance": known.covariance,
+        "known": known,
         "inflation": uncertainty.inflation,
-        "correlated": uncertainty.correlated,
+        "correlation_length": uncertainty.correlation_length,
     }
+
+
+def _covariance(minimum, known, scale):
+    """Of the parameters, among the directions that are determined."""
+    p = minimum.size
+    return known.covariance[:p, :p] * np.outer(minimum.slope, minimum.slope) * scale**2
 
 
 def _unknowns(minimum: Minimum, uncertainty: Uncertainty, scale: float) -> Fields:
@@ -149,8 +155,8 @@ def _unknowns(minimum: Minimum, uncertainty: Uncertainty, scale: float) -> Field
 
 def _predictions(minimum: Minimum, uncertainty: Uncertainty, scale: float) -> Fields:
     """What each experiment should have shown, and how well each channel is predicted."""
-    covariance = uncertainty.known.covariance
-    found = in_given_order(minimum.experiments, predictions_of(minimum, covariance), predicted_tests(minimum, covariance))
+    known = uncertainty.known
+    found = in_given_order(minimum.experiments, predictions_of(minimum, known), predicted_tests(minimum, known))
     nears = iter(part.near for part in minimum.problem.tests)
     of_each = lambda k, e, one: (
         channels_of(k, e.values, one.residuals) if isinstance(e, Experiment) else channels_of_test(k, e, next(nears), one.residuals)
@@ -163,19 +169,18 @@ def _predictions(minimum: Minimum, uncertainty: Uncertainty, scale: float) -> Fi
     }
 
 
-def _remarks(minimum, uncertainty, sigma, channels, unknowns):
+def _remarks(minimum, uncertainty, scale, sigma, channels, unknowns):
     """What the reader of the card should know."""
     free, p = minimum.problem.free, minimum.size
     remarks, at_bounds = [], []
     if uncertainty.jacobian is None:
         remarks = [NO_ERRORS]
     else:
-        found = undetermined_parameters(minimum, uncertainty)
-        remarks = [] if found is None else on_undetermined(free.entries, found, deciding(minimum) if found.idle else {})
+        remarks = _on_parameters(minimum, uncertainty, scale)
         r = np.nan_to_num(np.asarray(minimum.found.residuals), posinf=0.0)  # of a motion that could not be computed
         at_bounds = list(on_bounds(free, minimum.theta, np.asarray(transposed(minimum.found.jacobian, r))[:p]))
     times_noise = sigma if minimum.absolute else 1.0
-    independent = independent_samples(minimum.measurements, uncertainty.correlated)
+    independent = independent_samples(minimum.measurements, uncertainty.correlation_length)
     unfinished = int(minimum.outcome.best.status) in (STEP_LIMIT, INTERRUPTED)  # halves are compared at a minimum
     different = None if unfinished else different_halves(minimum, uncertainty)
     halves = on_halves(free.entries, different, len(minimum.recordings))
@@ -190,10 +195,21 @@ def _remarks(minimum, uncertainty, sigma, channels, unknowns):
     ]
 
 
+def _on_parameters(minimum, uncertainty, scale):
+    """What is not determined, and the estimates of the combinations that are."""
+    found = undetermined_parameters(minimum, uncertainty)
+    if found is None:
+        return []
+    covariance = _covariance(minimum, uncertainty.known, scale)
+    estimates = [combination.estimate(minimum.theta, covariance) for combination in found.combinations]
+    return on_undetermined(minimum.problem.free.entries, found, estimates, deciding(minimum) if found.idle else {})
+
+
 def _on_sigma(minimum):
     if minimum.absolute:
         return []
-    return [*on_too_short(too_short(minimum.problem)), *on_exact(predicted_exactly(minimum.problem, minimum.found))]
+    exact = noise_free(minimum.channels, minimum.residuals)
+    return [*on_too_short(too_short(minimum.problem, minimum.channels)), *on_exact(exact)]
 
 
 def _end(minimum: Minimum, doubt: str) -> Fields:

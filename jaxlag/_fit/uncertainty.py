@@ -8,21 +8,25 @@ import numpy as np
 
 from .arrow import Arrow, gathered, norms
 from .autocorrelation import autoregression, coloured_information, correlation_length
+from .base_parameters import nearby
+from .experiment_batch import of_events
 from .identifiability import Determined, Undetermined, determined_by, undetermined
 from .minimum import Minimum
+from .noise import by_sigma
 from .problem import failure_of, linearise
 
 
 class Uncertainty(NamedTuple):
     """What is determined, with the covariance over σ²; the Jacobian behind it, None where there are too many unknowns.
 
-    `inflation`, (p,): the factor by which correlated residuals enlarge each standard error; `correlated`: over how many samples they are.
+    `inflation`, (p,): the factor by which correlated residuals enlarge each standard error; `correlation_length`: over how many
+    samples they are.
     """
 
     known: Determined
     jacobian: Arrow | None
     inflation: np.ndarray
-    correlated: int
+    correlation_length: int
 
 
 def uncertainty_of(minimum: Minimum) -> Uncertainty:
@@ -42,14 +46,11 @@ def uncertainty_of(minimum: Minimum) -> Uncertainty:
 
 def _jacobian(minimum):
     """Of priors, tests and residuals; those of a robust loss as if it were quadratic."""
-    problem, found, loss = minimum.problem, minimum.found, minimum.problem.model.loss
+    problem, found = minimum.problem, minimum.found
     if found.jacobian is None:
         return None
-    blocks = [np.asarray(part.jacobian).astype(float) for part in found.batches]
-    if loss is not None:
-        slopes = [loss.slope(np.nan_to_num(r) / problem.scale) for r in minimum.weighted]
-        blocks = [J / np.asarray(slope)[:, :, None] for J, slope in zip(blocks, slopes, strict=True)]
-    beside = found.jacobian.first if isinstance(found.jacobian, Arrow) else found.jacobian[: problem.beside]
+    blocks = [by_sigma(batch, part) for batch, part in zip(problem.batches, found.batches, strict=True)]
+    beside = found.jacobian.first if isinstance(found.jacobian, Arrow) else found.jacobian[: problem.first_recorded]
     columns = tuple(problem.columns(k) for k in range(len(blocks)))
     return Arrow(np.asarray(beside).astype(float), tuple(blocks), columns, np.zeros((0, minimum.x.size)))
 
@@ -65,51 +66,62 @@ def sandwich(minimum: Minimum, J: Arrow, covariance: np.ndarray, weighted: list[
     samples they are. `weighted`: the residuals of each batch, like those of the minimum; `covariance`: as if they were white.
     """
     batches, segments_of_each = minimum.problem.batches, minimum.segments_of_each()
-    series = [np.concatenate([_by_time(batches[k], weighted[k][row].astype(float), n) for k, row, n in of]) for of in segments_of_each]
-    lengths = [correlation_length(autoregression(r[np.isfinite(r)]), len(r)) for rs in series for r in rs.T]
+    together = lambda parts: [np.concatenate(of) for of in zip(*parts, strict=True)]
+    series = [together([_by_time(batches[k], weighted[k][row].astype(float), n) for k, row, n in of]) for of in segments_of_each]
+    lengths = [correlation_length(autoregression(r[np.isfinite(r)]), len(r)) for of in series for rs in of for r in rs.T]
     if not any(lengths):
         return covariance, 0
-    power = np.nanmean(np.concatenate([r.ravel() for r in series]) ** 2)
+    power = np.nanmean(np.concatenate([r.ravel() for of in series for r in of]) ** 2)
     middle = J.first.T @ J.first
-    for segments, r in zip(segments_of_each, series, strict=True):
-        sizes = np.ones(r.shape[1]) if minimum.absolute else np.sqrt(np.nanmean(r**2, axis=0) / power)
+    for segments, of in zip(segments_of_each, series, strict=True):
         columns, slopes = _of_experiment(batches, J, segments)
-        middle[np.ix_(columns, columns)] += coloured_information(slopes, r, sizes)
+        for r, J_r in zip(of, slopes, strict=True):
+            sizes = np.ones(r.shape[1]) if minimum.absolute else np.sqrt(np.nanmean(r**2, axis=0) / power)
+            middle[np.ix_(columns, columns)] += coloured_information(J_r, r, sizes)
     return covariance @ middle @ covariance, max(lengths)
 
 
 def _of_experiment(batches, J, segments):
-    """The columns on which an experiment depends, and its rows, those of its segments one after the other, (samples, channels, columns)."""
+    """The columns on which an experiment depends, and its series, of one segment after the other, (samples, channels, columns)."""
     columns = np.unique(np.concatenate([J.columns[k][row] for k, row, _ in segments]))
     rows = []
     for k, row, n in segments:
-        own = _by_time(batches[k], J.blocks[k][row], n)
-        wide = np.zeros((*own.shape[:2], columns.size))
-        wide[:, :, np.searchsorted(columns, J.columns[k][row])] = own
-        rows.append(wide)
-    return columns, np.concatenate(rows)
+        wide = np.zeros((len(J.blocks[k][row]), columns.size))
+        wide[:, np.searchsorted(columns, J.columns[k][row])] = J.blocks[k][row]
+        rows.append(_by_time(batches[k], wide, n))
+    return columns, [np.concatenate(of) for of in zip(*rows, strict=True)]
 
 
 def _by_time(batch, flat, samples):
-    """Rows of one experiment, one channel after the other, as (samples, channels, ...)."""
+    """Rows of one experiment, one channel after the other, as series in time (samples, channels, ...): one of all that is sampled, and
+    one of the times of each event, whose noise has nothing to do with others.
+    """
     shapes = [leaf.shape[1:] for leaf in jax.tree.leaves(batch.values)]
     parts = np.split(flat, np.cumsum([int(np.prod(shape)) for shape in shapes])[:-1])
     by_time = [part.reshape(shape[0], -1, *flat.shape[1:]) for part, shape in zip(parts, shapes, strict=True)]
-    return np.concatenate(by_time, axis=1)[:samples]
+    kinds = of_events(batch)
+    sampled = [part[:samples] for part, of_event in zip(by_time, kinds, strict=True) if not of_event]
+    together = [np.concatenate(sampled, axis=1)] if sampled else []
+    return together + [part for part, of_event in zip(by_time, kinds, strict=True) if of_event]
 
 
 def undetermined_parameters(minimum: Minimum, uncertainty: Uncertainty) -> Undetermined | None:
-    """Which parameters are not determined, if any; a second point tells products from sums."""
-    free, p, null = minimum.problem.free, minimum.size, uncertainty.known.null
-    if uncertainty.jacobian is None or not np.any(null[:p]):
+    """Which parameters are not determined, if any; other points tell which combinations are."""
+    p, known = minimum.size, uncertainty.known
+    if uncertainty.jacobian is None or not np.any(known.null[:p]):
         return None
-    nulls, thetas = [minimum.slope[:, None] * null[:p]], [minimum.theta]
-    elsewhere = jnp.asarray(minimum.x).at[:p].add(0.1 * jnp.cos(jnp.arange(p)))
-    found = linearise(minimum.problem, elsewhere)
-    if failure_of(found) is None:
-        J = gathered(found.jacobian)
-        there = determined_by(np.asarray(J)[: len(J) - len(found.gaps)], np.asarray(found.gaps_jacobian), hidden=null.shape[1])
-        nulls.append(np.asarray(free.slope(elsewhere[:p]))[:, None] * there.null[:p])
-        thetas.append(np.asarray(free.theta(elsewhere[:p])))
     idle = np.flatnonzero(norms(uncertainty.jacobian)[:p] == 0).tolist()
-    return undetermined(minimum.theta, nulls, thetas, idle)
+    return undetermined(_points(minimum, known), np.flatnonzero(known.determined[:p]).tolist(), idle, known.noise)
+
+
+def _points(minimum, known):
+    """θ and the changes that do not show, at the estimate, then around it wherever there is a motion."""
+    free, p = minimum.problem.free, minimum.size
+    yield minimum.theta, minimum.slope[:, None] * known.null[:p]
+    for theta in nearby(minimum.theta, np.asarray(free.lower), np.asarray(free.upper)):
+        y = jnp.asarray((theta - free.start) / free.scale, minimum.x.dtype)
+        found = linearise(minimum.problem, jnp.asarray(minimum.x).at[:p].set(y))
+        J = np.asarray(gathered(found.jacobian))
+        if failure_of(found) is None and np.all(np.isfinite(J)):
+            there = determined_by(J[: len(J) - len(found.gaps)], np.asarray(found.gaps_jacobian), hidden=known.null.shape[1])
+            yield np.asarray(free.theta(y), float), np.asarray(free.slope(y))[:, None] * there.null[:p]

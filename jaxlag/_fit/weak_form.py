@@ -86,16 +86,15 @@ class Record(NamedTuple):
         """From the measurements."""
         own, ts = with_own(params, e.params), np.asarray(e.ts, float)
         nodes, quadrature = _quadrature(ts, jump_times(own, float))
-        motion = tuple(jnp.asarray(x, e.ts.dtype) for x in smooth(e, params, nodes)[1:])
+        arrays = jax.tree.map(lambda x: jnp.asarray(x) if isinstance(x, float) else x, own)
+        slips = lambda motion: np.asarray(_slips(system, e.q0, arrays, *(jnp.asarray(x, e.ts.dtype) for x in motion[:3])))
+        smoothed = smooth(e, params, nodes, lambda motion: _kinks(nodes, slips(motion)))
+        motion = tuple(jnp.asarray(x, e.ts.dtype) for x in smoothed[1:])
         speeds = np.sqrt(np.mean(np.asarray(motion[1]) ** 2, axis=0))
         units = jnp.asarray(np.where(speeds > 0, speeds, 1), e.ts.dtype)
         form = WeakForm(system, e.q0, e.params, jnp.asarray(nodes, e.ts.dtype), motion, units)
-        arrays = jax.tree.map(lambda x: jnp.asarray(x) if isinstance(x, float) else x, own)
-        slip, moves = _slips(system, e.q0, arrays, form.nodes, *motion[:2]), np.ones(nodes.size, bool)
-        if slip is not None:
-            speed = np.abs(np.asarray(slip))
-            moves = np.all(speed > SLOW * np.max(speed, axis=0), axis=1)
-        return cls(form, nodes, quadrature, moves, (ts[0], ts[-1]), (ts[-1] - ts[0]) / max(ts.size - 1, 1))
+        moves = ~np.any(_is_slow(slips(smoothed)), axis=1)
+        return cls(form, nodes, quadrature, moves, (ts[0], ts[-1]), (ts[-1] - ts[0]) / max(_most_samples(e) - 1, 1))
 
     def windows(self, half: float) -> Windows:
         """The windows of this half width along the record."""
@@ -107,6 +106,11 @@ class Record(NamedTuple):
         return terms[:, :n], terms[:, n : 2 * n], terms[:, 2 * n :]
 
 
+def _most_samples(e):
+    """Of all channels."""
+    return max(int(np.sum(np.any(np.isfinite(np.reshape(z, (len(z), -1))), axis=1))) for z in jax.tree.leaves(e.values))
+
+
 def _quadrature(ts, jumps):
     """Nodes and weights of Gauss and Legendre for the intervals between samples and jumps, within which inputs are smooth."""
     edges = np.unique(ts if jumps is None else np.concatenate([ts, np.clip(np.asarray(jumps), ts[0], ts[-1])]))
@@ -115,11 +119,31 @@ def _quadrature(ts, jumps):
     return (edges[:-1, None] + half * (1 + x)).ravel(), (half * w).ravel()
 
 
+def _is_slow(slip):
+    """Whether each slip velocity is so close to zero that friction may stick, (N, slips)."""
+    speed = np.abs(slip)
+    return speed <= SLOW * np.max(speed, axis=0, initial=0.0)
+
+
+def _kinks(ts, slip):
+    """The times at which dry friction reverses, begins to stick and ends to: where slip velocities beside a slow stretch extrapolate to
+    zero, or where they pass through it from one moment to the next.
+    """
+    if not slip.size:
+        return np.zeros(0)
+    with np.errstate(divide="ignore", invalid="ignore"):  # of nodes at one time
+        rates, slow = np.gradient(slip, ts, axis=0), _is_slow(slip)
+    at = np.concatenate([~slow[:-1] & slow[1:], np.zeros_like(slow[:1])]) | np.concatenate([np.zeros_like(slow[:1]), slow[:-1] & ~slow[1:]])
+    at[:-1] |= ~slow[:-1] & ~slow[1:] & (slip[:-1] * slip[1:] < 0)
+    i, j = np.nonzero(at & np.isfinite(rates) & (rates != 0))
+    return np.unique(np.clip(ts[i] - slip[i, j] / rates[i, j], ts[0], ts[-1]))
+
+
 @eqx.filter_jit  # so that all parameters are traced: a friction coefficient of 0 is still friction
 def _slips(system, like, params, ts, q, v):
-    """Slip velocities of dry friction along a record, (T, slips); None where there is no dry friction."""
+    """Slip velocities of dry friction along a record, (T, slips)."""
     elements = find_elements(bind(system, like, params), ts[0], q[0], v[0])
-    return None if elements is None else jax.vmap(elements.slip)(ts, q, v)
+    return jnp.zeros((ts.size, 0)) if elements is None else jax.vmap(elements.slip)(ts, q, v)
 
 
 @compiled

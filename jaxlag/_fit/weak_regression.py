@@ -23,7 +23,8 @@ ENOUGH = 1000  # windows of a record, by which an estimate is judged
 class Estimate(NamedTuple):
     """y from so many `windows`, its covariance, and its standard errors: infinite where y is not determined.
 
-    `spare`: how many windows could be left out if none overlapped and y were to be determined still.
+    `null`: the changes of y that do not show, (p, k), with an error `noise`. `spare`: how many windows could be left out if none overlapped
+    and y were to be determined still. `as_good`: estimates from other windows that predict as well.
     """
 
     half: float
@@ -31,12 +32,15 @@ class Estimate(NamedTuple):
     y: np.ndarray
     covariance: np.ndarray
     errors: np.ndarray
+    null: np.ndarray
+    noise: float
     windows: int
     spare: float
+    as_good: tuple["Estimate", ...] = ()
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class Problem:
+class WeakFormProblem:
     """Records and the free parameters; `terms` of a record at y, with their Jacobian; whether they are `linear` in y; what is `kept` of
     the windows of each width.
     """
@@ -48,7 +52,7 @@ class Problem:
     kept: dict[float, tuple] = dataclasses.field(default_factory=dict)
 
     @classmethod
-    def of(cls, records: Sequence[Record], free: Free, linear: bool) -> "Problem":
+    def of(cls, records: Sequence[Record], free: Free, linear: bool) -> "WeakFormProblem":
         """Where they are linear, the records are evaluated once."""
         return cls(records, free, linear, [_terms(record, free, linear) for record in records])
 
@@ -66,9 +70,9 @@ class Problem:
             y = (self._solve_linear if self.linear else self._solve_nonlinear)(residuals, weights, y)
             parts = residuals(y)
             weights = [_one_over(_rms(r), size) for (r, _), size in zip(parts, sizes, strict=True)]
-        covariance, determined = self._covariance(parts, weights, windows, used)
-        errors = np.where(determined, np.sqrt(np.maximum(np.diag(covariance), 0)), np.inf)
-        return Estimate(half, near_rest, y, covariance, errors, count, spare)
+        known = self._known(parts, weights, windows, used)
+        errors = np.where(known.determined, np.sqrt(np.maximum(np.diag(known.covariance), 0)), np.inf)
+        return Estimate(half, near_rest, y, known.covariance, errors, known.null, known.noise, count, spare)
 
     def unexplained(self, half: float, near_rest: float, found: Estimate) -> np.ndarray:
         """For each equation the mean square of its residuals with an estimate from windows of any width, and the variance by the error
@@ -79,6 +83,12 @@ class Problem:
         variance = np.einsum("kcp,pq,kcq->c", J, found.covariance, J, optimize=True) / len(J)
         size = self._sizes(r, J, found.y)
         return (_rms(r) ** 2 + variance) / np.where(size > 0, size, 1) ** 2
+
+    def jacobian(self, y: np.ndarray, found: Estimate) -> np.ndarray:
+        """Of the residuals at y in the windows of an estimate, over the size of their terms."""
+        parts = self._integrated(found.half, found.near_rest)[2](y)
+        sizes = [self._sizes(r, J, y) for r, J in parts]
+        return _stacked(parts, [_one_over(size, size) for size in sizes])[1]
 
     def _integrated(self, half, near_rest):
         """The windows of each record; which of them are used; their residuals, (K, n + m) for each record, and the Jacobian of these, as
@@ -155,8 +165,8 @@ class Problem:
         """y as counted from where all free parameters are zero."""
         return np.asarray(self.free.start / self.free.scale) + y
 
-    def _covariance(self, parts, weights, windows, used):
-        """By the scatter of the windows; and which entries of y are determined."""
+    def _known(self, parts, weights, windows, used):
+        """What is determined, with a covariance by the scatter of the windows."""
         known = determined_by(_stacked(parts, weights)[1], np.zeros((0, self.free.size)))
         spread, lags = [], []
         for (r, J), weight, record, w, u in zip(parts, weights, self.records, windows, used, strict=True):
@@ -165,7 +175,7 @@ class Problem:
             spread.append((all_r, all_J))
             correlated = max(OVERLAP * w.half, COLOUR * (record.span[1] - record.span[0]))
             lags.append(1 + int(np.ceil(correlated / (APART * w.half))))
-        return scatter(known.covariance, spread, lags), known.determined
+        return known._replace(covariance=scatter(known.covariance, spread, lags))
 
 
 def _terms(record, free, linear):

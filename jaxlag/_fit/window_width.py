@@ -1,11 +1,12 @@
 """The width of the windows, chosen by how well an estimate predicts windows of all widths."""
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 
 from .weak_form import Record
-from .weak_regression import Estimate, Problem
+from .weak_regression import Estimate, WeakFormProblem
 
 GROWTH = 1.4  # from one width to the next that is tried
 WIDEST = 0.25  # half a window, as a part of the longest record
@@ -16,7 +17,7 @@ NEGLIGIBLE = 0.003  # of the size of an equation's terms: residuals below it cou
 ALIKE = 0.8  # of the signal-to-noise ratio of the best: estimates that predict as well, whose scatter is part of its error
 
 
-def best_estimate(problem: Problem, halves: np.ndarray) -> Estimate | None:
+def best_estimate(problem: WeakFormProblem, halves: np.ndarray) -> Estimate | None:
     """The best estimate from windows of these half widths, the widest first; None where windows are too few.
 
     In narrow windows the noise is large, in windows of many oscillations the terms average to nothing; in both cases noise in the motion
@@ -47,7 +48,7 @@ def best_estimate(problem: Problem, halves: np.ndarray) -> Estimate | None:
     ratios = np.array([_signal_to_noise(problem, found, windows) for found in sure])
     best = sure[int(np.argmax(ratios))]
     as_good = [found for found, ratio in zip(sure, ratios, strict=True) if ratio >= ALIKE * np.max(ratios)]
-    return best._replace(errors=np.sqrt(best.errors**2 + _scatter(best, as_good)))
+    return best._replace(errors=with_scatter(best.y, best.errors, [(one.y, one.errors) for one in as_good]), as_good=tuple(as_good))
 
 
 def half_widths(records: Sequence[Record]) -> np.ndarray:
@@ -68,8 +69,9 @@ def _signal_to_noise(problem, found, windows):
     return float(np.mean(1 / np.sqrt(np.minimum(left, 1) + NEGLIGIBLE**2)))
 
 
-def _scatter(best, others):
-    """The median square by which they differ from the best beyond the difference of their variances."""
-    known = np.isfinite(best.errors)
-    excess = [(one.y - best.y) ** 2 - np.abs(np.where(known, one.errors, 0) ** 2 - np.where(known, best.errors, 0) ** 2) for one in others]
-    return np.where(known, np.median(np.maximum(excess, 0), axis=0), 0)
+def with_scatter(value: Any, error: Any, others: Sequence[tuple[Any, Any]]) -> Any:
+    """The standard error, with the median square by which others, (value, error), differ beyond the difference of their variances."""
+    known = np.isfinite(error)
+    square = lambda error: np.where(known, error, 0) ** 2
+    excess = [np.maximum((other - value) ** 2 - np.abs(square(its_error) - square(error)), 0) for other, its_error in others]
+    return np.sqrt(error**2 + np.where(known, np.median(excess, axis=0), 0)) if others else error

@@ -1,6 +1,6 @@
 """What an experiment recorded: measurements, the noise, times of events and delays, as a user gives them and after all checks."""
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Container, Iterable, Mapping
 from typing import Any
 
 import jax
@@ -14,8 +14,8 @@ from .numbers import number, numbers
 from .validation import is_vector
 
 
-def with_events(values: PyTree, events: Mapping[str, Any] | None, dtype: Any) -> PyTree:
-    """The measured values, and in channels of their own the times of events."""
+def with_events(values: PyTree, events: Mapping[str, Any] | None, ts: Any, dtype: Any, late: Container[str] = ()) -> PyTree:
+    """The measured values, and in channels of their own the times of events: within the record, unless they are heard `late`."""
     if not events:
         return values
     if not isinstance(values, Mapping) or not isinstance(events, Mapping) or set(values) & set(events):
@@ -27,19 +27,14 @@ def with_events(values: PyTree, events: Mapping[str, Any] | None, dtype: Any) ->
             raise ValueError(
                 f"`events[{name!r}]` must be a list of times, but has shape {channels[name].shape}. Give one number for each event."
             )
+        if name not in late and is_concrete((channels[name], ts)):
+            outside = channels[name][(channels[name] < ts[0]) | (channels[name] > ts[-1])]
+            if outside.size:
+                raise ValueError(
+                    f"`events[{name!r}]` must lie between the first and the last of `ts`, {ts[0]:g} and {ts[-1]:g}, but holds "
+                    f"{outside[0]:g}. The motion ends with `ts`: give it a later time, with NaN for what was not measured."
+                )
     return channels
-
-
-def of_equal_length(ts: Any, values: PyTree, sigma: PyTree) -> tuple[Any, PyTree, PyTree]:
-    """Times, values and sigma with equally many rows: further ones have the last time, and nothing was measured there."""
-    longest = max(len(x) for x in (ts, *jax.tree.leaves(values)))
-
-    def lengthened(x, end):
-        xnp = numpy_for(x, end)
-        return x if len(x) == longest else xnp.concatenate([x, xnp.full((longest - len(x), *x.shape[1:]), end, x.dtype)])
-
-    longer = lambda tree, end: jax.tree.map(lambda x: lengthened(x, end), tree)
-    return lengthened(ts, ts[-1]), longer(values, np.nan), sigma if values is None else longer(sigma, 1.0)
 
 
 def measured_values(values: PyTree, ts: Any, dtype: Any) -> PyTree:

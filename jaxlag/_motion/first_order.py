@@ -84,7 +84,7 @@ class EquationsOfMotion:
 
     def flat_at(self, params: PyTree, at: StatesAt) -> Flat:
         """The system over flat vectors at one time: its inputs are looked up once."""
-        return self.flat(pieces_at(params, self.elsewhere, at.t), at)
+        return self.flat(pieces_at(params, self.elsewhere, at.t, self.periods(params)), at)
 
     def states_of(self, t, parts: Parts) -> StatesAt:
         """The further states, at the time t."""

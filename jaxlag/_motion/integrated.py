@@ -10,7 +10,7 @@ from equinox.internal import while_loop
 from .._model.signal import broken_signals
 from .._program.whole_kernel import in_whole_kernel
 from .event_record import has_stopped, most
-from .interval_inputs import Inputs, Recorded, packed
+from .interval_inputs import Inputs, Record, Recorded, packed
 from .interval_loop import IntervalLoop, Moving, Numbers, Steps
 from .results import number_of, numbered
 
@@ -25,8 +25,9 @@ def integrated(
     """
     params, args = args.params, args._replace(params=None)
     start = jax.lax.stop_gradient(ts[0])
-    following = tuple(jnp.searchsorted(s.times.astype(ts.dtype), start, side="right").astype(int) for s in broken_signals(params))
-    following = (*following, *[jnp.array(1)] * len(equations.periods(params)))  # the first updates are in y0
+    periods = equations.periods(params)
+    following = tuple(Record.of(signal).following(start, periods).astype(int) for signal in broken_signals(params))
+    following = (*following, *[jnp.array(1)] * len(periods))  # the first updates are in y0
     moving = _moving(equations, params, directions, reverse)
     recorded = Recorded.of(equations.elsewhere, params, tuple(of_params for of_params, _ in directions))
     along = tuple(zip(recorded.directions, (of_origin for _, of_origin in directions), strict=True))

@@ -60,11 +60,25 @@ class Record(NamedTuple):
             values = jnp.where(following > first + 1, values[::-1], values)
         return Piece(ts + self.delay, values, self.interpolation, number)
 
-    def time(self, i: Int[Array, ""], t) -> Float[Array, ""]:
-        """That of sample i, infinite where there is none after t."""
+    def time(self, i: Int[Array, ""], origin, periods: Sequence[Any]) -> Float[Array, ""]:
+        """That of sample i, infinite where there is none; of a jump that is recorded for the tick of a sampled state, counted from the
+        `origin`, that of the tick: a logger's clock is not quite that of the controller, which would read either value at random.
+        """
         size = self.ts.shape[0]
-        found = (self.ts.at(jnp.minimum(i, size - 1))[0] + self.delay).astype(t.dtype)
-        return jnp.where((i < size) & (found > t), found, jnp.inf)
+        time = jnp.where(i < size, (self.ts.at(jnp.minimum(i, size - 1))[0] + self.delay).astype(origin.dtype), jnp.inf)
+        for period in periods if self.interpolation.jumps else ():
+            usual = (self.ts.at(size - 1)[0] - self.ts.at(0)[0]) / max(size - 1, 1)
+            tick = origin + jnp.round((time - origin) / jnp.where(period > 0, period, 1)) * period
+            is_meant = (jnp.abs(time - tick) <= SIMULTANEOUS * period) & (usual >= SELDOM * period) & jnp.isfinite(time)
+            time = time + jax.lax.stop_gradient(jnp.where(is_meant, tick - time, 0).astype(time.dtype))
+        return time
+
+    def following(self, origin, periods: Sequence[Any]) -> Int[Array, ""]:
+        """The first sample after the `origin`."""
+        origin = jax.lax.stop_gradient(origin)
+        times = self.ts.vector[self.ts.start : self.ts.start + self.ts.shape[0]].astype(origin.dtype) + self.delay.astype(origin.dtype)
+        i = jnp.searchsorted(times, origin, side="right")
+        return i + (self.time(i, origin, periods) <= origin)
 
 
 class Place(eqx.Module):
@@ -95,21 +109,9 @@ class Inputs:
         """Which of them jump."""
         return [record.interpolation.jumps for record in self.records]
 
-    def times(self, following: tuple[Int[Array, ""], ...], t) -> list[Float[Array, ""]]:
+    def times(self, following: tuple[Int[Array, ""], ...], origin, periods: Sequence[Any]) -> list[Float[Array, ""]]:
         """When the next sample of each comes; what follows in `following` are no signals."""
-        return [record.time(i, t) for record, i in zip(self.records, following, strict=False)]
-
-    def at_ticks(self, k: int, time, origin, periods: Sequence[Any]) -> Float[Array, ""]:
-        """The time at which signal k jumps, or that of the tick of a sampled state that it is recorded for: a logger's clock is not quite
-        that of the controller, which would read the old value or the new one at random.
-        """
-        ts, jumps = self.records[k].ts, self.records[k].interpolation.jumps
-        for period in periods if jumps else ():
-            usual = (ts.at(ts.shape[0] - 1)[0] - ts.at(0)[0]) / max(ts.shape[0] - 1, 1)
-            tick = origin + jnp.round((time - origin) / jnp.where(period > 0, period, 1)) * period
-            is_meant = (jnp.abs(time - tick) <= SIMULTANEOUS * period) & (usual >= SELDOM * period) & jnp.isfinite(time)
-            time = time + jax.lax.stop_gradient(jnp.where(is_meant, tick - time, 0).astype(time.dtype))
-        return time
+        return [record.time(i, origin, periods) for record, i in zip(self.records, following, strict=False)]
 
     def pieces(self, following: tuple[Int[Array, ""], ...]) -> PyTree:
         """Params with the inputs as they are up to the next sample of each."""
@@ -204,12 +206,12 @@ def _first_piece(number: int, signal: Signal) -> Piece:
     return Record.of(signal).piece(number, jnp.array(1))
 
 
-def pieces_at(params: PyTree, elsewhere: frozenset[int], t: Any) -> PyTree:
-    """Params with the inputs as they are around the time t, but for those that are asked for `elsewhere`."""
+def pieces_at(params: PyTree, elsewhere: frozenset[int], t: Any, periods: Sequence[Any]) -> PyTree:
+    """Params with the inputs as they are behind the time t, a tick of all sampled states, but for those that are asked for `elsewhere`."""
 
     def of(number, signal):
-        following = jnp.searchsorted(signal.times.astype(jnp.result_type(t)), jax.lax.stop_gradient(t), side="right")
-        return Record.of(signal).piece(number, following)
+        record = Record.of(signal)
+        return record.piece(number, record.following(jnp.asarray(t), periods))
 
     return _replaced(params, elsewhere, of)
 

@@ -198,9 +198,8 @@ class IntervalLoop(NamedTuple):
         inputs, periods = self.inputs(params), self.equations.periods(params)
         signals = len(inputs.records)
         ticks = [(origin + i * period).astype(t.dtype) for i, period in zip(steps.following[signals:], periods, strict=True)]
-        ticks = [jnp.where(tick > t, tick, jnp.inf) for tick in ticks]  # a period that is not positive has none
-        times = [inputs.at_ticks(k, time, origin, periods) for k, time in enumerate(inputs.times(steps.following, t))]
-        return [*times, *ticks]
+        times = [time.astype(t.dtype) for time in inputs.times(steps.following, origin, periods)]
+        return [jnp.where(time > t, time, jnp.inf) for time in (*times, *ticks)]  # a period that is not positive has no next tick
 
     def _tried(self, same, moving: Moving, given, steps: Steps, args) -> tuple[Tried, Any]:
         """A step of the solver up to the next node at most; and, not differentiated, its result and the rest of the solver's state.

@@ -2,7 +2,8 @@
 
 A damped oscillator, c and b fitted to 200 recordings for each correlation; and a pendulum in Cartesian coordinates whose rod is a
 constraint, its length l and damping b fitted to as many (seeds 0 to 199). Then the corners: few samples, one or two sensors of unknown
-noise, times at random, 400 recordings each. Run:
+noise, times at random, 400 recordings each. Last, regressions with dry friction that is unlike in both directions, 400 recordings of each
+machine. Run:
 
 python tests/benchmarks/bench_coverage.py
 """
@@ -12,7 +13,10 @@ import itertools
 import time
 
 import jax
+import jax.numpy as jnp
 import numpy as np
+from bench_recordings import SYSTEM as DRIVE
+from bench_recordings import drive
 from scipy import integrate, linalg, signal
 
 import jaxlag as jl
@@ -109,6 +113,80 @@ def in_the_corners(samples, sensors, at_random, rho=0.0, seeds=400):
     return jl.fit_each(SYSTEM, records, START, free=FREE)
 
 
+WITH_FRICTION = jl.System(
+    lambda q, qdot, m, c: 0.5 * m * qdot**2 - 0.5 * c * q**2,
+    dissipation=lambda qdot, b, Fc: 0.5 * b * qdot**2 + Fc * jnp.abs(qdot),
+    force=lambda t, u, offset: u(t) - offset,
+)
+RUBBED, AHEAD, BACK = {"m": 2.0, "c": 8.0, "b": 0.6, "Fc": 1.0, "offset": 0.3}, 1.3, 0.7  # Fc ± offset
+COULOMB = {"forth": {"Fv": 200.0, "Fc": 22.0}, "back": {"Fv": 200.0, "Fc": 18.5}, "ripple": 0.0, "presliding": 1e-7}
+OF_COULOMB = {"M": 95.0, "Fv": 200.0, "Fc": (22.0 + 18.5) / 2, "offset": drive.TRUE["offset"] + (22.0 - 18.5) / 2}
+
+
+def with_noise(ts, q, u, sizes, seed):
+    """A recording with white noise of the position and of the force, or the command."""
+    e, f = np.random.default_rng(seed).standard_normal((2, ts.size))
+    return jl.Experiment(ts, q + sizes[0] * e, 0.0, 0.0, params={"u": jl.Signal(ts, u + sizes[1] * f)})
+
+
+def rubbed(seeds, samples=1000, interval=0.01, steps=50):
+    """Oscillators from rest under three waves of random phases, force held from sample to sample, and friction in an implicit step of
+    its own, by which it sticks, too (Moreau, 1988); each with the true parameters.
+    """
+    ts, h, m = np.arange(samples) * interval, interval / steps, RUBBED["m"]
+    phases = np.random.default_rng(0).uniform(0, 2 * np.pi, (seeds, 3))
+    u = np.sin(2 * np.pi * np.array([0.2, 0.45, 0.8]) * ts[:, None, None] + phases) @ np.array([5.0, 4.0, 3.0])
+    q, v, seen = np.zeros(seeds), np.zeros(seeds), np.empty((samples, seeds))
+    for k in range(samples):
+        seen[k] = q
+        for _ in range(steps):
+            free = v + h / m * (u[k] - RUBBED["c"] * (q + h * v / 2) - RUBBED["b"] * v)
+            after = np.sign(free) * np.maximum(np.abs(free) - np.where(free > 0, AHEAD, BACK) * h / m, 0)
+            q, v = q + h * (v + after) / 2, after
+    return [(with_noise(ts, seen[:, seed], u[:, seed], (1e-3, 0.05), seed), RUBBED) for seed in range(seeds)]
+
+
+def drives(seeds, true=None, samples=5000, **how):
+    """Drives led along strokes of their own; with the true parameters, or those by least squares in the true motion."""
+    paths = []
+    for seed in range(seeds):
+        random = np.random.default_rng(seed)
+        goals = np.where(np.arange(12) % 2, 0.0, random.uniform(0.03, 0.1, 12))
+        paths.append(drive.strokes(goals, random.uniform(0.05, 0.25, 12), samples, begin=100))
+    ts, q, v, u, a = drive.worn(np.stack(paths, axis=1), **how)
+    record = lambda seed: with_noise(ts, q[:, seed], u[:, seed], (2e-6, 0.02), seed)
+    return [(record(seed), true or drive.inverse_dynamics(v[:, seed], u[:, seed], a[:, seed])) for seed in range(seeds)]
+
+
+REGRESSIONS = {
+    "oscillator": (WITH_FRICTION, rubbed),
+    "drive": (DRIVE, lambda seeds: drives(seeds, OF_COULOMB, **COULOMB)),
+    "worn drive": (DRIVE, drives),
+}
+
+
+def off_over_errors(case, seeds):
+    """By how many standard errors each estimate of `regress` is off: by name, (seeds,)."""
+    system, recorded = REGRESSIONS[case]
+    off = {}
+    for record, true in recorded(seeds):
+        found = jl.regress(system, record, dict.fromkeys(true, np.nan), free=tuple(true))
+        for name in true:
+            off.setdefault(name, []).append(float((found.estimates[name] - true[name]) / found.standard_errors[name]))
+    return {name: np.array(values) for name, values in off.items()}
+
+
+def regressions(seeds=400) -> None:
+    """Prints the table of the regressions."""
+    print(f"{'regress':12} {'':6} {'inside':>8} {'rms of off/error':>17} {'mean':>6} {'seconds':>8}")
+    for case in REGRESSIONS:
+        begin = time.perf_counter()
+        for name, off in off_over_errors(case, seeds).items():
+            seconds, size = time.perf_counter() - begin, np.sqrt(np.mean(off**2))
+            inside = f"{100 * np.mean(np.abs(off) < 1.96):6.1f} %"
+            print(f"{case:12} {name:6} {inside} {size:17.2f} {np.mean(off):6.2f} {seconds:8.1f}", flush=True)
+
+
 def coverage(fits, true=TRUE):
     """The fraction of intervals that contain the true value, for each parameter."""
     return {n: np.mean([f.interval(n).lower < true[n] < f.interval(n).upper for f in fits]) for n in true}
@@ -127,7 +205,7 @@ def main() -> None:
         seconds = time.perf_counter() - begin
         white, exact = deviations(rho, model, true)
         held = coverage(fits, true)
-        over = np.median([f.correlated for f in fits])
+        over = np.median([f.correlation_length for f in fits])
         said = np.mean([any("half of the record" in remark for remark in f.remarks) for f in fits])
         for i, name in enumerate(true):
             errors = np.array([float(f.standard_errors[name]) for f in fits])
@@ -157,3 +235,4 @@ CASES = (("oscillator", fits_of, position, TRUE), ("pendulum", constrained_fits_
 if __name__ == "__main__":
     main()
     corners()
+    regressions()

@@ -63,36 +63,38 @@ FORTH, BACK = {"Fv": 212.0, "Fc": 22.0}, {"Fv": 195.0, "Fc": 18.5}
 PRESLIDING, PITCH = 2e-5, 0.05  # m
 
 
-def strokes():
+def strokes(goals=(0.24, 0.0) * 6, speeds=(0.2, 0.12, 0.06, 0.16) * 3, samples=SAMPLES, begin=500):
     """There and back, each stroke at a constant speed, as EMPS is led."""
-    r, at, k = np.zeros(SAMPLES), 0.0, 500
-    for goal, speed in zip([0.24, 0.0] * 6, np.tile([0.2, 0.12, 0.06, 0.16], 3), strict=True):
+    r, at, k = np.zeros(samples), 0.0, begin
+    for goal, speed in zip(goals, speeds, strict=True):
         rise, T = speed / 1.0, abs(goal - at) / speed + speed / 1.0
         t = np.arange(int(T / STEP) + 1) * STEP
         way = np.where(t < rise, t**2 / 2, np.where(t < T - rise, speed * (t - rise / 2), abs(goal - at) - (T - t) ** 2 / 2))
-        way = (at + np.sign(goal - at) * way)[: max(SAMPLES - k, 0)]
+        way = (at + np.sign(goal - at) * way)[: max(samples - k, 0)]
         r[k : k + len(way)], r[k + len(way) :] = way, goal
         at, k = goal, k + len(t) + 150
     return r
 
 
-def worn(ripple=1.0, steps=10):
-    """As `recording`, and the true accelerations: ten steps of Euler's scheme a sample, in which friction builds up exactly."""
-    ts, r, h = np.arange(SAMPLES) * STEP, strokes(), STEP / steps
-    q, v, before, built = 0.0, 0.0, 0.0, 0.0
-    seen, speeds, commands, accelerations = (np.empty(SAMPLES) for _ in range(4))
-    for k in range(SAMPLES):
+def worn(r=None, forth=FORTH, back=BACK, ripple=1.0, presliding=PRESLIDING, steps=10):
+    """As `recording`, led along r, (T,) or (T, drives), and the true accelerations: ten steps of Euler's scheme a sample, in which
+    friction builds up exactly.
+    """
+    r, h = strokes() if r is None else r, STEP / steps
+    q, v, before, built = (np.zeros(r.shape[1:]) for _ in range(4))
+    seen, speeds, commands, accelerations = (np.empty(r.shape) for _ in range(4))
+    for k in range(len(r)):
         seen[k], speeds[k] = np.round(q / QUANTUM) * QUANTUM, v
         commands[k] = np.clip(KV * (KP * (r[k] - seen[k]) - (seen[k] - before) / STEP), -LIMIT, LIMIT)
         before = seen[k]
         for _ in range(steps):
-            way = FORTH if v > 0 else BACK
-            built = np.sign(v) - (np.sign(v) - built) * np.exp(-abs(v) * h / PRESLIDING)
+            Fv, Fc = (np.where(v > 0, forth[name], back[name]) for name in ("Fv", "Fc"))
+            built = np.sign(v) - (np.sign(v) - built) * np.exp(-np.abs(v) * h / presliding)
             pull = K * commands[k] - TRUE["offset"] - ripple * np.sin(2 * np.pi * q / PITCH)
-            v += h * (pull - way["Fc"] * built - way["Fv"] * v) / TRUE["M"]
-            q += h * v
+            begin, v = v, v + h * (pull - Fc * built - Fv * v) / TRUE["M"]
+            q = q + h * (begin + v) / 2
         accelerations[k] = (v - speeds[k]) / STEP
-    return ts, seen, speeds, commands, accelerations
+    return np.arange(len(r)) * STEP, seen, speeds, commands, accelerations
 
 
 def inverse_dynamics(speeds, commands, accelerations):

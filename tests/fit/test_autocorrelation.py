@@ -141,12 +141,14 @@ def test_the_covariance_is_the_sandwich_and_all_that_is_made_of_it(one):
 @pytest.mark.slow
 def test_the_card_and_a_comparison_say_so(one):
     times = " to ".join(f"{x:.2g}" for x in sorted(one.inflation))
-    assert one.correlated == one.channels[0].correlated > 2 and one.remarks == []
-    said = f"standard errors account for residuals correlated over {one.correlated} samples: {times} times those for white residuals"
+    assert one.correlation_length == one.channels[0].correlation_length > 2 and one.remarks == []
+    said = (
+        f"standard errors account for residuals correlated over {one.correlation_length} samples: {times} times those for white residuals"
+    )
     assert said in repr(one)
     white = fit(osc.record(0))
-    assert white.correlated == 0 and np.all(white.inflation == 1) and "correlated over" not in repr(white)
-    assert f"overstated: residuals of 'a' are correlated over {one.correlated} samples" in repr(jl.compare({"a": one, "b": one}))
+    assert white.correlation_length == 0 and np.all(white.inflation == 1) and "correlated over" not in repr(white)
+    assert f"overstated: residuals of 'a' are correlated over {one.correlation_length} samples" in repr(jl.compare({"a": one, "b": one}))
     assert "overstated" not in repr(jl.compare({"a": white, "b": white}))
     short = fit(osc.record(0), max_steps=1)
     assert not short.converged and "the fit of 'b' has not converged" in repr(jl.compare({"a": white, "b": short}))
@@ -214,4 +216,4 @@ def test_the_95_percent_intervals_hold_the_truth_with_a_constraint(rho, within):
 def test_the_card_says_where_times_are_uneven(at_random):
     """Correlation is counted in samples, which say little of a time then."""
     fits = bench_coverage.in_the_corners(200, 1, at_random, rho=0.95, seeds=2)
-    assert all(found.correlated and ("samples that are not evenly spaced in time" in repr(found)) == at_random for found in fits)
+    assert all(found.correlation_length and ("samples that are not evenly spaced in time" in repr(found)) == at_random for found in fits)

@@ -1,10 +1,11 @@
 """A laser that lags beside an accelerometer that does not: estimates, errors and predictions by SciPy on the closed form."""
 
+import jax.numpy as jnp
 import numpy as np
 import optax
 import oscillator as osc
 import pytest
-from scipy import optimize
+from scipy import integrate, optimize
 
 import jaxlag as jl
 
@@ -122,3 +123,35 @@ def test_the_unknown_start_of_a_record_with_a_lag():
 def test_lags_of_what_is_no_channel_are_refused(make, said):
     with pytest.raises(ValueError, match=said):
         make()
+
+
+@pytest.mark.parametrize("second", [1.0, 1e-3])  # in the unit of time
+def test_regression_knows_of_lags(second):
+    """A mass on a spring, driven from rest, late on the clock; the sensor of its position lags, that of its velocity lags more."""
+    m, c, b, w = 2.0, 50.0, 3.0, 4.0
+    forced = jl.System(
+        lambda q, qdot, m, c: 0.5 * m * qdot**2 - 0.5 * c * q**2,
+        dissipation=lambda qdot, b: 0.5 * b * qdot**2,
+        force=lambda t, w, begin: jnp.sin(w * (t - begin)),
+    )
+    begin, ts = 1e5 * second, np.linspace(0.0, 8.0, 801)
+    rates = lambda t, s: [s[1], (np.sin(w * t) - c * s[0] - b * s[1]) / m]
+    moved = integrate.solve_ivp(rates, (0, 8), [0.0, 0.0], "DOP853", rtol=1e-11, atol=1e-13, dense_output=True).sol
+    late = lambda i, lag: moved(np.maximum(ts - lag, 0))[i]
+    values = {"position": late(0, 0.31), "speed": late(1, 0.52) / second}
+    record = jl.Experiment(
+        begin + ts * second,
+        values,
+        0.0,
+        0.0,
+        observe=lambda q, qdot: {"position": q, "speed": qdot},
+        delay={"position": lambda lag: lag, "speed": 0.52 * second},
+        params={"begin": begin},
+    )
+    params = {"m": m * second**2, "c": np.nan, "b": np.nan, "w": w / second, "lag": 0.31 * second}
+    found = jl.regress(forced, record, params, free=("c", "b"))
+    np.testing.assert_allclose([found.estimates["c"], found.estimates["b"]], [c, b * second], rtol=2e-3)
+    unknown = jl.regress(forced, record, params, free=("c", "b", "lag"))
+    assert np.isinf(unknown.standard_errors["lag"])
+    with pytest.raises(ValueError, match="`delay` must be known where the motion is read off the measurements, but is NaN"):
+        jl.regress(forced, record, params | {"lag": np.nan}, free=("c", "b", "lag"))

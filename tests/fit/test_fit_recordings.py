@@ -56,7 +56,7 @@ def test_a_driven_pendulum_from_its_regression():
     names = ("J", "ml", "b", "F", "offset")
     bounds = {"b": (0, None), "F": (0, None)}
     found = jl.fit(system, record, dict.fromkeys(names, np.nan), free=names, start=jl.Regress(), bounds=bounds, solver=jl.Dopri5())
-    assert found.converged and found.led_in[0].startswith("regress")
+    assert found.converged and found.start_log[0].startswith("regress")
     assert 0.48 < found.estimates["J"] / found.estimates["ml"] < 0.52
     assert 0.12 < found.estimates["J"] < 0.18
 
@@ -101,7 +101,7 @@ def test_a_swing_wants_air_drag_and_dry_friction_instead_of_a_viscous_term(swing
     table = jl.compare(whole)
     assert table.names[0] == "viscous air dry" and table.names[1] == "viscous air"
     assert min(table.bic[model] for model in MODELS if model != "viscous air dry") > 1000
-    assert table.correlated and "overstated" in repr(table)
+    assert table.correlation_length and "overstated" in repr(table)
 
     best = whole["viscous air dry"]
     assert best.estimates["k"] < 2 * best.standard_errors["k"]

@@ -93,12 +93,12 @@ def test_all_statistics_are_those_of_the_whole_matrix(case, monkeypatch):
     whole = jl.fit(osc.SYSTEM, records(5, padding=1, rho=rho), START, free=FREE, **options)
     monkeypatch.setattr(problem, "WIDE", 0)
     found = jl.fit(osc.SYSTEM, records(5, rho=rho), START, free=FREE, **options)
-    assert found.remarks == whole.remarks and found.correlated == whole.correlated and found.converged == whole.converged
+    assert found.remarks == whole.remarks and found.correlation_length == whole.correlation_length and found.converged == whole.converged
     np.testing.assert_allclose([*found.estimates.values()], [*whole.estimates.values()], rtol=1e-6)
     np.testing.assert_allclose(found.covariance, whole.covariance, rtol=2e-4)
-    np.testing.assert_allclose([found.sigma, found.misfit], [whole.sigma, whole.misfit], rtol=1e-5)
+    np.testing.assert_allclose([found.sigma, found.neg2_log_likelihood], [whole.sigma, whole.neg2_log_likelihood], rtol=1e-5)
     if not options:
-        assert found.correlated
+        assert found.correlation_length
         np.testing.assert_allclose(found.interval("c", profile=True), whole.interval("c", profile=True), rtol=1e-6)
         np.testing.assert_allclose(found.prediction_errors[2], whole.prediction_errors[2][:-1], rtol=1e-3)
 

@@ -1,4 +1,4 @@
-"""Measurements that a function of the parameters predicts, beside recordings; against least squares by SciPy and by hand."""
+"""Measurements that a function of the parameters predicts, beside recordings; by hand. By SciPy: `test_oracles`."""
 
 import inspect  # `unwrap`: without the hook of these tests, which refuses wrong types before
 
@@ -6,7 +6,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from scipy.optimize import least_squares
 
 import jaxlag as jl
 
@@ -16,26 +15,6 @@ FORCES = np.array([4.0, 8.0])
 
 def deflections(c):
     return {"deflection": FORCES / c}
-
-
-@pytest.mark.parametrize("unit", [1.0, 1e-9])
-def test_a_deflection_tells_mass_from_stiffness(unit):
-    """Of which a free oscillation tells the ratio alone; masses and forces in this unit."""
-    random = np.random.default_rng(5)
-    ts = np.linspace(0.0, 3.0, 40)
-    seen, hung = np.cos(2.0 * ts) + 1e-3 * random.standard_normal(40), FORCES / 8.0 + 0.01 * random.standard_normal(2)
-    record = jl.Experiment(ts, seen, 1.0, 0.0, sigma=1e-3)
-    weighed = jl.Measurement({"deflection": hung}, lambda c: deflections(c / unit), sigma=0.01)
-    start = {"m": 1.5 * unit, "c": 7.0 * unit}
-    found = jl.fit(OSCILLATOR, [record, weighed], start, free=("m", "c"), tolerance=1e-6, rtol=1e-9, atol=1e-12)
-    by_scipy = least_squares(
-        lambda x: np.append((np.cos(np.sqrt(x[1] / x[0]) * ts) - seen) / 1e-3, (FORCES / x[1] - hung) / 0.01), [1.5, 7.0], xtol=1e-14
-    )
-    errors = np.sqrt(np.diag(np.linalg.inv(by_scipy.jac.T @ by_scipy.jac)))
-    assert found.converged
-    np.testing.assert_allclose([found.estimates[name] / unit for name in ("m", "c")], by_scipy.x, rtol=0, atol=1e-4 * errors.min())
-    np.testing.assert_allclose([found.standard_errors[name] / unit for name in ("m", "c")], errors, rtol=1e-3)
-    assert [channel.name for channel in found.channels] == ["z", "deflection"]
 
 
 def test_a_measurement_alone_of_an_equilibrium_that_moves():

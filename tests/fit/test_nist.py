@@ -3,47 +3,16 @@
 The models are formulas of a variable x; here they are what a sensor sees of a body at rest, at the times 0, 1, 2, …
 """
 
-import json
-import pathlib
-
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
+from nist import MODELS, PROBLEMS, fitted
 
 import jaxlag as jl
 
-PROBLEMS = json.loads((pathlib.Path(__file__).parents[1] / "data" / "nist_strd.json").read_text())["problems"]
-MODELS = {
-    "Misra1a": lambda x, b1, b2: b1 * (1 - jnp.exp(-b2 * x)),
-    "Misra1b": lambda x, b1, b2: b1 * (1 - (1 + b2 * x / 2) ** -2),
-    "Misra1c": lambda x, b1, b2: b1 * (1 - (1 + 2 * b2 * x) ** -0.5),
-    "Misra1d": lambda x, b1, b2: b1 * b2 * x / (1 + b2 * x),
-    "Lanczos1": lambda x, b1, b2, b3, b4, b5, b6: b1 * jnp.exp(-b2 * x) + b3 * jnp.exp(-b4 * x) + b5 * jnp.exp(-b6 * x),
-    "BoxBOD": lambda x, b1, b2: b1 * (1 - jnp.exp(-b2 * x)),
-    "MGH09": lambda x, b1, b2, b3, b4: b1 * (x**2 + x * b2) / (x**2 + x * b3 + b4),
-    "MGH17": lambda x, b1, b2, b3, b4, b5: b1 + b2 * jnp.exp(-x * b4) + b3 * jnp.exp(-x * b5),
-    "Bennett5": lambda x, b1, b2, b3: b1 * (b2 + x) ** (-1 / b3),
-    "Rat42": lambda x, b1, b2, b3: b1 / (1 + jnp.exp(b2 - b3 * x)),
-    "Rat43": lambda x, b1, b2, b3, b4: b1 / (1 + jnp.exp(b2 - b3 * x)) ** (1 / b4),
-    "Thurber": lambda x, b1, b2, b3, b4, b5, b6, b7: (b1 + b2 * x + b3 * x**2 + b4 * x**3) / (1 + b5 * x + b6 * x**2 + b7 * x**3),
-    "Eckerle4": lambda x, b1, b2, b3: b1 / b2 * jnp.exp(-((x - b3) ** 2) / b2**2 / 2),
-}
-MODELS["Lanczos3"] = MODELS["Lanczos1"]
 PLATEAUS = [("BoxBOD", 0), ("MGH17", 0)]  # whence SciPy, with scaled columns, comes to a plateau, or takes 600 evaluations
 MOST = {"MGH09": 300, "Lanczos1": 120}  # steps; SciPy's `lm` takes 533 and 80 evaluations
-STATE = jl.System(lambda qdot: 0.5 * qdot**2)
 IN_DEFAULT_SUITE = "Lanczos3", "BoxBOD", "MGH17", "Bennett5"
-
-
-def fitted(name, number, **how):
-    problem, model = PROBLEMS[name], MODELS[name]
-    names = tuple(f"b{i + 1}" for i in range(len(problem["certified"])))
-    sensor = {"model": model, "jnp": jnp}
-    exec(f"def observe(t, x, {', '.join(names)}): return model(x[jnp.round(t).astype(int)], {', '.join(names)})", sensor)
-    record = jl.Experiment(np.arange(len(problem["x"])) * 1.0, problem["y"], 0.0, 0.0, observe=sensor["observe"])
-    params = {"x": np.array(problem["x"])} | dict(zip(names, problem["starts"][number], strict=True))
-    return jl.fit(STATE, record, params, free=names, tolerance=1e-6, **how)
 
 
 def check(name, found):

@@ -45,6 +45,20 @@ def test_a_controller_reads_the_set_point_of_its_tick(off, late, scale):
     np.testing.assert_allclose(along, difference, atol=1e-5 * np.max(np.abs(difference)))
 
 
+@pytest.mark.parametrize("sampled", ["at the ticks", "by the clock of the log"])
+@pytest.mark.parametrize("off", [-4e-4, -3e-6, 3e-6, 4e-4])
+def test_a_log_that_began_before(off, sampled):
+    """All times of the log are late, or early, by a part of a tick; the first goal differs from that before the motion. Where samples of
+    the motion stood between a tick and the time of its goal in the log, no further goal was read, and nothing moved.
+    """
+    shifts = T * off * np.random.default_rng(0).uniform(0.5, 1, N + 3)
+    log = T * np.arange(-3, N) + shifts
+    goal = jl.Signal(log, np.append([7.0, 7.0, 7.0], GOALS), jl.interpolation.ZeroOrderHold())
+    ts = T * np.arange(N) if sampled == "at the ticks" else np.append(0.0, log[4:])
+    motion = jl.simulate(servo, 0.0, 0.0, ts, {"m": 1.0, "b": 2.0, "gain": 50.0, "T": T, "goal": goal})
+    np.testing.assert_allclose(motion.q + motion.qdot * (T * np.arange(N) - ts), by_hand(), atol=1e-9 + 100 * (off * T) ** 2)
+
+
 def test_a_signal_that_is_finer_than_the_ticks_keeps_its_times():
     """A force in pulses of 1 ms beside a controller of 1 Hz: the momentum is the sum of all pulses, by hand."""
     pulses = np.random.default_rng(1).standard_normal(3001)
@@ -58,15 +72,14 @@ def test_a_signal_that_is_finer_than_the_ticks_keeps_its_times():
 
 
 def test_a_closed_loop_is_identified_whose_clock_is_off():
-    """Friction was identified as −857 ± 3.3, "converged", from a log with such a clock."""
+    """Friction was identified as −857 ± 3.3, "converged", from a log with such a clock; nothing, where its samples had it, too."""
     ticks = T * np.arange(N)
     recorded = ticks + 3e-8 * np.random.default_rng(0).standard_normal(N)
     recorded[0] = min(recorded[0], 0.0)
     seen = by_hand() + 1e-4 * np.random.default_rng(2).standard_normal(N)
     goal = jl.Signal(recorded, GOALS, jl.interpolation.ZeroOrderHold())
-    found = jl.fit(
-        servo, jl.Experiment(ticks, seen, 0.0, 0.0, params={"goal": goal}), {"m": 1.3, "b": 1.0, "gain": 50.0, "T": T}, free=("m", "b")
-    )
+    log = jl.Experiment(recorded, seen, 0.0, 0.0, params={"goal": goal}, unknown=("q0", "qdot0"))
+    found = jl.fit(servo, log, {"m": 1.3, "b": 1.0, "gain": 50.0, "T": T}, free=("m", "b"))
     assert found.converged
     for name, true in (("m", 1.0), ("b", 2.0)):
         assert abs(float(found.estimates[name]) - true) < 4 * float(found.standard_errors[name]) < 0.02

@@ -27,9 +27,9 @@ def test_one_call_leads_in_from_far_away():
     found = led_in(record, {"c": 9.0, "b": 0.02})
     for name, truth in (("c", 4.0), ("b", 0.02)):
         assert abs(found.estimates[name] - truth) < 4 * found.standard_errors[name]
-    assert found.converged and found.steps < 8 and found.led_in == ("regress", f"whole motion: {found.steps} steps")
+    assert found.converged and found.steps < 8 and found.start_log == ("regress", f"whole motion: {found.steps} steps")
     assert f"  start found by regress, then whole motion: {found.steps} steps" in repr(found)
-    assert found.to_dict()["led_in"] == list(found.led_in)
+    assert found.to_dict()["start_log"] == list(found.start_log)
 
 
 @pytest.fixture(scope="module")
@@ -55,8 +55,12 @@ def test_segments_help_where_the_start_of_regress_is_too_poor(chaos):
     truth = {"w": 1.0, "b": 0.5, "a": 1.15}
     start = jl.Regress(segments=30, width=1.0)
     found = jl.fit(DRIVEN, chaos, {"w": 3.0, "b": 1.0, "a": 0.3}, free=tuple(truth), start=start)
-    assert found.led_in[0] == "regress" and found.led_in[3].startswith("30 segments: ") and found.led_in[4].startswith("whole motion: ")
-    assert found.converged and len(found.led_in) == 5
+    assert (
+        found.start_log[0] == "regress"
+        and found.start_log[3].startswith("30 segments: ")
+        and found.start_log[4].startswith("whole motion: ")
+    )
+    assert found.converged and len(found.start_log) == 5
     for name, value in truth.items():
         assert abs(found.estimates[name] - value) < 4 * found.standard_errors[name]
 
@@ -68,7 +72,7 @@ def test_an_estimate_at_its_bound_is_moved_inside():
         jl.fit(osc.SYSTEM, record, osc.TRUE | {"c": np.nan, "b": np.nan}, free=FREE, bounds=bounds),
         led_in(record, {"b": 0.6}, bounds=bounds),
     ):
-        assert "(b moved inside from its bound 0.5 to 0.6" in found.led_in[0] and found.estimates["b"] == 0.5
+        assert "(b moved inside from its bound 0.5 to 0.6" in found.start_log[0] and found.estimates["b"] == 0.5
         assert "b is at its bound 0.5; the measurements favour values beyond it" in found.remarks
 
 
@@ -144,7 +148,7 @@ def test_a_start_from_which_nothing_is_explained_is_mended_without_being_asked(c
     record = osc.record(0, np.linspace(0.0, 12.0, 240))
     given = {"m": 1.0, "c": c, "b": 0.1}
     alone, found = (jl.fit(osc.SYSTEM, record, given, free=("c", "b"), start=start) for start in (None, "auto"))
-    assert not alone.converged and not alone.led_in
-    assert found.converged and "explaining too little" in found.led_in[0] and found.led_in[1] == "regress"
+    assert not alone.converged and not alone.start_log
+    assert found.converged and "explaining too little" in found.start_log[0] and found.start_log[1] == "regress"
     assert abs(found.estimates["c"] - 4.0) < 3 * found.standard_errors["c"] < 0.05
-    assert not jl.fit(osc.SYSTEM, record, given, free=("c", "b"), max_steps=5).led_in  # a limit is a limit
+    assert not jl.fit(osc.SYSTEM, record, given, free=("c", "b"), max_steps=5).start_log  # a limit is a limit

@@ -80,7 +80,7 @@ def test_the_estimates_are_the_most_likely_ones(one):
     theta, least, _ = by_scipy(record(0))
     errors = np.array([float(one.standard_errors[name]) for name in FREE])
     np.testing.assert_allclose((estimates(one) - theta) / errors, 0.0, atol=2e-3)
-    np.testing.assert_allclose(one.misfit, least, atol=1e-4)
+    np.testing.assert_allclose(one.neg2_log_likelihood, least, atol=1e-4)
     np.testing.assert_allclose([one.aic, one.bic], [least + 2 * 4, least + np.log(120) * 4], atol=1e-4)
     np.testing.assert_allclose(one.sigma, np.exp(np.mean(np.log(list(one.sigmas[0].values())))), rtol=1e-9)
 
@@ -116,7 +116,7 @@ def test_experiments_share_the_sigma_of_a_channel():
     theta, least, _ = by_scipy(*pair)
     errors = np.array([float(both.standard_errors[name]) for name in FREE])
     np.testing.assert_allclose((estimates(both) - theta) / errors, 0.0, atol=2e-3)
-    np.testing.assert_allclose(both.misfit, least, atol=1e-4)
+    np.testing.assert_allclose(both.neg2_log_likelihood, least, atol=1e-4)
     assert both.sigmas[0]["v"] == both.sigmas[1]["v"] and both.aic == pytest.approx(least + 2 * 4, abs=1e-4)
 
 
@@ -127,7 +127,7 @@ def test_segments_and_fits_in_a_batch_agree(one):
     for found in (in_segments, a):
         np.testing.assert_allclose(estimates(found), estimates(one), atol=0.02 * one.standard_errors["b"])
         np.testing.assert_allclose(found.covariance, one.covariance, rtol=1e-3)
-        np.testing.assert_allclose(found.misfit, one.misfit, rtol=1e-5)
+        np.testing.assert_allclose(found.neg2_log_likelihood, one.neg2_log_likelihood, rtol=1e-5)
     alone = fit(record(7))
     np.testing.assert_allclose(estimates(b), estimates(alone), rtol=1e-5)
     np.testing.assert_allclose(b.sigmas[0]["v"], alone.sigmas[0]["v"], rtol=1e-4)

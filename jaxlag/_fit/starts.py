@@ -12,11 +12,12 @@ from jaxtyping import PyTree
 from .._model.numbers import count
 from .._model.system import System
 from .doubt import unexplained
-from .experiment import Experiment, measured
+from .experiment import Experiment, validate_inputs
 from .levenberg_marquardt import INTERRUPTED, REASONS, STEP_LIMIT
-from .measurement import apart
-from .multiple_shooting import whole
+from .measurement import split_by_kind
+from .multiple_shooting import FEWEST, can_be_cut
 from .parameters import Free, is_unknown
+from .problem import NoMotion
 from .regress import Regression, regress
 from .remarks import UNEXPLAINED
 from .result import Fit
@@ -92,49 +93,65 @@ class MultiStart:
         count(self.count, "`count`", least=2, cure="Use some tens for a poor initial guess.")
 
 
-def _segments(start, experiments):
-    """Their number; 1 where the records are too short, or cannot be cut."""
-    if any(whole(e) for e in experiments):
-        return 1
-    return start.segments or min(SEGMENTS, *(e.ts.size // SAMPLES for e in experiments))
+@dataclasses.dataclass
+class Escalation:
+    """The fits on the way from a poor start, and the log of what was done.
 
-
-def _staged(fit_from, start, experiments, params, given, done, max_steps, first):
-    """The best of the fits on the way. `fit_from(experiments, params, max_steps, segments)` is a fit; `given`: the parameters of the user,
-    which may be the better start; `done`: what was done before; `first`: the fit from the given parameters, if there is one already.
+    `fit_from(experiments, params, max_steps, segments)` is a fit.
     """
-    steps, fits = [done], []
-    if first is not None:
-        steps, fits = [f"whole motion from the given start: {first.steps} steps, explaining too little", done], [first]
 
-    def stage(name, *where, **more):
+    fit_from: Callable[..., Fit]
+    log: list[str] = dataclasses.field(default_factory=list)
+    fits: list[Fit] = dataclasses.field(default_factory=list)
+
+    def attempt(self, name: str, *where: Any, **more: Any) -> Fit | None:
+        """One more fit, unless there is no motion from there."""
         try:
-            fits.append(fit_from(*where, **more))
-        except ValueError as error:
-            if "start" not in str(error) and "segment" not in str(error):
-                raise
-            steps.append(f"{name}: could not be computed")
+            found = self.fit_from(*where, **more)
+        except NoMotion:
+            self.log.append(f"{name}: could not be computed")
             return None
-        steps.append(f"{name}: {fits[-1].steps} steps{'' if fits[-1].converged else ', not converged'}")
-        return fits[-1]
+        self.log.append(f"{name}: {found.steps} steps{'' if found.converged else ', not converged'}")
+        self.fits.append(found)
+        return found
 
-    segments, most = 1 if first else _segments(start, experiments), max_steps  # segments may take long: only where asked for
-    found = stage("whole motion", experiments, params, max_steps=min(most, FIRST_STEPS))
-    if first is None and not (found and _explains(found)):
-        other = stage("whole motion from the given start", experiments, given, max_steps=min(most, FIRST_STEPS))
+    def best(self) -> Fit:
+        """The most likely of them, with the log."""
+        if not self.fits:
+            raise NoMotion("`start` must lead to a motion that can be computed, but none could. Give other `params`, or more segments.")
+        misfits = [np.nan_to_num(fit.neg2_log_likelihood, nan=np.inf) for fit in self.fits]
+        best = [fit for fit, misfit in zip(self.fits, misfits, strict=True) if misfit <= min(misfits) + ALIKE][-1]
+        chosen = [] if best is self.fits[-1] else [f"the best of them is number {self.fits.index(best) + 1}"]
+        return dataclasses.replace(best, start_log=(*self.log, *chosen))
+
+
+def _segments(start, system, experiments):
+    """Their number; 1 where the records are too short, or cannot be cut."""
+    if system.states or system.events or system.unilateral or not all(map(can_be_cut, experiments)):
+        return 1
+    shortest = min(e.ts.size for e in experiments)
+    count = start.segments or min(SEGMENTS, shortest // SAMPLES)
+    return count if count <= shortest // FEWEST else 1
+
+
+def _through_segments(way, segments, experiments, params, given, most):
+    """The whole motion from `params`, the estimates of a regression, and from those `given`; then segments, and the whole motion again."""
+    found = way.attempt("whole motion", experiments, params, max_steps=min(most, FIRST_STEPS))
+    if not (found and _explains(found)):
+        other = way.attempt("whole motion from the given start", experiments, given, max_steps=min(most, FIRST_STEPS))
         found = other if other and _explains(other) else found
     if segments > 1 and not (found and _explains(found)):
-        found = stage(f"{segments} segments", experiments, params, max_steps=most, segments=segments)
+        found = way.attempt(f"{segments} segments", experiments, params, max_steps=most, segments=segments)
         if found:
-            stage("whole motion", found.experiments, found.params, max_steps=most)
-    elif found and found.reason == REASONS[STEP_LIMIT] and most > FIRST_STEPS:
-        stage("whole motion", found.experiments, found.params, max_steps=most - FIRST_STEPS)
-    if not fits:
-        raise ValueError("`start` must lead to a motion that can be computed, but none could. Give other `params`, or more segments.")
-    misfits = [np.nan_to_num(fit.misfit, nan=np.inf) for fit in fits]
-    best = [fit for fit, misfit in zip(fits, misfits, strict=True) if misfit <= min(misfits) + ALIKE][-1]
-    steps += [] if best is fits[-1] else [f"the best of them is number {fits.index(best) + 1}"]
-    return dataclasses.replace(best, led_in=tuple(steps))
+            way.attempt("whole motion", found.experiments, found.params, max_steps=most)
+    else:
+        _on(way, found, most)
+
+
+def _on(way, found, most):
+    """The rest of the steps, where the first ones did not suffice."""
+    if found and found.reason == REASONS[STEP_LIMIT] and most > FIRST_STEPS:
+        way.attempt("whole motion", found.experiments, found.params, max_steps=most - FIRST_STEPS)
 
 
 def _explains(fit):
@@ -159,7 +176,7 @@ def inside_bounds(found: Regression, free: str | Sequence[str], bounds: Any) -> 
     return chosen.insert(np.asarray(theta, chosen.start.dtype)), f"regress{moved_inside}"
 
 
-def led_in(
+def from_better_start(
     fit_from: Callable[..., Fit],
     system: System,
     experiments: Sequence[Experiment],
@@ -174,12 +191,19 @@ def led_in(
     """
     if not isinstance(start, Regress):
         raise ValueError(f"`start` must be `Regress()`, `MultiStart()`, 'auto' or None, but is {start!r}. Write `start=jl.Regress()`.")
-    experiments, params = measured(experiments, params)
+    experiments, params = validate_inputs(experiments, params)
     found = regress(system, experiments, params, width=start.width, **common)
     inside, done = inside_bounds(found, **common)
+    way = Escalation(fit_from)
+    if first is not None:  # segments may take long: only where asked for
+        way = Escalation(fit_from, [f"whole motion from the given start: {first.steps} steps, explaining too little", done], [first])
+        _on(way, way.attempt("whole motion", experiments, inside, max_steps=min(max_steps, FIRST_STEPS)), max_steps)
+        return way.best()
+    way.log.append(done)
     chosen = Free.of(params, **common)
     given = chosen.insert(jnp.where(np.isnan(chosen.start), Free.of(inside, **common).start, chosen.start))
-    return _staged(fit_from, start, experiments, inside, given, done, max_steps, first)
+    _through_segments(way, _segments(start, system, experiments), experiments, inside, given, max_steps)
+    return way.best()
 
 
 def without_unknown(
@@ -192,7 +216,7 @@ def without_unknown(
     unknown = np.isnan(chosen.start)
     if not np.any(unknown):
         return params, ()
-    if apart(experiments)[1]:
+    if split_by_kind(experiments)[1]:
         name = chosen.entries[int(np.argmax(unknown))]
         raise ValueError(
             f"`params` must have a start for each free entry where modes or frequency responses are fitted, but {name!r} is NaN. "
