@@ -22,7 +22,7 @@ from ._fit.comparison import compare as compare
 from ._fit.experiment import Experiment as Experiment
 from ._fit.frequency_response_test import FrequencyResponseTest as FrequencyResponseTest
 from ._fit.fit import fit as fit
-from ._fit.fit_each import fit_each as fit_each
+from ._fit.fit import fit_each as fit_each
 from ._fit.robust_loss import Huber as Huber
 from ._fit.starts import MultiStart as MultiStart, Regress as Regress
 from ._fit.measurement import Measurement as Measurement

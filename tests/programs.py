@@ -20,7 +20,8 @@ from jaxlag._program import scalarise
 from jaxlag._program.constants import FOLDABLE, folded
 from jaxlag._program.expressions import TooLong, UnknownPrimitive, filled
 from jaxlag._program.interpreter import Interpreter, traced
-from jaxlag._program.walker import CALLS, CALLS_WITH_DERIVATIVE_RULE, called_program, primitive_names
+from jaxlag._program.primitives import ANY_CALL
+from jaxlag._program.walker import called_program, primitive_names
 
 SIZE = 3  # of x and of v
 LIMIT = 5000
@@ -72,7 +73,7 @@ BY_NUMPY = {
 def run_equation(equation, *operands):
     """The outputs of one equation."""
     name, p = equation.primitive.name, equation.params
-    if name in (*CALLS, *CALLS_WITH_DERIVATIVE_RULE):
+    if name in ANY_CALL:
         return run_plain(called_program(equation), *operands)
     if name == "custom_linear_solve":
         lengths = p["const_lengths"]

@@ -8,6 +8,8 @@ import tomllib
 from fnmatch import fnmatch
 from pathlib import Path
 
+import jax
+import jax.numpy as jnp
 import pytest
 
 import jaxlag
@@ -15,8 +17,11 @@ import jaxlag
 pytestmark = pytest.mark.fast
 
 ROOT, PACKAGE = Path(__file__).parents[1], Path(jaxlag.__file__).parent
-UNSTABLE = {"internal", "interpreters", "extend"}  # modules of JAX and Equinox whose interface may change at any time
+UNSTABLE = {"internal", "interpreters", "extend", "experimental"}  # modules of JAX and Equinox whose interface may change at any time
 DOCUMENTED = {"_replace", "_fields", "_asdict", "_getframe"}  # of named tuples and of sys
+DESCRIBED = {"jaxlag", "builtins", "abc", "enum", "typing"}  # where private methods are documented, or ours
+OPTION = "xla_"  # how names of XLA's options begin
+ALSO_ELSEWHERE = {"parent", "unflatten"}  # names of pathlib and of `jax.tree`, too
 
 
 def listed():
@@ -28,7 +33,7 @@ def listed():
 
 def read(trees):
     """Private modules and attributes that the files read, as (file, name)."""
-    own = {name for tree in trees.values() for name in _members(tree)} | DOCUMENTED
+    own, of_objects = {name for tree in trees.values() for name in _members(tree)} | DOCUMENTED, undocumented()
     for file, tree in trees.items():
         for node in ast.walk(tree):
             if isinstance(node, ast.ImportFrom) and not node.level:
@@ -40,6 +45,24 @@ def read(trees):
                     yield file, node.attr
                 elif isinstance(node.value, ast.Attribute) and node.value.attr in UNSTABLE:
                     yield file, f"{node.value.attr}.{node.attr}"
+                elif node.attr in of_objects:
+                    yield file, node.attr
+            elif isinstance(node, ast.Call) and getattr(node.func, "id", "") in ("getattr", "hasattr"):
+                yield from ((file, x.value) for x in node.args if isinstance(x, ast.Constant) and x.value in of_objects)
+            elif isinstance(node, ast.keyword) and (node.arg or "").startswith(OPTION):
+                yield file, node.arg
+            elif isinstance(node, ast.Constant) and re.fullmatch(OPTION + r"\w+", str(node.value)):
+                yield file, node.value
+
+
+def undocumented():
+    """Attributes of JAX's tracers and tree structures, whose classes its documentation does not describe."""
+    kinds = {jax.tree_util.PyTreeDef}
+    look = lambda x: kinds.add(type(x)) or 2.0 * x
+    for traced in (jax.vmap(look), jax.jit(look), jax.jacfwd(look), lambda x: jax.linearize(look, x)):
+        traced(jnp.ones(2))
+    names = set(dir(jax.tree_util.PyTreeDef)).union(*(vars(base).get("__slots__", ()) for kind in kinds for base in kind.__mro__))
+    return {name for name in names if not name.startswith("_")} - ALSO_ELSEWHERE
 
 
 def overridden(trees):
@@ -48,7 +71,7 @@ def overridden(trees):
         module = importlib.import_module(".".join(["jaxlag", *Path(file).with_suffix("").parts]).removesuffix(".__init__"))
         for cls in vars(module).values():
             if inspect.isclass(cls) and cls.__module__ == module.__name__:
-                bases = [base for base in cls.__mro__ if base.__module__.split(".")[0] not in ("jaxlag", "builtins", "abc", "typing")]
+                bases = [base for base in cls.__mro__ if base.__module__.split(".")[0] not in DESCRIBED]
                 names = {name for name, value in vars(cls).items() if inspect.isfunction(getattr(value, "__func__", value))}
                 yield from ((file, name) for name in names if _is_private(name) and any(name in vars(base) for base in bases))
 

@@ -1,8 +1,8 @@
 """Autocorrelation of residuals: a test for it, its length in samples, its effect on the covariance of the estimates; their spectrum."""
 
-import functools
-
 import numpy as np
+
+from .._program.registry import remembered
 
 LAGS = 20
 COLOURED = 0.01  # p-value below which residuals are taken as correlated
@@ -38,7 +38,7 @@ def autoregression(r: np.ndarray) -> np.ndarray:
     return _autoregression(np.asarray(r, float).tobytes())
 
 
-@functools.lru_cache(maxsize=64)  # the covariance and the table of channels ask for the same
+@remembered  # the covariance and the table of channels ask for the same
 def _autoregression(samples):
     r = np.frombuffer(samples)
     n = r.size

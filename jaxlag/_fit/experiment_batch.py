@@ -155,7 +155,7 @@ def _tangent_basis(system, params, e):
 def _constraint_jacobians(flat, t, q, v):
     """Of the constraints on positions, and of all constraints on velocities; and units of coordinates in which they weigh alike."""
     G = constraint_rows(flat, t, q, v)[1]
-    return position_residual(flat, t, q)[1], G, unit_lengths(inertia(flat, t, q, v)[0].as_matrix(), G)
+    return position_residual(flat, t, q)[1], G, unit_lengths(inertia(flat, t, q, v).as_matrix(), G)
 
 
 def map_batch(of_one: Callable[..., Any], batch: ExperimentBatch, z: Any, *common: Any) -> Any:

@@ -20,7 +20,7 @@ from .minimum import Minimum
 
 def own_estimates(minimum: Minimum, known: Determined, scale: float) -> list[tuple[dict[str, Any], dict[str, Any]]]:
     """For each experiment its unknowns and their standard errors, by name."""
-    firsts = (segments[0] for segments in minimum.segments_of_each())
+    firsts = (segments[0] for segments in minimum.segments_of_each)
     return [_own_estimates(minimum, k, row, e, known, scale) for (k, row, _), e in zip(firsts, minimum.recordings, strict=True)]
 
 
@@ -79,7 +79,7 @@ class Predicted(NamedTuple):
 def predictions_of(minimum: Minimum, known: Determined) -> list[Predicted]:
     """For each experiment, its segments put together."""
     found = []
-    for e, segments in zip(minimum.recordings, minimum.segments_of_each(), strict=True):
+    for e, segments in zip(minimum.recordings, minimum.segments_of_each, strict=True):
         parts = [jax.tree.map(lambda x, row=row: np.asarray(x)[row], minimum.found.batches[k].channels) for k, row, _ in segments]
         counts = [n for *_, n in segments] if len(segments) > 1 else [None]
         predictions = _joined(e.values, parts, counts)

@@ -90,8 +90,10 @@ def levenberg_marquardt(
     progress: Callable[[int, float], None] | None = None,
     size: Any = np.inf,
     noise: float = 0.0,
+    found: tuple[Any, Any, Any] | None = None,
 ) -> Outcome:
-    """Minimises ½|r(y)|² within `bounds`. `linearise(y)` returns r, its Jacobian, and anything else that is wanted at the best y.
+    """Minimises ½|r(y)|² within `bounds`. `linearise(y)` returns r, its Jacobian, and anything else that is wanted at the best y; `found`:
+    what it returns at the first y, where that is known.
 
     Ends where the next step of Gauss and Newton would change no parameter by more than `tolerance` of its standard error: |J Δy| ≤
     tolerance · σ̂, with σ̂² = |r|² / `freedom`; or by no more than rounding, a part of the `size` of what r is a difference of. `noise`: the
@@ -102,10 +104,10 @@ def levenberg_marquardt(
     Methods for Non-Linear Least Squares Problems (2004), section 3.2; for the bounds Bertsekas, SIAM J. Control Optim. 20 (1982) 221.
     """
     initialise, update = SINGLE if y.ndim == 1 else BATCHED
-    box = [np.broadcast_to(np.asarray(bound, y.dtype), y.shape) for bound in bounds or (-np.inf, np.inf)]
-    now, trial = initialise(y, linearise(y), box)
+    box = [_in_shape(bound, y, y.shape) for bound in bounds or (-np.inf, np.inf)]
+    now, trial = initialise(y, found or linearise(y), box)
     costs = [now.cost]
-    step, limits = 0, [np.broadcast_to(np.asarray(limit, y.dtype), y.shape[:-1]) for limit in (tolerance, freedom, size, noise)]
+    step, limits = 0, [_in_shape(limit, y, y.shape[:-1]) for limit in (tolerance, freedom, size, noise)]
     try:
         for step in range(1, max_steps + 1):
             now, trial = update(now, trial, _tried(linearise, trial.y, now), box, *limits)
@@ -120,6 +122,11 @@ def levenberg_marquardt(
     status = np.asarray(now.status)
     status = np.where(status == RUNNING, unfinished, status)
     return Outcome(now._replace(status=status), step, np.stack([np.asarray(cost) for cost in costs]))
+
+
+def _in_shape(x, like, shape):
+    x = np.asarray(x, like.dtype)
+    return x if x.shape == shape else np.broadcast_to(x, shape)
 
 
 def _tried(linearise, y, now):

@@ -22,6 +22,7 @@ from .problem import (
     linearise,
     linearise_each,
     linearise_starts,
+    reweighted,
     size_of,
     sizes_of_each,
     without_jacobian,
@@ -49,11 +50,11 @@ def minimise(
     for _ in range(_rounds(problem, method) if estimate_sigma else 0):
         if int(outcome.best.status) in (INTERRUPTED, STEP_LIMIT) and method is None:
             break
-        before, (reweighted, change) = outcome, weighted_by_residuals(problem, channels, outcome.best.aux)
+        before, (anew, change) = outcome, weighted_by_residuals(problem, channels, outcome.best.aux)
         if change < SETTLED:
             break
-        reweighted = dataclasses.replace(reweighted, continuity=apart)
-        outcome, problem = _minimise(reweighted, before.best.y, method, 1, limits)
+        anew = dataclasses.replace(anew, continuity=apart)
+        outcome, problem = _minimise(anew, before.best.y, method, 1, limits, before.best.aux)
         outcome = outcome._replace(steps=before.steps + outcome.steps, costs=np.append(before.costs, outcome.costs))
     return outcome, problem
 
@@ -73,12 +74,9 @@ def minimise_each(problem: LeastSquaresProblem, *, estimate_sigma: bool, **limit
     bounds = tuple(np.concatenate([bound, sign * own]) for bound, sign in zip(problem.free.bounds, (-1, 1), strict=True))
 
     def minimised(problem, xs):
-        def residuals(xs):
-            found = linearise_each(problem, xs)
-            return found.residuals, found.jacobian, found
-
         sizes = np.sqrt(sum(part**2 for part in sizes_of_each(problem.batches[0])))
-        return levenberg_marquardt(residuals, xs, bounds=bounds, size=sizes, noise=_noise_of(problem), **limits)
+        more = {"bounds": bounds, "size": sizes, "noise": _noise_of(problem)}
+        return _with_all_parts(levenberg_marquardt(lambda xs: _parts(linearise_each(problem, xs)), xs, **more, **limits))
 
     if estimate_sigma:
         channels = [Channels.of(one) for one, _ in split_by_experiment(problem)]
@@ -119,14 +117,15 @@ def _each_weighted(problem, apart):
     return dataclasses.replace(problem, batches=(with_sigma(batch, together),), scale=np.stack([one.scale for one in apart]))
 
 
-def _minimise(problem, x, method, starts, limits):
+def _minimise(problem, x, method, starts, limits, before=None):
+    """From x, where `before` was found with other weights."""
     if method is not None:
         return _by_optax(problem, method, x, limits), problem
     if problem.continuity is not None:
         return join(problem, x, **limits)
     if starts > 1:
         return _from_many_starts(problem, starts, limits), problem
-    return _from_one_start(problem, x, limits), problem
+    return _from_one_start(problem, x, limits, before), problem
 
 
 def _noise_of(problem):
@@ -135,14 +134,21 @@ def _noise_of(problem):
     return 0.0 if tolerance is None else float(tolerance)
 
 
-def _from_one_start(problem, x, limits):
+def _parts(found):
+    """Residuals, their Jacobian, and what else there is at a point, which is kept without these."""
+    return found.residuals, found.jacobian, found._replace(residuals=None, jacobian=None)
+
+
+def _with_all_parts(outcome):
+    best = outcome.best
+    return outcome._replace(best=best._replace(aux=best.aux._replace(residuals=best.residuals, jacobian=best.jacobian)))
+
+
+def _from_one_start(problem, x, limits, before):
     held = held_by_jax(problem)
-
-    def residuals(x):
-        found = linearise(held, x)
-        return found.residuals, found.jacobian, found
-
-    outcome = levenberg_marquardt(residuals, x, bounds=problem.bounds, size=size_of(problem), noise=_noise_of(problem), **limits)
+    first = None if before is None else _parts(reweighted(held, x, before))
+    more = {"bounds": problem.bounds, "size": size_of(problem), "noise": _noise_of(problem), "found": first}
+    outcome = _with_all_parts(levenberg_marquardt(lambda x: _parts(linearise(held, x)), x, **more, **limits))
     reason = failure_of(outcome.best.aux)
     if reason:
         raise NoMotion(f"{AT_THE_START}, but ended with: {reason} Start from other parameters.")
@@ -154,11 +160,8 @@ def _from_many_starts(problem, starts, limits):
     ys = problem.free.random_starts(jax.random.key(0), starts).at[0].set(0)
     xs = jnp.concatenate([ys, jnp.zeros((starts, problem.size - problem.free.size))], axis=1)
 
-    def residuals(xs):
-        found = linearise_starts(problem, xs)
-        return found.residuals, found.jacobian, found
-
-    outcome = levenberg_marquardt(residuals, xs, bounds=problem.bounds, size=size_of(problem), noise=_noise_of(problem), **limits)
+    more = {"bounds": problem.bounds, "size": size_of(problem), "noise": _noise_of(problem)}
+    outcome = _with_all_parts(levenberg_marquardt(lambda xs: _parts(linearise_starts(problem, xs)), xs, **more, **limits))
     cost = np.nan_to_num(outcome.costs[-1], nan=np.inf)
     if not np.isfinite(cost).any():
         raise NoMotion("`start` must include one whose motion can be computed, but none can. Narrow the bounds.")

@@ -5,6 +5,7 @@ import functools
 from collections.abc import Iterator, Sequence
 from typing import Any
 
+import jax
 import numpy as np
 
 from .._program.jit import compiled
@@ -58,37 +59,47 @@ class Minimum:
         """p, the number of free parameters."""
         return self.problem.free.size
 
-    @property
+    @functools.cached_property
     def flat(self) -> np.ndarray:
         """All entries of `weighted`."""
         return np.concatenate([np.zeros(0), *(np.ravel(r) for r in self.weighted)])
 
-    @property
+    @functools.cached_property
     def recordings(self) -> tuple[Experiment, ...]:
         """The experiments that are recordings in time."""
         return split_by_kind(self.experiments)[0]
 
-    @property
+    @functools.cached_property
     def of_tests(self) -> np.ndarray:
         """Residuals of the tests, over sigma; 0 where nothing was measured."""
         return np.concatenate([np.zeros(0), *(np.asarray(test.residuals) for test in self.found.tests)])
 
-    @property
+    @functools.cached_property
     def measurements(self) -> int:
         """How many real numbers were measured."""
         return self.measured.size + sum(part.test.measurements for part in self.problem.tests)
 
-    @property
+    @functools.cached_property
     def measured(self) -> np.ndarray:
         """Those of them that were measured."""
         flat = self.flat
         return flat[np.isfinite(flat)]
 
-    @property
+    @functools.cached_property
     def absolute(self) -> bool:
         """Whether sigma was given."""
         return all(e.sigma is not None for e in self.recordings)
 
+    @functools.cached_property
+    def relative_size(self) -> float:
+        """How many times as large as the measurements the residuals are."""
+        squares = 0.0
+        for batch in self.problem.batches:
+            for z, s in zip(jax.tree.leaves(batch.values), jax.tree.leaves(batch.sigma), strict=True):
+                squares += float(np.nansum((np.asarray(z) / np.asarray(s))[: len(batch.members)] ** 2))
+        return float(np.linalg.norm(self.measured) / np.sqrt(squares)) if squares > 0 else 0.0
+
+    @functools.cached_property
     def segments_of_each(self) -> list[list[tuple[int, int, int]]]:
         """For each experiment its segments: batch, row in the batch, and number of samples of its own."""
         samples = self.segments.samples or [e.ts.size for e in self.recordings]

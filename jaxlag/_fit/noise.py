@@ -11,7 +11,7 @@ from .arrow import gathered
 from .channels import channel_names
 from .experiment_batch import ExperimentBatch, with_sigma
 from .problem import LeastSquaresProblem, Linearisation
-from .residuals import Linearised
+from .residuals import Predictions
 
 FLOOR = 1e-12  # of a channel's spread; smaller residuals are rounding
 NORMAL = 1.4826  # standard deviation of normal noise over the median of its size
@@ -152,7 +152,7 @@ def _decided(problem, channels, found):
     return {name: np.sum(h) for name, h in channels.split([leverages(k, J) for k, J in enumerate(blocks)]).items()}
 
 
-def by_sigma(batch: ExperimentBatch, part: Linearised) -> np.ndarray:
+def by_sigma(batch: ExperimentBatch, part: Predictions) -> np.ndarray:
     """The Jacobian of what was predicted of each experiment, over sigma; zero where nothing was measured."""
     there = np.isfinite(batch.flat(batch.values))[..., None]
     return np.where(there, np.where(there, np.asarray(part.channels_jacobian, float), 0) / batch.flat(batch.sigma)[..., None], 0)

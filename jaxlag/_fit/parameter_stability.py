@@ -78,7 +78,7 @@ def _estimates(minimum, i, j, found, covariance):
 def _second_halves(minimum):
     """For each batch, which of its residuals are in the second half of their record, shaped like them."""
     halves = [np.zeros(part.shape, bool) for part in minimum.weighted]
-    for e, segments in zip(minimum.recordings, minimum.segments_of_each(), strict=True):
+    for e, segments in zip(minimum.recordings, minimum.segments_of_each, strict=True):
         ts = np.asarray(e.ts)  # with arrays of JAX this took a tenth of a fit
         middle = (ts[0] + ts[-1]) / 2
         for k, row, _ in segments:

@@ -18,7 +18,7 @@ from .experiment import Experiment
 from .experiment_batch import ExperimentBatch, batches_of, map_batch
 from .measurement import Evaluated, Prepared, Test
 from .parameters import Free
-from .residuals import Linearised, Model, evaluate_batch, linearise_batch
+from .residuals import Model, Predictions, linearise_batch, predict_batch, weighted
 
 WIDE = 4e6  # numbers in a Jacobian, from which on zeros are left out of it
 ASIDE = 0.01  # of a parameter, by which a start is moved
@@ -48,7 +48,7 @@ class Linearisation(NamedTuple):
 
     residuals: Any
     jacobian: Any
-    batches: tuple[Linearised, ...]
+    batches: tuple[Predictions, ...]
     gaps: Any
     gaps_jacobian: Any
     tests: tuple[Evaluated, ...] = ()
@@ -117,9 +117,13 @@ class LeastSquaresProblem:
     def linearise(self, x: Float[Array | np.ndarray, " x"]) -> Linearisation:
         """All residuals and their Jacobian: those of the priors, of the tests, of the recordings, of the gaps."""
         y, zs = self.split(x)
-        of_batches = [linearise_batch(self.model, self.free, batch, y, z, self.scale) for batch, z in zip(self.batches, zs, strict=True)]
-        parts, blocks = tuple(part for part, _ in of_batches), tuple(J for _, J in of_batches)
-        tests = tuple(test.linearised(self.model.system, self.free, y) for test in self.tests)
+        parts = [linearise_batch(self.model, self.free, batch, y, z) for batch, z in zip(self.batches, zs, strict=True)]
+        return self.assembled(x, parts, tuple(test.linearised(self.model.system, self.free, y) for test in self.tests))
+
+    def assembled(self, x: Any, predictions: Sequence[Predictions], tests: tuple[Evaluated, ...]) -> Linearisation:
+        """The same, from what is predicted at x: with other weights it takes no motion."""
+        y, _ = self.split(x)
+        parts, blocks = self._weighted(predictions)
         slope = jnp.diag(self.free.slope(y) / self.free.prior_deviation)
         of_free = [(self.free.prior_residual(y), slope), *(test[:2] for test in tests)]
         first = jnp.concatenate([J for _, J in of_free])
@@ -151,9 +155,18 @@ class LeastSquaresProblem:
         total = jnp.sum(self.free.prior_residual(y) ** 2)
         for test in self.tests:
             total = total + jnp.sum(test.evaluated(self.model.system, self.free.insert(self.free.theta(y)))[0] ** 2)
-        for batch, z in zip(self.batches, zs, strict=True):
-            total = total + jnp.sum(evaluate_batch(self.model, self.free, batch, y, z, self.scale).residuals ** 2)
+        for part in self._evaluated(y, zs):
+            total = total + jnp.sum(part.residuals**2)
         return total / 2
+
+    def _weighted(self, predictions):
+        """Predictions of each batch with their residuals, and the Jacobians of these."""
+        pairs = [weighted(self.model.loss, batch, part, self.scale) for batch, part in zip(self.batches, predictions, strict=True)]
+        return tuple(part for part, _ in pairs), tuple(J for _, J in pairs)
+
+    def _evaluated(self, y, zs):
+        """Predictions and residuals of each batch, without Jacobians."""
+        return self._weighted([predict_batch(self.model, self.free, batch, y, z) for batch, z in zip(self.batches, zs, strict=True)])[0]
 
     def _over_all_unknowns(self, k, rows, J):
         """Jacobians of some experiments of batch k with respect to (y, z), with a column for every unknown."""
@@ -204,18 +217,21 @@ def _linearise(problem, x):
 
 
 @compiled
+def reweighted(problem: LeastSquaresProblem, x: Any, found: Linearisation) -> Linearisation:
+    """A linearisation at x with the weights of this problem instead of those it was computed with: takes no motion."""
+    return problem.assembled(x, found.batches, found.tests)
+
+
+@compiled
 def without_jacobian(problem: LeastSquaresProblem, x: Float[Array | np.ndarray, " x"]) -> Linearisation:
     """The residuals alone, where there are too many unknowns for a Jacobian."""
     y, zs = problem.split(x)
-    parts = []
-    for batch, z in zip(problem.batches, zs, strict=True):
-        found = evaluate_batch(problem.model, problem.free, batch, y, z, problem.scale)
-        parts.append(Linearised(found.residuals, found.ends, None, found.channels, None, found.result))
+    parts = problem._evaluated(y, zs)
     params = problem.free.insert(problem.free.theta(y))
     tests = [test.evaluated(problem.model.system, params) for test in problem.tests]
     r = jnp.concatenate([problem.free.prior_residual(y), *(r for r, _ in tests), *(part.residuals.ravel() for part in parts)])
     evaluated = tuple(Evaluated(r, None, predictions) for r, predictions in tests)
-    return Linearisation(r, None, tuple(parts), jnp.zeros(0), jnp.zeros((0, problem.size)), evaluated)
+    return Linearisation(r, None, parts, jnp.zeros(0), jnp.zeros((0, problem.size)), evaluated)
 
 
 @compiled

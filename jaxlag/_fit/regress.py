@@ -20,8 +20,7 @@ from .rounding import plus_minus
 from .smoothing_spline import without_delay
 from .undetermined import on_undetermined
 from .weak_form import Record
-from .weak_regression import WeakFormProblem
-from .window_width import SLIDING, best_estimate, half_widths, with_scatter
+from .weak_regression import SLIDING, WeakFormProblem, best_estimate, half_widths, with_scatter
 
 LINEAR = 1e-9  # relative change of a Jacobian that counts as zero
 

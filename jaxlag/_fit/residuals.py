@@ -93,33 +93,45 @@ def _times(e, motion, late):
     return {name: jnp.concatenate([ts, jnp.full(counts[name] - ts.size, jnp.nan, ts.dtype)]) for name, ts in times.items()}
 
 
-class Evaluation(NamedTuple):
-    """Experiments at given unknowns: weighted residuals, their derivatives by the predictions, first and last state as (q, q̇, q, q̇),
-    predictions, how the motion ended.
+class Predictions(NamedTuple):
+    """Experiments at given unknowns: their weighted residuals, first and last state as (q, q̇, q, q̇), predictions, and how the motion
+    ended; ends and predictions with their Jacobians with respect to (y, z), or None. Experiments are the first axis.
     """
 
     residuals: Any
-    slopes: Any
     ends: Any
+    ends_jacobian: Any
     channels: PyTree
+    channels_jacobian: Any
     result: RESULTS
 
 
-def _evaluate(model, free, e, y, z, scale):
-    """One experiment at the scaled free parameters y and its own unknowns z."""
+def _predicted(model, free, e, y, z):
+    """Of one experiment at the scaled free parameters y and its own unknowns z: flat predictions, ends, predictions, how it ended."""
     channels, motion = model.predicted(free.insert(free.theta(y)), e, z)
     _check(e, channels)
-    r, slopes = _weighted(model.loss, scale, *(ravel_pytree(tree)[0] for tree in (channels, e.values, e.sigma)))
     ends = ravel_pytree([jax.tree.map(lambda x, i=i: x[i], (motion.q, motion.qdot)) for i in (0, -1)])[0]
-    return Evaluation(jnp.where(motion.succeeded, r, jnp.inf), slopes, ends, channels, motion.result)
+    return ravel_pytree(channels)[0], ends, channels, motion.result
 
 
-def _weighted(loss, scale, predicted, measured, sigma):
-    """Residuals over sigma, as the loss counts them, and their derivatives by what is predicted; zero where nothing was measured."""
-    there = jnp.isfinite(measured)
-    r = jnp.where(there, (jnp.where(there, predicted, 0) - jnp.where(there, measured, 0)) / sigma, 0)
-    slopes = jnp.where(there, 1 / sigma, 0)
-    return (r, slopes) if loss is None else (scale * loss.root(r / scale), slopes * loss.slope(r / scale))
+def weighted(loss: Huber | None, batch: ExperimentBatch, found: Predictions, scale: Any = 1.0) -> tuple[Predictions, Any]:
+    """Predictions with their residuals over sigma, as the loss counts them, and the Jacobian of these; zero where nothing was measured, and
+    infinite residuals where there is no motion. Takes no motion.
+    """
+
+    def of_one(measured, sigma, predicted, J, result):
+        measured, sigma, predicted = (ravel_pytree(tree)[0] for tree in (measured, sigma, predicted))
+        there = jnp.isfinite(measured)
+        r = jnp.where(there, (jnp.where(there, predicted, 0) - jnp.where(there, measured, 0)) / sigma, 0)
+        slopes = jnp.where(there, 1 / sigma, 0)
+        r, slopes = (r, slopes) if loss is None else (scale * loss.root(r / scale), slopes * loss.slope(r / scale))
+        J = None if J is None else jnp.where(slopes[:, None] > 0, slopes[:, None] * J, 0)
+        finite = (result == RESULTS.successful) & (True if J is None else jnp.all(jnp.isfinite(r)) & jnp.all(jnp.isfinite(J)))
+        return jnp.where(finite, r, jnp.inf), None if J is None else jnp.where(finite, J, 0)
+
+    measured, sigma = (jax.tree.map(lambda x: x[: len(batch.members)], tree) for tree in (batch.values, batch.sigma))
+    residuals, J = jax.vmap(of_one)(measured, sigma, found.channels, found.channels_jacobian, found.result)
+    return found._replace(residuals=residuals), J
 
 
 def _check(e, channels):
@@ -138,36 +150,25 @@ def _check(e, channels):
             )
 
 
-def evaluate_batch(model: Model, free: Free, batch: ExperimentBatch, y: Any, z: Any, scale: Any = 1.0) -> Evaluation:
-    """The experiments of a batch at y and z (experiments, unknowns)."""
-    return map_batch(lambda e, z, y, free, scale: _evaluate(model, free, e, y, z, scale), batch, z, y, free, scale)
+def predict_batch(model: Model, free: Free, batch: ExperimentBatch, y: Any, z: Any) -> Predictions:
+    """The experiments of a batch at y and z (experiments, unknowns), without Jacobians or residuals."""
+
+    def of_one(e, z, y, free):
+        _, ends, channels, result = _predicted(model, free, e, y, z)
+        return Predictions(None, ends, None, channels, None, result)
+
+    return map_batch(of_one, batch, z, y, free)
 
 
-class Linearised(NamedTuple):
-    """Experiments at given unknowns: residuals, predictions and ends, the last two with their Jacobians with respect to (y, z), flat;
-    experiments are the first axis.
-    """
+def linearise_batch(model: Model, free: Free, batch: ExperimentBatch, y: Any, z: Any) -> Predictions:
+    """The same with their Jacobians, in one forward pass."""
 
-    residuals: Any
-    ends: Any
-    ends_jacobian: Any
-    channels: PyTree
-    channels_jacobian: Any
-    result: RESULTS
-
-
-def linearise_batch(model: Model, free: Free, batch: ExperimentBatch, y: Any, z: Any, scale: Any = 1.0) -> tuple[Linearised, Any]:
-    """The experiments of a batch at y and z (experiments, unknowns), in one forward pass; and the Jacobian of their residuals."""
-
-    def of_one(e, z, y, free, scale):
+    def of_one(e, z, y, free):
         def channels_and_ends(x):
-            found = _evaluate(model, free, e, x[: y.size], x[y.size :], scale)
-            return (ravel_pytree(found.channels)[0], found.ends), found
+            flat, ends, *rest = _predicted(model, free, e, x[: y.size], x[y.size :])
+            return (flat, ends), (ends, *rest)
 
-        (channels_J, ends_J), found = jax.jacfwd(channels_and_ends, has_aux=True)(jnp.concatenate([y, z]))
-        J = jnp.where(found.slopes[:, None] > 0, found.slopes[:, None] * channels_J, 0)
-        finite = jnp.all(jnp.isfinite(found.residuals)) & jnp.all(jnp.isfinite(J))
-        r, J = jnp.where(finite, found.residuals, jnp.inf), jnp.where(finite, J, 0)
-        return Linearised(r, found.ends, ends_J, found.channels, channels_J, found.result), J
+        (channels_J, ends_J), (ends, channels, result) = jax.jacfwd(channels_and_ends, has_aux=True)(jnp.concatenate([y, z]))
+        return Predictions(None, ends, ends_J, channels, channels_J, result)
 
-    return map_batch(of_one, batch, z, y, free, scale)
+    return map_batch(of_one, batch, z, y, free)

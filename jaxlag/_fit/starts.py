@@ -11,7 +11,6 @@ from jaxtyping import PyTree
 
 from .._model.numbers import count
 from .._model.system import System
-from .doubt import unexplained
 from .experiment import Experiment, validate_inputs
 from .levenberg_marquardt import INTERRUPTED, REASONS, STEP_LIMIT
 from .measurement import split_by_kind
@@ -19,7 +18,7 @@ from .multiple_shooting import FEWEST, can_be_cut
 from .parameters import Free, is_unknown
 from .problem import NoMotion
 from .regress import Regression, regress
-from .remarks import UNEXPLAINED
+from .remarks import UNEXPLAINED, unexplained
 from .result import Fit
 
 FIRST_STEPS = 30  # of the whole motion from the start of `regress`; those that do not converge are long in vain

@@ -12,7 +12,6 @@ import numpy as np
 from .arrow import transposed
 from .autocorrelation import independent_samples
 from .channels import channels_of
-from .doubt import PARTNERS, doubt_of
 from .experiment import Experiment
 from .experiment_statistics import deciding, ended_inputs, own_estimates, predictions_of, with_estimates
 from .identifiability import correlation_of
@@ -26,8 +25,10 @@ from .parameter_stability import different_halves
 from .problem import LeastSquaresProblem
 from .remarks import (
     NO_ERRORS,
+    PARTNERS,
     UNEXPLAINED,
     UNRELATED_SIZE,
+    doubt_of,
     on_bounds,
     on_exact,
     on_halves,
@@ -113,7 +114,7 @@ def _sigmas(minimum, sigma):
     if minimum.absolute:
         mean = lambda z, s: np.sqrt(np.nanmean(np.where(np.isfinite(z), np.asarray(s) ** 2, np.nan), axis=0))
         return [jax.tree.map(mean, e.values, e.sigma) for e in minimum.experiments]
-    firsts = [segments[0] for segments in minimum.segments_of_each()]
+    firsts = [segments[0] for segments in minimum.segments_of_each]
     return [jax.tree.map(lambda s, row=row: sigma * np.asarray(s)[row, 0], minimum.problem.batches[k].sigma) for k, row, _ in firsts]
 
 
@@ -184,7 +185,7 @@ def _remarks(minimum, uncertainty, scale, sigma, channels, unknowns):
     unfinished = int(minimum.outcome.best.status) in (STEP_LIMIT, INTERRUPTED)  # halves are compared at a minimum
     different = None if unfinished else different_halves(minimum, uncertainty)
     halves = on_halves(free.entries, different, len(minimum.recordings))
-    misfit = on_misfit(_relative_size(minimum), times_noise, independent, halves, channels, bool(at_bounds), bool(minimum.recordings))
+    misfit = on_misfit(minimum.relative_size, times_noise, independent, halves, channels, bool(at_bounds), bool(minimum.recordings))
     return [
         *remarks,
         *on_no_freedom(minimum.measurements, unknowns),
@@ -216,7 +217,7 @@ def _end(minimum: Minimum, doubt: str) -> Fields:
     """How the iteration ended; where it did at what is hardly a fit, the `doubt` is the reason."""
     outcome = minimum.outcome
     status = int(outcome.best.status)
-    if status in (CONVERGED, STEP_LIMIT) and _relative_size(minimum) > UNRELATED_SIZE:
+    if status in (CONVERGED, STEP_LIMIT) and minimum.relative_size > UNRELATED_SIZE:
         status = UNRELATED
     reason = (
         doubt
@@ -226,12 +227,3 @@ def _end(minimum: Minimum, doubt: str) -> Fields:
         else REASONS[status]
     )
     return {"converged": status == CONVERGED and not doubt, "reason": reason, "steps": outcome.steps, "costs": outcome.costs}
-
-
-def _relative_size(minimum):
-    """How many times as large as the measurements the residuals are."""
-    squares = 0.0
-    for batch in minimum.problem.batches:
-        for z, s in zip(jax.tree.leaves(batch.values), jax.tree.leaves(batch.sigma), strict=True):
-            squares += float(np.nansum((np.asarray(z) / np.asarray(s))[: len(batch.members)] ** 2))
-    return float(np.linalg.norm(minimum.measured) / np.sqrt(squares)) if squares > 0 else 0.0

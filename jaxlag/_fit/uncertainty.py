@@ -50,7 +50,7 @@ def _jacobian(minimum):
     if found.jacobian is None:
         return None
     blocks = [by_sigma(batch, part) for batch, part in zip(problem.batches, found.batches, strict=True)]
-    beside = found.jacobian.first if isinstance(found.jacobian, Arrow) else found.jacobian[: problem.first_recorded]
+    beside = found.jacobian.first if isinstance(found.jacobian, Arrow) else np.asarray(found.jacobian)[: problem.first_recorded]
     columns = tuple(problem.columns(k) for k in range(len(blocks)))
     return Arrow(np.asarray(beside).astype(float), tuple(blocks), columns, np.zeros((0, minimum.x.size)))
 
@@ -65,7 +65,7 @@ def sandwich(minimum: Minimum, J: Arrow, covariance: np.ndarray, weighted: list[
     """The covariance over σ² of what the columns of J belong to, with the sandwich where residuals are correlated; and over how many
     samples they are. `weighted`: the residuals of each batch, like those of the minimum; `covariance`: as if they were white.
     """
-    batches, segments_of_each = minimum.problem.batches, minimum.segments_of_each()
+    batches, segments_of_each = minimum.problem.batches, minimum.segments_of_each
     together = lambda parts: [np.concatenate(of) for of in zip(*parts, strict=True)]
     series = [together([_by_time(batches[k], weighted[k][row].astype(float), n) for k, row, n in of]) for of in segments_of_each]
     lengths = [correlation_length(autoregression(r[np.isfinite(r)]), len(r)) for of in series for rs in of for r in rs.T]

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import PyTree
 
 from .._mechanics.friction_elements import find_elements
-from .._mechanics.lagrange import applied_force, constraint_rows, inertia
+from .._mechanics.lagrange import applied_force, constraint_rows, inertia, inertial_force
 from .._mechanics.pseudo_inverse import pseudo_inverse
 from .._model.flat import bind
 from .._model.signal import jump_times
@@ -59,7 +59,7 @@ class WeakForm(eqx.Module):
         if not len(G):
             return jnp.concatenate([p, force + applied(multipliers)])
         if flat.needs_multipliers:  # the only place where the acceleration is needed
-            M, inertial = inertia(flat, t, q, v)
+            M, inertial = inertia(flat, t, q, v), inertial_force(flat, t, q, v)
             multipliers = pseudo_inverse(G @ G.T) @ (G @ (self.units * (M.mv(a) - inertial) - applied(multipliers)))
 
         def projected(t, q, x):
@@ -142,7 +142,7 @@ def _kinks(ts, slip):
 @eqx.filter_jit  # so that all parameters are traced: a friction coefficient of 0 is still friction
 def _slips(system, like, params, ts, q, v):
     """Slip velocities of dry friction along a record, (T, slips)."""
-    elements = find_elements(bind(system, like, params), ts[0], q[0], v[0])
+    elements = find_elements(bind(system, like, params))
     return jnp.zeros((ts.size, 0)) if elements is None else jax.vmap(elements.slip)(ts, q, v)
 
 

@@ -13,7 +13,7 @@ from jaxtyping import Array, Float, PyTree
 from .._mechanics.constrained_acceleration import constrained_acceleration
 from .._mechanics.contact import in_current_mode
 from .._mechanics.lagrange import imbalance, velocity_residual
-from .._mechanics.massless import completed, first_order
+from .._mechanics.massless import first_order, with_first_order_rates
 from .._mechanics.saddle_point import Sound
 from .._model.flat import Flat, StatesAt, bind
 from .._model.injection import call
@@ -77,8 +77,8 @@ class Dynamics:
         """g and ψ, including the slip of dry friction that sticks, followed by the velocity errors of coordinates without inertia."""
         flat = self.at(y, motion)
         mode = in_current_mode(flat, self.t, y.q, y.v)
-        z, _ = first_order(mode, self.t, y.q, y.v)
-        off = (y.v - completed(mode, self.t, y.q, y.v).v)[z]
+        z, *_ = first_order(mode)
+        off = (y.v - with_first_order_rates(mode, self.t, y.q, y.v).v)[z]
         return flat.holonomic(self.t, y.q), jnp.concatenate([velocity_residual(mode, self.t, y.q, y.v), off])
 
     def forces(self, y: Whole, motion: Motion) -> Forces:

@@ -79,8 +79,8 @@ def constraint_slopes(system, t, q, qdot, params, states):
     flat, t, q, v = checked(system, t, q, qdot, params, states)
     mode = in_current_mode(flat, t, q, v)
     _, G, _ = constraint_rows(mode, t, q, v)
-    G = G * unit_lengths(inertia(mode, t, q, v)[0].as_matrix(), G)[None]
-    z, rows = first_order(mode, t, q, v)
+    G = G * unit_lengths(inertia(mode, t, q, v).as_matrix(), G)[None]
+    z, rows, _ = first_order(mode)
     if z.size:
         alone = np.outer(rows, ~np.isin(np.arange(q.size), z))
         G = jnp.concatenate([jnp.where(alone, 0, G), jnp.eye(q.size, dtype=G.dtype)[z]])
@@ -97,7 +97,7 @@ def matrices(choice: Choice, system: System, t: Any, q: PyTree, qdot: PyTree, pa
     basis, driven = tangent_basis(dynamics, choice.partition, y)
     forces = dynamics.forces(y, dynamics.still())
     mode = in_current_mode(dynamics.at(y, dynamics.still()), at.t, y.q, y.v)
-    z, _ = first_order(mode, at.t, y.q, y.v)
+    z, *_ = first_order(mode)
     if z.size:
         slopes, M, found = _slopes_of_solution(dynamics, y, forces, basis, driven)
     else:
@@ -135,7 +135,7 @@ def _slopes(
     redundant = len(held) < rows
     G = _rows(dynamics, y)
     mode = in_current_mode(dynamics.at(y, dynamics.still()), dynamics.t, y.q, y.v)
-    units = unit_lengths(inertia(mode, dynamics.t, y.q, y.v)[0].as_matrix(), G)
+    units = unit_lengths(inertia(mode, dynamics.t, y.q, y.v).as_matrix(), G)
     inside = least_change(G, forces.multipliers, units) if redundant else jnp.zeros(n, y.q.dtype)
 
     def along(c):
@@ -192,7 +192,7 @@ def _slopes_of_solution(
     slopes = jax.jacfwd(along)(jnp.zeros(d + 3 * m, y.q.dtype))
     of = lambda J: ByInputs(J[:, :d], jnp.moveaxis(J[:, d:].reshape(len(J), 3, m), 1, 0))
     mode = in_current_mode(dynamics.at(y, dynamics.still()), dynamics.t, y.q, y.v)
-    M = inertia(mode, dynamics.t, y.q, y.v)[0].as_matrix()
+    M = inertia(mode, dynamics.t, y.q, y.v).as_matrix()
     return [of(J) for J in slopes], M, dynamics.balance(y, forces.qddot, forces.multipliers, dynamics.still())
 
 
@@ -239,9 +239,9 @@ def _shifted(rates: ByInputs, of: ByInputs) -> ByInputs:
 def _sizes(dynamics: Dynamics, y: Whole, multipliers: Array, mass: Array) -> tuple[Float[Array, " y"], Float[Array, " r"]]:
     """The size of each entry of the state, with zero entries sized by mass; and the size of the terms that cancel in q̈, ż and updates."""
     mode, G = in_current_mode(dynamics.at(y, dynamics.still()), dynamics.t, y.q, y.v), _rows(dynamics, y)
-    light = first_order(mode, dynamics.t, y.q, y.v).coordinates
-    stand_in = with_masses(mode, light, dynamics.t, y.q, y.v) if light.size else None
-    mass = mass if stand_in is None else inertia(stand_in, dynamics.t, y.q, y.v)[0].as_matrix()
+    light = first_order(mode).coordinates
+    stand_in = with_masses(mode, light) if light.size else None
+    mass = mass if stand_in is None else inertia(stand_in, dynamics.t, y.q, y.v).as_matrix()
     units = unit_lengths(mass, G)
     of_lagrangian = lambda q: jax.grad(mode.lagrangian, argnums=1)(dynamics.t, q, y.v)
     applied = applied_force(mode, dynamics.t, y.q, y.v, multipliers)

@@ -17,12 +17,12 @@ from .._mechanics.lagrange import imbalance
 from .._model.flat import Flat
 from .._model.system import System
 from .._model.validation import checked
-from .._program.array_dependence import dependence
 from .._program.expressions import TooLong
 from .._program.jit import compiled
 from .._program.size_of_terms import size_of_terms
 from .._program.sparse_jacobian import entries
-from .._program.sparse_matrix import Places, SparseMatrix, colors
+from .._program.sparse_matrix import SparseMatrix, SparsityPattern, colors
+from .._program.sparsity import dependence
 
 CURE = "Take `linearise(…).modes()`."
 
@@ -47,7 +47,7 @@ def _deviation(flat: Flat, t: Any, q: Array, multipliers: Array, along: Array, r
 def _deviates(system: System, t: Any, q: PyTree, params: PyTree, multipliers: Array) -> tuple[Callable, Array, int]:
     """`_deviation` of a system at rest, the zero deviation, and the number of coordinates."""
     flat, t, q, v = checked(system, t, q, jax.tree.map(jnp.zeros_like, q), params, {})
-    if find_elements(flat, t, q, v) is not None:
+    if find_elements(flat) is not None:
         raise ValueError(f"`dissipation` must have no dry friction in `lowest_modes`, but has. {CURE}")
     of = lambda *given: _deviation(flat, t, q, multipliers, *given)
     return of, jnp.zeros(q.size + flat.rows, q.dtype), q.size
@@ -58,7 +58,7 @@ def pencil(system: System, t: Any, q: PyTree, params: PyTree, multipliers: Array
     """The pencil at rest at q, with constraint forces λ."""
     of, nothing, n = _deviates(system, t, q, params, multipliers)
     pattern = _pattern(lambda w: of(w, w, w), nothing)
-    color, places = colors(pattern), Places.of(pattern, n)
+    color, places = colors(pattern), SparsityPattern.of(pattern, n)
 
     def slope(i):
         at = lambda w: of(*(w if i == j else nothing for j in range(3)))

@@ -12,7 +12,7 @@ from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from .._mechanics.augmented_inertia import unit_lengths, units_of_mass
 from .._mechanics.friction_elements import FrictionElements, find_elements
-from .._mechanics.lagrange import applied_force, constraint_rows, inertia
+from .._mechanics.lagrange import applied_force, constraint_rows, inertia, inertial_force
 from .._mechanics.pseudo_inverse import FOLLOWS, SEEN
 from .._mechanics.saddle_point import saddle_point
 from .._mechanics.stick_slip import in_mode, slip_of, sticking
@@ -102,7 +102,7 @@ class Equations:
         self.unravel_states = ravel_pytree(values)[1]
         self.moving = np.setdiff1d(np.arange(at.q.size), search.fixed).astype(int)
         self.running = np.array(search.running, int)
-        elements = find_elements(flat, at.t, at.q, at.v)
+        elements = find_elements(flat)
         self.friction_rows = elements.element_of_row.size if elements is not None and search.held else 0
         self.sizes = np.cumsum([self.moving.size, self.running.size, ravel_pytree(values)[0].size, flat.rows])
 
@@ -126,7 +126,7 @@ class Equations:
     def force(self, flat: Flat, given: Given, q: Array, v: Array, of: Unknowns) -> Float[Array, " n"]:
         """f + Gᵀλ with dry friction where it slips; where it sticks, without it or with the force that it would have to hold."""
         t, held = given.t, 0.0
-        elements = find_elements(flat, t, q, v)
+        elements = find_elements(flat)
         if elements is not None:
             sigma = directions_of_slip(elements, given)
             flat = flat._replace(dissipations=in_mode(flat, elements, sigma).dissipations)
@@ -134,7 +134,7 @@ class Equations:
                 holding = jnp.where(sticking(elements, sigma)[elements.element_of_row], of.friction, 0)
                 held = jax.vjp(lambda v: elements.slip(t, q, v), v)[1](holding)[0]
         _, G, _ = constraint_rows(flat, t, q, v)
-        return inertia(flat, t, q, v)[1] + applied_force(flat, t, q, v, of.multipliers) + G.T @ of.multipliers + held
+        return inertial_force(flat, t, q, v) + applied_force(flat, t, q, v, of.multipliers) + G.T @ of.multipliers + held
 
 
 def left_open(J: Float[Array, "r u"], which: np.ndarray) -> Bool[Array, " b"]:
@@ -161,7 +161,7 @@ def steady_state(search: Search, system: System, t: Any, q: PyTree, qdot: PyTree
     given = Given(eqx.filter(params, eqx.is_array), t, q0, v0, jnp.zeros(len(search.running), bool))
     equations = Equations(search, system, q, params, values, given, flat)
     start = jax.lax.stop_gradient(q0)
-    units = _units(inertia(flat, t, start, v0)[0].as_matrix())
+    units = _units(inertia(flat, t, start, v0).as_matrix())
     if search.stable:
         V = lambda q: -flat.lagrangian(t, q, v0)
         within = units_beside(jax.hessian(V)(start), units)
@@ -190,7 +190,7 @@ def _described(equations: Equations, given: Given, root: Root) -> Rest:
     """A steady state with everything that is reported about it."""
     flat, q, v, of = equations.taken_apart(given, root.w)
     t, (known, at_rest) = given.t, jax.lax.stop_gradient((given, root.w))
-    R, M = equations(known, at_rest), inertia(flat, t, q, v)[0].as_matrix()
+    R, M = equations(known, at_rest), inertia(flat, t, q, v).as_matrix()
     step = jax.lax.stop_gradient(_a_while(_units(M), jnp.maximum(jnp.abs(q), jnp.abs(given.q)), v))
     later = at_rest.at[: equations.moving.size].add(jax.lax.stop_gradient(step * v)[equations.moving])
     uniform = is_nothing(equations(known._replace(t=known.t + step, q=known.q + step * known.v), later), root.size)
@@ -236,7 +236,7 @@ def _friction(
     whether anything slips.
     """
     t = given.t
-    elements = find_elements(flat, t, q, v)
+    elements = find_elements(flat)
     if elements is None:
         return {}, jnp.array(True), jnp.array(False)
     sigma, slip, row = directions_of_slip(elements, given), elements.slip(t, q, v), elements.element_of_row

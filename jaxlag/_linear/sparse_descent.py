@@ -8,7 +8,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float, Int
 
-from .._program.block_tridiagonal_lu import Factors, factorised, positive_eigenvalues, solution
+from .._program.block_tridiagonal import Factors, factorised, positive_eigenvalues, solution
 from .._program.conditions import halved, repeated
 from .._program.sparse_matrix import SparseMatrix, row_sums
 from .descent import STEPS, far_down
@@ -33,15 +33,15 @@ def sparse_minimum_near(V: Callable, slope_and_curvature: Callable, q: Float[Arr
     def turn(carry):
         x, added, _, i = carry
         slope, K = slope_and_curvature(units * x)
-        slope, K = units * slope, SparseMatrix(K.values * units[K.places.rows] * units[K.places.columns], K.places)
+        slope, K = units * slope, SparseMatrix(K.values * units[K.pattern.rows] * units[K.pattern.columns], K.pattern)
         largest = jnp.max(row_sums(K))
         added, factors = _made_definite(K, jnp.where(added > FIRST * largest, added / WEAKER, 0))
-        step = -solution(K.places, factors, slope)
+        step = -solution(K.pattern, factors, slope)
         longest = jnp.max(jnp.abs(step))
         reach = jnp.max(jnp.maximum(jnp.abs(x), jnp.abs(q / units)))
         reach = jnp.where(reach > 0, reach, longest)
         flat, falls = longest <= eps**0.5 * reach, added > 0
-        downhill = solution(K.places, factors, anywhere)
+        downhill = solution(K.pattern, factors, anywhere)
         downhill = downhill / jnp.max(jnp.abs(downhill))
         step = jnp.where(flat & falls, downhill * far_down(lambda h: V(units * (x + h * downhill)), 0.1 * reach), step)
         longest = jnp.max(jnp.abs(step))
@@ -80,19 +80,19 @@ def eigenvalues_below(J: SparseMatrix, scale: Float[Array, " n"], bound: Array) 
 
     Source: Gould, Math. Programming 32 (1985) 90: J has the inertia of −K on the null space of G, plus one of each sign per row.
     """
-    n, places = scale.size, J.places
+    n, pattern = scale.size, J.pattern
     of_q = np.arange(J.shape[0]) < n
     unit = jnp.append(lax.rsqrt(scale), jnp.ones(J.shape[0] - n, scale.dtype))
-    values, within = J.values * unit[places.rows] * unit[places.columns], of_q[places.columns] & of_q[places.rows]
+    values, within = J.values * unit[pattern.rows] * unit[pattern.columns], of_q[pattern.columns] & of_q[pattern.rows]
     stiffest = jnp.max(jnp.where(within, jnp.abs(values), 0), initial=0.0)
     stiffest = jnp.where(stiffest > 0, stiffest, 1)  # in these units no number is far from one, like the numbers next to blocks
-    row = jax.ops.segment_max(jnp.abs(values), places.rows, J.shape[0], indices_are_sorted=True)
+    row = jax.ops.segment_max(jnp.abs(values), pattern.rows, J.shape[0], indices_are_sorted=True)
     unit = jnp.where(of_q | (row <= 0), lax.rsqrt(stiffest), jnp.sqrt(stiffest) / jnp.where(row > 0, row, 1))
-    A = SparseMatrix(values * unit[places.rows] * unit[places.columns], places).plus_diagonal(jnp.where(of_q, bound / stiffest, 0))
+    A = SparseMatrix(values * unit[pattern.rows] * unit[pattern.columns], pattern).plus_diagonal(jnp.where(of_q, bound / stiffest, 0))
     factors = factorised(A)
     count, sound = positive_eigenvalues(A, factors)
     error = jnp.zeros((), scale.dtype)
     for signs in np.random.default_rng(0).choice([-1.0, 1.0], (PROBES, J.shape[0])):
         x = jnp.asarray(signs, scale.dtype)
-        error = jnp.maximum(error, jnp.max(jnp.abs(A @ (solution(places, factors, A @ x) - x))))
+        error = jnp.maximum(error, jnp.max(jnp.abs(A @ (solution(pattern, factors, A @ x) - x))))
     return count - (J.shape[0] - n), jnp.where(sound, SAFETY * error * stiffest, jnp.inf)

@@ -99,7 +99,7 @@ class Matrices(NamedTuple):
 
 
 def _scipy(A: SparseMatrix) -> scipy.sparse.csc_matrix:
-    return scipy.sparse.csc_matrix((np.asarray(A.values, float), (A.places.rows, A.places.columns)), A.shape)
+    return scipy.sparse.csc_matrix((np.asarray(A.values, float), (A.pattern.rows, A.pattern.columns)), A.shape)
 
 
 def following_rows(G: scipy.sparse.csc_matrix) -> np.ndarray:
@@ -119,14 +119,14 @@ def following_rows(G: scipy.sparse.csc_matrix) -> np.ndarray:
 
 def _without(given: Pencil, left_out: np.ndarray) -> Pencil:
     """The pencil without some of the constraints: −d μ = 0 replaces each, with d as large as its row."""
-    places, values = given.stiffness.places, np.asarray(given.stiffness.values)
-    is_out = np.isin(np.arange(places.shape[0]), left_out)
-    taken = is_out[places.rows] | is_out[places.columns]
-    size = np.zeros(places.shape[0], values.dtype)
-    np.maximum.at(size, places.rows, np.abs(values))
-    on_diagonal = places.rows == places.columns
-    values = np.where(taken, np.where(on_diagonal, -np.where(size > 0, size, 1)[places.rows], 0), values)
-    return given._replace(stiffness=SparseMatrix(jnp.asarray(values), places))
+    pattern, values = given.stiffness.pattern, np.asarray(given.stiffness.values)
+    is_out = np.isin(np.arange(pattern.shape[0]), left_out)
+    taken = is_out[pattern.rows] | is_out[pattern.columns]
+    size = np.zeros(pattern.shape[0], values.dtype)
+    np.maximum.at(size, pattern.rows, np.abs(values))
+    on_diagonal = pattern.rows == pattern.columns
+    values = np.where(taken, np.where(on_diagonal, -np.where(size > 0, size, 1)[pattern.rows], 0), values)
+    return given._replace(stiffness=SparseMatrix(jnp.asarray(values), pattern))
 
 
 class Found(NamedTuple):
@@ -207,7 +207,7 @@ def _left_out(matrices: Matrices, squares: np.ndarray, count: int) -> bool:
     shifted = given.stiffness.values - middle * given.mass.values
     masses = np.asarray(matrices.M.diagonal()[: matrices.n])
     scale = jnp.asarray(np.where(masses > 0, masses, 1), shifted.dtype)
-    below, within = compiled(eigenvalues_below)(SparseMatrix(-shifted, given.stiffness.places), scale, jnp.zeros((), shifted.dtype))
+    below, within = compiled(eigenvalues_below)(SparseMatrix(-shifted, given.stiffness.pattern), scale, jnp.zeros((), shifted.dtype))
     is_certain = bool(within <= np.max(gaps) / 2)
     if not is_certain:
         warnings.warn("whether a lower mode was left out is not certain: factors of the matrix are too inexact", UserWarning, stacklevel=5)

@@ -46,7 +46,7 @@ def many_at_rest(search: Search, system: System, t: Any, q: PyTree, qdot: PyTree
     """As `steady_state`; None if there are few coordinates, no structure, or more than forces and positions in the equations."""
     flat, t, q0, v0 = checked(system, t, q, qdot, params, states)
     beside = search.fixed or search.running or search.held or system.states or system.nonholonomic
-    if q0.size < MANY or beside or (search.stable and flat.rows) or find_elements(flat, t, q0, v0) is not None:
+    if q0.size < MANY or beside or (search.stable and flat.rows) or find_elements(flat) is not None:
         return None
     values = start_values(system, states, t, q, qdot, params)
     given = Given(eqx.filter(params, eqx.is_array), t, q0, v0, jnp.zeros(0, bool))
@@ -65,7 +65,7 @@ def _searched(equations: SparseEquations, given: Given, flat: Flat, start: Array
     """
     V = lambda q: -flat.lagrangian(given.t, q, given.v)
     of_V = lambda q: (equations.residual(given, q), equations.jacobian(given, q))
-    masses = units_alike(inertia(flat, given.t, given.q, given.v)[0], [])
+    masses = units_alike(inertia(flat, given.t, given.q, given.v), [])
     units = jnp.zeros_like(start).at[: masses.size].set(masses)
     if not can_descend:
         return sparse_root_near(equations, given, _with_multipliers(equations, given, start), units)
@@ -84,9 +84,9 @@ def _with_multipliers(equations: SparseEquations, given: Given, w: Array) -> Arr
     """w with the multipliers that best balance the forces."""
     J, n = equations.jacobian(given, w), given.q.size
     of_q = np.arange(w.size) < n
-    within = of_q[J.places.rows] & of_q[J.places.columns]
-    A = equations.matrix(SparseMatrix(jnp.where(within, 0, J.values), J.places)).plus_diagonal(jnp.asarray(of_q, w.dtype))
-    balance = refined(A.__matmul__, A.places, newton_factors(A), jnp.where(of_q, equations.residual(given, w), 0))
+    within = of_q[J.pattern.rows] & of_q[J.pattern.columns]
+    A = equations.matrix(SparseMatrix(jnp.where(within, 0, J.values), J.pattern)).plus_diagonal(jnp.asarray(of_q, w.dtype))
+    balance = refined(A.__matmul__, A.pattern, newton_factors(A), jnp.where(of_q, equations.residual(given, w), 0))
     return w + jnp.where(of_q | ~jnp.all(jnp.isfinite(balance)), 0, balance)
 
 
@@ -101,7 +101,7 @@ def _described(of_rest: EquationsOfRest, equations: SparseEquations, given: Give
         unit = lx.DiagonalLinearOperator(jnp.ones_like(q))
         multipliers = saddle_point(unit, G, -(G.T @ multipliers), jnp.zeros_like(multipliers)).multipliers
     alone = jnp.asarray(equations.alone[: q.size] > 0)
-    M = lax.stop_gradient(inertia(flat, given.t, q, v)[0])
+    M = lax.stop_gradient(inertia(flat, given.t, q, v))
     return Rest(
         flat.unravel(shown(q)),
         flat.unravel(v),
@@ -120,15 +120,15 @@ def _described(of_rest: EquationsOfRest, equations: SparseEquations, given: Give
 
 def _curvature(J: SparseMatrix, M: lx.AbstractLinearOperator, alone: Array) -> Curvature:
     """The number of squared natural frequencies below zero, and within rounding of zero, from the inertia of J relative to M."""
-    n, eps, places = alone.size, jnp.finfo(J.values.dtype).eps, J.places
+    n, eps, pattern = alone.size, jnp.finfo(J.values.dtype).eps, J.pattern
     masses = jnp.append(units_alike(M, []), jnp.zeros(J.shape[0] - n, J.values.dtype))
     units = sparse_units_beside(J, masses)[:n]
     units = jnp.where(units > 0, units, 1)
     mass = units**-2
-    within = (places.rows < n) & (places.columns < n)
+    within = (pattern.rows < n) & (pattern.columns < n)
     unit = jnp.append(units, jnp.zeros(J.shape[0] - n, J.values.dtype))
-    K = SparseMatrix(jnp.where(within, J.values * unit[places.rows] * unit[places.columns], 0), places)
-    difference = jnp.max(jnp.abs(K.T.values - K.values)) if K.T.places == places else jnp.inf
+    K = SparseMatrix(jnp.where(within, J.values * unit[pattern.rows] * unit[pattern.columns], 0), pattern)
+    difference = jnp.max(jnp.abs(K.T.values - K.values)) if K.T.pattern == pattern else jnp.inf
     largest = jnp.max(row_sums(K))
     J = J.plus_diagonal(jnp.concatenate([jnp.where(alone, -largest * mass, 0), jnp.zeros(J.shape[0] - n)]).astype(mass.dtype))
     dust = eps**0.625 * largest

@@ -14,13 +14,19 @@ CURE = "Look for a steady state by `equilibrium` or `steady`, or take it all the
 def refuse_unsteady(found: Matrices, later: Callable[[float], Matrices], names: Sequence[str]) -> None:
     """Raises if q̈ or ż is not zero, or A changes a little later; `names`: the coordinates and states."""
     if is_concrete(found) and (reason := why_unsteady(found, later, names)):
-        raise ValueError(f"{reason} {DEFINED if reason == UNDEFINED else CURE}")
+        raise ValueError(f"{reason} {CURE if is_determined(found) else DEFINED}")
+
+
+def is_determined(found: Matrices) -> bool:
+    """Whether the motion and its derivatives are."""
+    numbers = np.asarray(found.steadiness.left), np.asarray(found.rates.by_state)
+    return bool(found.steadiness.determined) and all(np.all(np.isfinite(x)) for x in numbers)
 
 
 def why_unsteady(found: Matrices, later: Callable[[float], Matrices], names: Sequence[str]) -> str:
     """A sentence that says what is not steady; empty if everything is."""
     left, allowed, A = (np.asarray(x) for x in (found.steadiness.left, found.steadiness.allowed, found.rates.by_state))
-    if not (found.steadiness.determined and np.all(np.isfinite(A)) and np.all(np.isfinite(left))):
+    if not is_determined(found):
         return UNDEFINED
     if np.any(np.abs(left) > allowed):
         i = int(np.argmax(np.abs(left) / np.where(allowed > 0, allowed, np.finfo(A.dtype).tiny)))

@@ -20,9 +20,8 @@ from .constrained_acceleration import constrained_acceleration
 from .contact import in_current_mode
 from .lagrange import constraint_rows
 from .pseudo_inverse import pseudo_inverse
-from .saddle_point import CONTRADICTION, NO_INERTIA, Sound
-from .self_consistent import NOT_CONSISTENT
-from .singular_directions import explained
+from .saddle_point import CONTRADICTION, Sound
+from .singular_directions import Failure, explained
 
 
 class Acceleration(NamedTuple):
@@ -73,11 +72,11 @@ def _refuse(verdict: Bool[Array, "3"], *given) -> None:
         return
     determined, satisfied, agrees = np.asarray(verdict)
     if not determined:
-        raise ValueError(explained(NO_INERTIA, *given))
+        raise ValueError(explained(Failure.no_inertia, *given))
     if not satisfied:
         raise ValueError(CONTRADICTION)
     if not agrees:
-        raise ValueError(explained(NOT_CONSISTENT, *given))
+        raise ValueError(explained(Failure.no_multipliers, *given))
 
 
 def _verdict(flat: Flat, sound: Sound, multipliers) -> Bool[Array, "3"]:

@@ -9,6 +9,7 @@ import lineax as lx
 from jaxtyping import Array, Float
 
 from .._program.conditions import everywhere
+from .._program.shifted_factors import inverse_lengths
 from .._program.sparse_matrix import SparseMatrix
 from .structured_inertia import StructuredInertia
 
@@ -21,8 +22,8 @@ def augmented(M, G):
 
 def unit_lengths(M: Float[Array, "n n"], G: Float[Array, "m n"]) -> Float[Array, " n"]:
     """Units of the coordinates in which each has inertia of order one, whatever units they are given in; of what has no mass, by rows."""
-    size = jnp.diagonal(augmented(M, G)[0])
-    return jnp.where(size > 0, jax.lax.rsqrt(jnp.where(size > 0, size, 1)), 1)
+    units, present = inverse_lengths(jnp.diagonal(augmented(M, G)[0]), 0)
+    return jnp.where(present, units, 1)
 
 
 def units_alike(M: lx.AbstractLinearOperator, rows: Sequence[Any]) -> Float[Array, " n"]:
@@ -39,7 +40,7 @@ def units_alike(M: lx.AbstractLinearOperator, rows: Sequence[Any]) -> Float[Arra
 
 def units_of_mass(mass: Float[Array, " n"]) -> Float[Array, " n"]:
     """Units in which each coordinate has inertia 1; 0 of what has none."""
-    return jnp.where(mass > 0, jax.lax.rsqrt(jnp.where(mass > 0, mass, 1)), 0)
+    return inverse_lengths(mass, 0)[0]
 
 
 def alike(M: lx.AbstractLinearOperator, rows: Sequence[Any], size: Float[Array, " n"]) -> Float[Array, " n"]:

@@ -12,7 +12,6 @@ taken out of the solution by putting that right once. Where rows depend on each 
 Source: Benzi, Golub & Liesen, Numerical solution of saddle point problems, Acta Numerica 2005, sections 5, 6 and 8.
 """
 
-import functools
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -22,14 +21,15 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float
 
-from .._program.block_tridiagonal import pairs_in_a_column
-from .._program.block_tridiagonal_lu import Factors as Blocks
-from .._program.block_tridiagonal_lu import factorised as by_blocks
-from .._program.block_tridiagonal_lu import order, positive_eigenvalues, solution
+from .._program.block_tridiagonal import Factors as Blocks
+from .._program.block_tridiagonal import blocks, positive_eigenvalues, solution
+from .._program.block_tridiagonal import factorised as by_blocks
 from .._program.conditions import everywhere
-from .._program.shifted_factors import SHIFT, put_right, scales, shifted_where_singular, signs
+from .._program.registry import remembered
+from .._program.shifted_factors import inverse_lengths, refine, scales, shifted_where_singular, shifts, signs
 from .._program.sparse_jacobian import SPARSE
-from .._program.sparse_matrix import Places, SparseMatrix, picked, summed_by
+from .._program.sparse_matrix import SparseMatrix, SparsityPattern, assembled, gather_static, summed_by
+from .sparse_saddle_point import rotation
 
 EXACT = 2  # times that a solution is put right where rows are independent: once for GᵀG, once for rounding
 
@@ -37,25 +37,21 @@ EXACT = 2  # times that a solution is put right where rows are independent: once
 class Whole(NamedTuple):
     """How the matrix of (x, −λ) is put together: fixed while tracing, by the places of M and G alone."""
 
-    places: Places
+    pattern: SparsityPattern
     pairs: tuple[np.ndarray, np.ndarray]  # of entries of G in one row
-    sums: Places  # by which entries of M, pairs, entries of G, of Gᵀ and the δ are added up
+    sums: SparsityPattern  # by which entries of M, pairs, entries of G, of Gᵀ and the δ are added up
 
 
-@functools.lru_cache(maxsize=64)
-def whole(M: Places, G: Places) -> Whole | None:
+@remembered
+def whole(M: SparsityPattern, G: SparsityPattern) -> Whole | None:
     """None where blocks would be so large that a full matrix serves as well."""
     (m, n), (by_columns, number) = G.shape, G.transposed
-    first, second = (number[pairs] for pairs in pairs_in_a_column(by_columns))
+    first, second = (number[pairs] for pairs in by_columns.pairs_in_a_column())
     of_rows = n + np.arange(m)
     rows = np.concatenate([M.rows, G.columns[first], n + G.rows, G.columns, of_rows])
     columns = np.concatenate([M.columns, G.columns[second], G.columns, n + G.rows, of_rows])
-    there, place = np.unique(rows * (n + m) + columns, return_inverse=True)
-    places = Places(there // (n + m), there % (n + m), (n + m, n + m), n)
-    if SPARSE * order(places).size > n + m:
-        return None
-    sorting = np.argsort(place, kind="stable")
-    return Whole(places, (first, second), Places(place[sorting], sorting, (there.size, place.size)))
+    pattern, sums = assembled(rows, columns, n + m, n)
+    return Whole(pattern, (first, second), sums) if SPARSE * blocks(pattern).size <= n + m else None
 
 
 class Factors(NamedTuple):
@@ -74,31 +70,29 @@ def factorised(M: SparseMatrix, G: SparseMatrix) -> Factors:
     """Rows that depend on each other are seen by what the inverse makes of a vector at random; then δ is not zero, and a solution is put
     right more often. M is positive on their null space where as many eigenvalues are negative as there are rows (Sylvester).
     """
-    how, eps, (m, n) = whole(M.places, G.places), jnp.finfo(G.values.dtype).eps, G.shape
+    how, (m, n) = whole(M.pattern, G.pattern), G.shape
     assert how is not None  # asked where it is of use
     units = lax.rsqrt(masses(M))
-    values = G.values * picked(units, G.places.columns)
-    squares = summed_by(G.places, values**2)
-    there = squares > (4 * eps) ** 2 * jnp.max(squares)  # a row of nothing but rounding has no part in it
-    weights = jnp.where(there, lax.rsqrt(jnp.where(there, squares, 1)), 0)
-    values, (first, second) = values * picked(weights, G.places.rows), how.pairs
-    shift = eps**SHIFT * weights**2 / _typical(weights**2, there) + ~there  # as much for each row in the units given
-    of_M = M.values * picked(units, M.places.rows) * picked(units, M.places.columns)
+    values = G.values * gather_static(units, G.pattern.columns)
+    weights, present = inverse_lengths(summed_by(G.pattern, values**2))
+    values, (first, second) = values * gather_static(weights, G.pattern.rows), how.pairs
+    of_M = M.values * gather_static(units, M.pattern.rows) * gather_static(units, M.pattern.columns)
     probe = signs((n + m,), values.dtype)
 
     def factored(delta):
-        entries = jnp.concatenate([of_M, picked(values, first) * picked(values, second), values, values, -delta])
-        K = SparseMatrix(summed_by(how.sums, picked(entries, how.sums.columns)), how.places)
+        entries = jnp.concatenate([of_M, gather_static(values, first) * gather_static(values, second), values, values, -delta])
+        K = SparseMatrix(summed_by(how.sums, gather_static(entries, how.sums.columns)), how.pattern)
         return K, by_blocks(K)
 
-    (K, factors), shifted = shifted_where_singular(factored, lambda found: solution(how.places, found[1], probe), shift)
+    probed = lambda found: solution(how.pattern, found[1], probe)
+    (K, factors), shifted = shifted_where_singular(factored, probed, shifts(weights, present) + ~present)
     rising, sound = positive_eigenvalues(K, factors)
     return Factors(factors, units, weights, everywhere(~shifted), (rising == n) & sound)
 
 
 def masses(M: SparseMatrix) -> Float[Array, " n"]:
     """The diagonal of M, where that is not (next to) nothing relative to its largest number, as of what constraints alone hold."""
-    return scales(summed_by(M.places, jnp.where(M.places.rows == M.places.columns, M.values, 0)))
+    return scales(summed_by(M.pattern, jnp.where(M.pattern.rows == M.pattern.columns, M.values, 0)))
 
 
 def is_determined(_: SparseMatrix, factors: Factors) -> Bool[Array, ""]:
@@ -106,14 +100,9 @@ def is_determined(_: SparseMatrix, factors: Factors) -> Bool[Array, ""]:
     return factors.determined
 
 
-def _typical(x, among):
-    """The geometric mean of some numbers."""
-    return jnp.exp(jnp.sum(jnp.where(among, jnp.log(jnp.where(among, x, 1)), 0)) / jnp.maximum(jnp.sum(among), 1))
-
-
 def solver(M: SparseMatrix, G: SparseMatrix, factors: Factors) -> tuple[Callable, Callable]:
     """(f, c) ↦ (x, λ); and (dG, λ) ↦ how λ turns with the null space of Gᵀ to stay of least norm."""
-    how, n = whole(M.places, G.places), G.shape[1]
+    how, n = whole(M.pattern, G.pattern), G.shape[1]
     assert how is not None  # asked where it is of use
     scale = jnp.concatenate([factors.units, factors.weights])[:, None]
     apart = lambda given: (given[:n], given[n:])
@@ -123,21 +112,12 @@ def solver(M: SparseMatrix, G: SparseMatrix, factors: Factors) -> tuple[Callable
         return jnp.concatenate([M @ x + G.T @ pull, G @ x])
 
     def once(given):
-        return scale * jax.vmap(lambda b: solution(how.places, factors.of, b), in_axes=1, out_axes=1)(scale * given)
+        return scale * jax.vmap(lambda b: solution(how.pattern, factors.of, b), in_axes=1, out_axes=1)(scale * given)
 
-    refined = lambda matvec, given: put_right(once, matvec, given, EXACT, ~factors.regular)
+    refined = lambda matvec, given: refine(once, matvec, given, EXACT, ~factors.regular)
 
     def solve(f, c):
         x, pull = apart(lax.custom_linear_solve(by_matrix, jnp.concatenate([f, c]), refined, symmetric=True))
         return x, -pull
 
-    def rotated(dG, multipliers):
-        nothing = jnp.zeros((n, multipliers.shape[1]), multipliers.dtype)
-
-        def turned(dG, multipliers):
-            change = dG @ solve(nothing, multipliers)[0]
-            return change - G @ solve(nothing, change)[0]
-
-        return lax.cond(factors.regular, lambda _, multipliers: jnp.zeros_like(multipliers), turned, dG, multipliers)
-
-    return solve, rotated
+    return solve, rotation(G, solve, factors.regular)

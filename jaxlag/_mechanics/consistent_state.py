@@ -25,11 +25,11 @@ from .constraint_residuals import off, off_constraints, terms
 from .contact import in_contact
 from .friction_elements import find_elements, with_all_masses
 from .lagrange import inertia, position_rows, velocity_residual, velocity_rows
-from .massless import completed, inertial_part
+from .massless import inertial_part, with_first_order_rates
 from .projection import metric_of_positions
 from .pseudo_inverse import Constraints
-from .saddle_point import NO_INERTIA, Rows, is_determined, reach_of
-from .singular_directions import NOT_AFFINE, UNDEFINED, explained, not_affine_in
+from .saddle_point import Rows, is_determined, reach_of
+from .singular_directions import Failure, explained, not_affine_in
 from .stick_slip import first_mode, in_mode
 from .structured_inertia import StructuredInertia
 
@@ -59,8 +59,8 @@ def nearest_state(flat: Flat, t, q0, v0, free: Sequence[int] | None = None, *, f
     """
     moving = np.arange(q0.size) if free is None else np.asarray(free, int)
     yes = jnp.array(True)
-    stated, flat = flat, with_all_masses(flat, t, q0, v0)
-    full = inertia(flat, t, q0, v0)[0]
+    stated, flat = flat, with_all_masses(flat)
+    full = inertia(flat, t, q0, v0)
     M = _part(full, moving)
     given = jnp.concatenate([flat.holonomic(t, q0), velocity_residual(flat, t, q0, v0)])
     positions = flat.holonomic(t, q0).size
@@ -111,14 +111,14 @@ def _is_finite(M: lx.AbstractLinearOperator) -> Bool[Array, ""]:
 def _with_decided_rates(flat: Flat, t, q, v) -> Float[Array, " n"]:
     """q̇ with the velocities that dissipation decides, in the mode of friction that holds there; contacts have no part in them."""
     flat = in_contact(flat, jnp.zeros(len(flat.contacts), bool))
-    elements = find_elements(flat, t, q, v) if flat.massless else None
+    elements = find_elements(flat) if flat.massless else None
     mode = flat if elements is None else in_mode(flat, elements, first_mode(flat, elements, t, q, v)[0].sigma)
-    return completed(mode, t, q, v).v
+    return with_first_order_rates(mode, t, q, v).v
 
 
 def has_inertia(flat: Flat, t, q, v) -> Bool[Array, ""]:
     """Whether M leaves no direction without inertia that the constraints allow."""
-    return scalarised(lambda t, q, v: is_determined(inertia(flat, t, q, v)[0], velocity_rows(flat, t, q, v)[1]))(t, q, v)
+    return scalarised(lambda t, q, v: is_determined(inertia(flat, t, q, v), velocity_rows(flat, t, q, v)[1]))(t, q, v)
 
 
 def _nearest_position(flat: Flat, moving, t, q0, M, found: bool) -> Float[Array, " n"]:
@@ -183,14 +183,14 @@ def _nearest_velocity(flat: Flat, moving, t, q, v0, found: bool) -> tuple[Float[
         t, q, v0 = args
         v = v0.at[moving].set(w[:free])
         psi, pull = jax.vjp(lambda v: velocity_residual(flat, t, q, v), v)
-        pushed = inertia(flat, t, q, v0)[0].mv(v - v0)
+        pushed = inertia(flat, t, q, v0).mv(v - v0)
         return jnp.concatenate([(pushed - pull(w[free:])[0])[moving], psi])
 
     @scalarised
     def linear(args, w):
         t, q, v0 = args
         psi, G, _ = velocity_rows(flat, t, q, v0)
-        M, G, sizes = _part(inertia(flat, t, q, v0)[0], moving), _columns(G, moving), abs(G) @ jnp.abs(v0) + jnp.abs(psi - G @ v0)
+        M, G, sizes = _part(inertia(flat, t, q, v0), moving), _columns(G, moving), abs(G) @ jnp.abs(v0) + jnp.abs(psi - G @ v0)
         is_off = off(psi, sizes + abs(G) @ alike(M, [G], jnp.abs(v0[moving]))) > _small(q)
         return Linear(M, G, jnp.zeros_like(v0[moving]), -psi, reach_of(v0[moving], is_off))
 
@@ -240,17 +240,16 @@ def consistent_state(
     core = _StateOn(_fixed_indices(coordinates(q, "q"), listed(fixed)))
     (new_q, new_qdot), (reached, determined, affine, defined) = at_state(core, system, q, qdot, params, t, states)
     if is_concrete(reached):
-        for passed, reason in ((defined, UNDEFINED), (determined, NO_INERTIA), (affine, NOT_AFFINE), (reached, IMPOSSIBLE)):
-            if not passed:
-                raise ValueError(explained(reason, system, q, qdot, params, t, states))
+        passed = {
+            Failure.undefined: defined,
+            Failure.no_inertia: determined,
+            Failure.not_affine: affine,
+            Failure.impossible_start: reached,
+        }
+        for failure in passed:
+            if not passed[failure]:
+                raise ValueError(explained(failure, system, q, qdot, params, t, states))
     return new_q, new_qdot
-
-
-IMPOSSIBLE = (
-    "`holonomic` and `nonholonomic` must be satisfied by some state near the start, but none was found. "
-    "Start nearer, fix fewer coordinates, or look for constraints that contradict each other, or of which one is lost in the rounding of "
-    "another."
-)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -8,8 +8,8 @@ from jaxtyping import Array, Float
 
 from .._model.flat import Flat
 from .._program.sparse_matrix import dense
-from .lagrange import applied_force, inertia, velocity_residual, velocity_rows
-from .massless import completed, first_order, inertial_part
+from .lagrange import applied_force, inertia, inertial_force, velocity_residual, velocity_rows
+from .massless import first_order, inertial_part, with_first_order_rates
 from .pseudo_inverse import Constraints
 from .saddle_point import SaddlePoint, Sound, saddle_point
 from .self_consistent import others, self_consistent
@@ -17,21 +17,25 @@ from .self_consistent import others, self_consistent
 
 def constrained_acceleration(flat: Flat, t, q, v, feedback=None) -> SaddlePoint:
     """q̈ and λ of  M q̈ = f + Gᵀλ,  G q̈ = −γ − feedback(t, q, v); of coordinates without inertia, the rate of the velocity that D decides."""
-    z, _ = first_order(flat, t, q, v)
+    return constrained_motion(flat, t, q, v, feedback)[1]
+
+
+def constrained_motion(flat: Flat, t, q, v, feedback=None) -> tuple[Float[Array, " n"], SaddlePoint]:
+    """q̇ with the velocities that D decides, and q̈ and λ."""
+    z, *_ = first_order(flat)
     if not z.size:
-        return _by_inertia(flat, t, q, v, feedback)
-    decided = lambda t, q, v: completed(flat, t, q, v)
-    v, multipliers, sound = decided(t, q, v)
+        return v, _by_inertia(flat, t, q, v, feedback)
+    (v, multipliers, sound), along = jax.linearize(lambda t, q, v: with_first_order_rates(flat, t, q, v), t, q, v)
     _, pull = jax.vjp(lambda v: velocity_residual(flat, t, q, v), v)
     found = _by_inertia(inertial_part(flat, t, q, v, pull(multipliers)[0]), t, q, v, feedback)
-    _, rate = jax.jvp(lambda t, q, v: decided(t, q, v).v, (t, q, v), (jnp.ones_like(t), v, found.x))
+    rate = along(jnp.ones_like(t), v, found.x).v
     is_sound = Sound(*(a & b for a, b in zip(sound, found.sound, strict=True)))
-    return SaddlePoint(found.x.at[z].set(rate[z]), found.multipliers + multipliers, is_sound)
+    return v, SaddlePoint(found.x.at[z].set(rate[z]), found.multipliers + multipliers, is_sound)
 
 
 def _by_inertia(flat: Flat, t, q, v, feedback) -> SaddlePoint:
     """q̈ and λ where everything has inertia, or is held by constraints."""
-    M, inertial = inertia(flat, t, q, v)
+    M, inertial = inertia(flat, t, q, v), inertial_force(flat, t, q, v)
     _, G, gamma = velocity_rows(flat, t, q, v)
     c = -gamma if feedback is None else -gamma - feedback(flat, t, q, v)
     force = lambda multipliers: applied_force(flat, t, q, v, multipliers)
@@ -74,7 +78,7 @@ def _affine(columns, force):
 
 def other_multipliers(flat: Flat, t, q, v, multipliers) -> Float[Array, "o m"]:
     """Others than those known with which the forces that depend on λ agree, as far as a search finds some; NaN where it does not."""
-    M, inertial = inertia(flat, t, q, v)
+    M, inertial = inertia(flat, t, q, v), inertial_force(flat, t, q, v)
     _, G, gamma = velocity_rows(flat, t, q, v)
     _, reaction, unit = _by_force(flat, M, G, inertial, -gamma, lambda multipliers: applied_force(flat, t, q, v, multipliers))
     return others(reaction, multipliers, unit, jax.random.key(0))

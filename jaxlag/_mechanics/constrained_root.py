@@ -46,11 +46,12 @@ def root_of(residual: Callable, linear: Callable, search: Callable, args: tuple,
     residual, of_residual = jax.closure_convert(residual, args, like)
     linear, of_linear = jax.closure_convert(linear, args, like)
     fixed, within = jax.lax.stop_gradient((args, of_linear))
-    w, aux = search(lambda args, w: linear(args, w, *within), fixed)
+    step_at = lambda args, w, within: jax.tree.map(jnp.asarray, linear(args, w, *within))  # JAX may hand numbers on as NumPy's arrays
+    w, aux = search(lambda args, w: step_at(args, w, within), fixed)
     of_all = lambda everything, w: residual(everything[0], w, *everything[1])
 
     def change(everything, w, R):
-        step = linear(everything[0], w, *everything[2])
+        step = step_at(everything[0], w, everything[2])
         if not is_without_curvature(step.M, step.G):
             return step.change(R)
         return _refined(lambda dw: jax.jvp(lambda w: of_all(everything, w), (w,), (dw,))[1], step, R)

@@ -13,12 +13,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from .._model.flat import Flat
+from .._model.flat import Flat, read_once
 from .._program.implicit import undifferentiated
 from .._program.scalarise import scalarised
-from .._program.sparse_jacobian import sparsity_pattern
-from .friction_elements import FrictionElements
-from .lagrange import inertia, velocity_residual
+from .._program.sparsity import sparsity_pattern
+from .friction_elements import FrictionElements, find_elements
+from .lagrange import inertia, pattern_of_rows, velocity_residual
 from .saddle_point import FEW
 
 NOISE = 0.75  # power of eps, what is left of a row by rounding alone
@@ -37,7 +37,7 @@ def on_constraints(flat: Flat, elements: FrictionElements, t, q, v, left: Callab
 
     `left()` is what they leave, where there is a program of it already.
     """
-    if not 0 < flat.rows <= FEW or flat.massless or not _may_be_decided(flat, elements, t, q, v):
+    if not 0 < flat.rows <= FEW or flat.massless or not read_once(flat, _may_be_decided):
         return elements._replace(free=None, straight=np.array(False), driven=np.array(False))
     found = left() if left else left_by_constraints(flat, elements, t, q, v)
     return elements._replace(**found._asdict())
@@ -67,11 +67,13 @@ def extent_of(elements: FrictionElements, sigma: Float[Array, " r"], slip: Float
     return jnp.where(elements.norms(sigma) == 0, 0, extent)
 
 
-def _may_be_decided(flat: Flat, elements: FrictionElements, t, q, v) -> bool:
+def _may_be_decided(flat: Flat, t, q, v) -> bool:
     """Whether some slip moves nothing but what constraints move, too; nearly all slips of several components do."""
+    elements = find_elements(flat)
+    assert elements is not None  # asked where there are some
     if np.any(elements.is_vector):
         return True
-    held = np.any(sparsity_pattern(lambda v: velocity_residual(flat, t, q, v), v), axis=0)
+    held = np.any(read_once(flat, pattern_of_rows), axis=0)
     return bool(np.any(np.all(held | ~sparsity_pattern(lambda v: elements.slip(t, q, v), v), axis=1)))
 
 
@@ -83,7 +85,7 @@ def left_by_constraints(flat: Flat, elements: FrictionElements, t, q, v) -> Left
 
 def _left(flat: Flat, elements: FrictionElements, t, q, v) -> Left:
     """In the metric of the diagonal of M, which no unit of a coordinate changes."""
-    still, mass = jnp.zeros_like(v), jnp.diagonal(inertia(flat, t, q, v)[0].as_matrix())
+    still, mass = jnp.zeros_like(v), jnp.diagonal(inertia(flat, t, q, v).as_matrix())
     root = jnp.sqrt(jnp.where(mass > 0, mass, 1))
     rows = lambda function: (jax.jacfwd(function)(still) / root[None], function(still))
     basis, b = _orthonormal(*rows(lambda v: velocity_residual(flat, t, q, v)))

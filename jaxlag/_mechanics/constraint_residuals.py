@@ -19,7 +19,7 @@ ROUNDING = 4  # eps, by which a residual may differ from zero relative to the te
 
 
 class Residuals(NamedTuple):
-    """Those of g and ψ = (dg/dt, a), and the rows ∂g/∂q and ∂a/∂q̇."""
+    """Residuals g and ψ = (dg/dt, a), and the rows ∂g/∂q and ∂a/∂q̇."""
 
     g: Float[Array, " h"]
     psi: Float[Array, " m"]
@@ -48,7 +48,7 @@ def off_constraints(flat: Flat, t, q, v, reach: tuple[Array, Array] | None = Non
     """Largest residual of g and ψ relative to the terms of its row, for coordinates and velocities as large as they are, or
     in a motion as they `reach`.
     """
-    found, M = Residuals.of(flat, t, q, v), inertia(flat, t, q, v)[0]
+    found, M = Residuals.of(flat, t, q, v), inertia(flat, t, q, v)
     G = [rows for rows in (found.of_positions, found.of_velocities) if rows.shape[0]]
     of_q, of_v = (alike(M, G, size) for size in ((jnp.abs(q), jnp.abs(v)) if reach is None else reach))
     of_g = abs(found.of_positions) @ of_q + terms(flat, t, q)

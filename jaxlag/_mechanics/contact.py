@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from .._model.flat import Flat
+from .._model.flat import Flat, variant
 from .._program.scalarise import scalarised
 from .constrained_acceleration import constrained_acceleration
 from .constrained_slip import on_constraints
@@ -32,7 +32,12 @@ def in_contact(flat: Flat, closed: Bool[Array, " c"]) -> Flat:
     def holonomic(t, q):
         return jnp.concatenate([flat.bilateral(t, q), jnp.where(closed, flat.gaps(t, q), 0)])
 
-    return flat._replace(holonomic=holonomic, closed=closed) if flat.contacts else flat
+    return variant(flat, _in_some_contact, holonomic=holonomic, closed=closed) if flat.contacts else flat
+
+
+def _in_some_contact(flat: Flat, t, q, v) -> Flat:
+    """The system with contacts of which it is not known whether they are closed."""
+    return in_contact(flat, jnp.broadcast_to(t > 0, len(flat.contacts)))
 
 
 def free(flat: Flat) -> Flat:
@@ -46,7 +51,11 @@ def free(flat: Flat) -> Flat:
         return padded
 
     dissipations, forces = ({name: of_all(term) for name, term in of.items()} for of in (flat.dissipations, flat.forces))
-    return flat._replace(holonomic=flat.bilateral, closed=None, dissipations=dissipations, forces=forces)
+    return variant(flat, _free, holonomic=flat.bilateral, closed=None, dissipations=dissipations, forces=forces)
+
+
+def _free(flat: Flat, t, q, v) -> Flat:
+    return free(flat)
 
 
 def contact_rows(flat: Flat, multipliers: Float[Array, " m"]) -> Float[Array, " c"]:
@@ -70,7 +79,7 @@ def on_contact(flat: Flat, t, q, v, closed: Bool[Array, " c"]) -> Float[Array, "
 
     def put(t, q, v, closed):
         g, G = position_residual(in_contact(flat, closed), t, q)
-        return q + saddle_point(inertia(with_all_masses(flat, t, q, v), t, q, v)[0], G, jnp.zeros_like(q), -g, reach_of(q)).x
+        return q + saddle_point(inertia(with_all_masses(flat), t, q, v), G, jnp.zeros_like(q), -g, reach_of(q)).x
 
     return scalarised(put)(t, q, v, closed)
 
@@ -91,7 +100,7 @@ class GapScales(NamedTuple):
 
 
 def gap_scales(flat: Flat, t, q, v, of_positions: Float[Array, " n"], of_velocities: Float[Array, " n"]) -> GapScales:
-    """Those of these errors."""
+    """Gaps and rates that these errors amount to."""
     G = jnp.abs(jax.lax.stop_gradient(jax.jacfwd(flat.gaps, argnums=1)(t, q)))
     return GapScales(_times(G, of_positions), _times(G, of_velocities))
 
@@ -102,17 +111,20 @@ def roundings(x: Float[Array, " n"], own: Any) -> Float[Array, " n"]:
     return little * jnp.abs(jax.lax.stop_gradient(x)) + little**2 * own
 
 
-def roundings_beside(flat: Flat, t, q, v, x: Float[Array, " n"]) -> Float[Array, " n"]:
-    """Of each velocity, what counts as rounding where an impact gives the energy of some to others: that of the largest it could be.
-
-    Of x = v, and likewise of x = q.
+def roundings_beside(flat: Flat, t, q, v) -> tuple[Float[Array, " n"], Float[Array, " n"]]:
+    """Of each velocity, what counts as rounding where an impact gives the energy of some to others: that of the largest it could be; and
+    likewise of each coordinate, which come first.
     """
-    t, q, v, x = jax.lax.stop_gradient((t, q, v, x))
-    M = inertia(flat, t, q, v)[0]
+    t, q, v = jax.lax.stop_gradient((t, q, v))
+    M = inertia(flat, t, q, v)
     mass = jnp.diagonal(M.as_matrix())
-    largest = jnp.sqrt(jnp.maximum(x @ M.mv(x), 0) / jnp.where(mass > 0, mass, jnp.inf))
-    largest = jnp.maximum(jnp.abs(x), largest)
-    return roundings(largest, largest)
+
+    def of(x):
+        largest = jnp.sqrt(jnp.maximum(x @ M.mv(x), 0) / jnp.where(mass > 0, mass, jnp.inf))
+        largest = jnp.maximum(jnp.abs(x), largest)
+        return roundings(largest, largest)
+
+    return of(q), of(v)
 
 
 class Contacts(NamedTuple):
@@ -212,7 +224,7 @@ def _scales(flat, t, q, v):
     free = constrained_acceleration(flat, t, q, v).x
     G = jnp.abs(jax.jacfwd(flat.gaps, argnums=1)(t, q))
     drift = jnp.abs(gap_accelerations(flat, t, q, v, jnp.zeros_like(v)))
-    force, size = jnp.abs(inertia(flat, t, q, v)[0].mv(free)), jnp.sum(G**2, axis=1)
+    force, size = jnp.abs(inertia(flat, t, q, v).mv(free)), jnp.sum(G**2, axis=1)
     little = jnp.finfo(v.dtype).eps ** ROUNDING
     return little * _times(G, force) / jnp.where(size > 0, size, 1), little * (_times(G, jnp.abs(free)) + drift)
 
@@ -239,13 +251,13 @@ def in_current_mode(flat: Flat, t, q, v) -> Flat:
 
     Contacts that touch and neither open nor close, to rounding, are closed where they push.
     """
-    elements = find_elements(flat, t, q, v)
+    elements = find_elements(flat)
     if not flat.contacts:
         if elements is None:
             return flat
         sigma = first_mode(flat, elements, t, q, v)[0].sigma
         return in_mode(flat, on_constraints(flat, elements, t, q, v), sigma)
-    scales = gap_scales(flat, t, q, v, roundings_beside(flat, t, q, v, q), roundings_beside(flat, t, q, v, v))
+    scales = gap_scales(flat, t, q, v, *roundings_beside(flat, t, q, v))
     candidates = touching(flat, t, q, v, scales)
     if elements is None:
         return in_contact(flat, select_closed(flat, t, q, v, candidates).closed)

@@ -10,7 +10,7 @@ from jaxtyping import Array, Float
 from .._model.flat import Flat
 from .._program.scalarise import scalarised
 from .constrained_root import Linear, root_of
-from .lagrange import applied_force, inertia, velocity_residual
+from .lagrange import applied_force, inertial_force, velocity_residual
 from .saddle_point import Sound, is_determined, saddle_point
 
 ITERATIONS = 100  # of Newton's method; from rest, a few more than from a motion
@@ -21,7 +21,7 @@ LEAST = 0.125  # exponent of the least number (3e-39), at which velocity a D is 
 
 def smooth_force(flat: Flat, t, q, v):
     """∂L/∂q − … − ∂D/∂q̇ + Q: all but constraints."""
-    return inertia(flat, t, q, v)[1] + applied_force(flat, t, q, v, jnp.zeros(flat.rows, v.dtype))
+    return inertial_force(flat, t, q, v) + applied_force(flat, t, q, v, jnp.zeros(flat.rows, v.dtype))
 
 
 def by_newton(flat: Flat, z, rows, equations: Callable, t, q, v) -> tuple[Array, Array, Sound]:

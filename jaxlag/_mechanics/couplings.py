@@ -10,9 +10,9 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from .._model.flat import Flat, rows_by_name
-from .._program.array_dependence import dependence
 from .._program.expressions import TooLong
 from .._program.sparse_jacobian import MANY, few_colors
+from .._program.sparsity import dependence
 from .lagrange import inertia, velocity_residual
 
 NOT_READ = -1
@@ -38,7 +38,7 @@ def couplings(flat: Flat, t, q, v) -> dict[tuple[str, str], Coupling]:
 
 def uses_all_numbers(flat: Flat, t, q, v) -> Bool[Array, ""]:
     """Whether M is taken with all its numbers, where no structure of it is seen."""
-    return jnp.array(isinstance(inertia(flat, t, q, v)[0], lx.MatrixLinearOperator))
+    return jnp.array(isinstance(inertia(flat, t, q, v), lx.MatrixLinearOperator))
 
 
 def _functions(flat, t, q, v) -> Iterator[tuple[str, str, Callable, Float[Array, " n"], np.ndarray | None]]:

@@ -21,9 +21,9 @@ from .contact import in_contact, in_current_mode
 from .couplings import MATRICES, NOT_READ, couplings, uses_all_numbers
 from .friction_elements import light_coordinates, unread_friction
 from .lagrange import applied_force, constraint_rows, inertia, position_residual, velocity_residual
-from .massless import completed, with_masses
+from .massless import with_first_order_rates, with_masses
 from .pseudo_inverse import CLEAR, SEEN
-from .singular_directions import UNDEFINED, is_defined, not_affine_in, tangent_basis
+from .singular_directions import Failure, is_defined, not_affine_in, tangent_basis
 from .surfaces import surfaces
 
 
@@ -102,7 +102,7 @@ def examine(system: System, q: PyTree, qdot: PyTree, params: PyTree = None, *, t
     """
     found = jax.tree.map(np.asarray, at_state(_measure, system, q, qdot, params, t, states))
     if not is_defined(found):
-        raise ValueError(UNDEFINED)
+        raise ValueError(Failure.undefined.value)
     q = coordinates(q, "q")
     eps = float(jnp.finfo(found["M"].dtype).eps)
     G, M = found["G"], found["M"]
@@ -177,8 +177,8 @@ def _measure(flat: Flat, t, q, v):
     closed = mode.closed if flat.contacts else jnp.zeros(0, bool)
     flat = in_contact(flat, closed)
     _, G, _ = constraint_rows(flat, t, q, v)
-    light = light_coordinates(flat, t, q, v)
-    M = inertia(with_masses(flat, light, t, q, v) if light.size else flat, t, q, v)[0].as_matrix()
+    light = light_coordinates(flat)
+    M = inertia(with_masses(flat, light) if light.size else flat, t, q, v).as_matrix()
     units = unit_lengths(M, G)
     beside = jnp.linspace(-0.1, 0.1, q.size, dtype=q.dtype)
     around = jnp.stack([jnp.zeros_like(beside), beside, -beside[::-1]])
@@ -189,7 +189,7 @@ def _measure(flat: Flat, t, q, v):
 
     def rates(y):
         q, v = jnp.split(y, 2)
-        return jnp.concatenate([completed(mode, t, q, v).v, constrained_acceleration(mode, t, q, v).x])
+        return jnp.concatenate([with_first_order_rates(mode, t, q, v).v, constrained_acceleration(mode, t, q, v).x])
 
     speed = jnp.max(jnp.abs(v / units))  # in the metric of M
     size = 0.1 * jnp.where(speed > 0, speed, 1) * units
@@ -230,7 +230,7 @@ def _defects(mode, t, q, v):
     Of M q̈ − f − Gᵀλ and of G q̈ + γ: what is left, and with the largest term; zeros where inertia is missing, and where no q̈ satisfies
     all rows, as beside the constraints of a linkage with redundant ones.
     """
-    v = completed(mode, t, q, v).v
+    v = with_first_order_rates(mode, t, q, v).v
     qddot, multipliers, sound = scalarised(lambda t, q, v: constrained_acceleration(mode, t, q, v))(t, q, v)
     one, L, psi = jnp.ones_like(t), mode.lagrangian, lambda t, q, v: velocity_residual(mode, t, q, v)
     _, rate = jax.jvp(jax.grad(L, argnums=2), (t, q, v), (one, v, qddot))

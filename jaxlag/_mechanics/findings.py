@@ -39,6 +39,7 @@ def not_unique(multipliers, others):
 
 
 def without_inertia(names, M, G, units):
+    """A direction that has no inertia, and that nothing holds."""
     free = [names[i] for i in massless_coordinates(M, G, units)]
     if free:
         yield (
@@ -59,6 +60,7 @@ def nearly_without_inertia(names, M, G):
 
 
 def not_affine(names, where):
+    """Velocity constraints that are not affine in a velocity."""
     listed = ", ".join(repr(names[i]) for i in np.flatnonzero(where))
     if listed:
         yield f"a nonholonomic constraint is not affine in the velocity of {listed}: write its derivative, or a root of it"
@@ -81,6 +83,7 @@ def pushing(names, M, G, rows, units, system):
 
 
 def of_numbers(numbers, distances, defect, dtype):
+    """Numbers that are not what they should be: defects, redundant rows, a state off its constraints, energy that is added, stiffness."""
     if defect > float(jnp.finfo(dtype).eps) ** 0.5:
         yield (
             f"the accelerations miss Lagrange's equations, as JAX alone differentiates them, by {defect:.2g} of the largest term: "

@@ -6,7 +6,7 @@ from typing import Any
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from .._model.flat import Flat
+from .._model.flat import Flat, variant
 from .._model.numbers import count, number
 from .friction_elements import FrictionElements, find_elements
 
@@ -42,9 +42,9 @@ class StickSlip:
     def __post_init__(self):
         count(self.max_transitions, "`max_transitions`", least=0, cure="The default is 10_000.")
 
-    def elements(self, flat: Flat, t: Any, q: Float[Array, " n"], v: Float[Array, " n"]) -> FrictionElements | None:
+    def elements(self, flat: Flat) -> FrictionElements | None:
         """What sticks and slips."""
-        return find_elements(flat, t, q, v)
+        return find_elements(flat)
 
     def smoothed(self, flat: Flat, t: Any, q: Float[Array, " n"], v: Float[Array, " n"]) -> Flat:
         """The system itself: without elements that stick there is nothing to smooth."""
@@ -76,12 +76,12 @@ class Regularised:
         width = number(self.width, "`width`", positive=True, cure="Take some thousandths of the velocities that occur.")
         object.__setattr__(self, "width", float(width))
 
-    def elements(self, flat: Flat, t: Any, q: Float[Array, " n"], v: Float[Array, " n"]) -> None:
+    def elements(self, flat: Flat) -> None:
         """None: nothing sticks."""
 
     def smoothed(self, flat: Flat, t: Any, q: Float[Array, " n"], v: Float[Array, " n"]) -> Flat:
         """The system with smooth friction."""
-        elements = find_elements(flat, t, q, v)
+        elements = find_elements(flat)
         if elements is None:
             return flat
 
@@ -91,4 +91,4 @@ class Regularised:
         def smooth(D):
             return lambda t, q, v, multipliers: D(t, q, v, multipliers, extent(t, q, v))
 
-        return flat._replace(dissipations={name: smooth(D) for name, D in elements.potentials.items()})
+        return variant(flat, self.smoothed, dissipations={name: smooth(D) for name, D in elements.potentials.items()})

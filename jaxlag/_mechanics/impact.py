@@ -152,8 +152,8 @@ def check_impacts(flat: Flat, elements: FrictionElements | None, treatment: Stic
 
 def _in_fast_time(flat, elements, t, q, v, returned, given):
     """The system of an impact: x stands for a change of q, its acceleration from rest for q̇⁺."""
-    flat = inertial_part(with_all_masses(flat, t, q, v), t, q, v)
-    M = inertia(flat, t, q, v)[0]
+    flat = inertial_part(with_all_masses(flat), t, q, v)
+    M = inertia(flat, t, q, v)
     momentum = M.mv(v)
     if given is not None:
         momentum = momentum + jax.vjp(lambda v: gap_rates(flat, t, q, v), v)[1](given)[0]
@@ -168,6 +168,7 @@ def _in_fast_time(flat, elements, t, q, v, returned, given):
         dissipations={},
         forces={},
         massless=(),
+        stand_ins=(),
     )
     fast = fast._replace(holonomic=lambda s, x: jnp.concatenate([fast.bilateral(s, x), jnp.zeros_like(drift[1])]))
     if elements is None:

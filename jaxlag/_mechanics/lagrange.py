@@ -9,24 +9,61 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import lineax as lx
-from jaxtyping import Array, Float, PyTree
+import numpy as np
+from jaxtyping import Array, Bool, Float, PyTree
 
-from .._model.flat import Flat
+from .._model.flat import Flat, read_once
 from .._model.system import System
 from .._model.validation import at_state
-from .._program.sparse_jacobian import MANY, jacobian
+from .._program.sparse_jacobian import MAX_DENSE_COLUMNS, jacobian
 from .._program.sparse_matrix import SparseMatrix, dense
+from .._program.sparsity import MANY, sparsity_pattern
 from .structured_inertia import MOST_FULL, structured_inertia
 
 
-def inertia(flat: Flat, t, q, v) -> tuple[lx.AbstractLinearOperator, Float[Array, " n"]]:
-    """M and the force of the Lagrangian alone, ∂L/∂q − (∂²L/∂q̇∂q) q̇ − ∂²L/∂q̇∂t."""
-    momentum = jax.grad(flat.lagrangian, argnums=2)
-    M = structured_inertia(lambda v: flat.lagrangian(t, q, v), v) if v.size >= MANY else jacobian(lambda v: momentum(t, q, v), v)[1]
-    if flat.massless and MANY <= v.size <= MOST_FULL:  # it is not positive itself, but where constraints hold what has no mass
+def inertia(flat: Flat, t, q, v) -> lx.AbstractLinearOperator:
+    """M."""
+    M = _inertia(flat, lambda v: flat.lagrangian(t, q, v), v)
+    return _with_stand_ins(flat, M, t, q, v) if flat.stand_ins else M
+
+
+def _inertia(flat, kinetic, v):
+    if v.size < MANY:
+        return jacobian(jax.grad(kinetic), v, lambda: read_once(flat, _pattern_of_inertia, stated=True))[1]
+    M = structured_inertia(kinetic, v)
+    if flat.massless and v.size <= MOST_FULL:  # it is not positive itself, but where constraints hold what has no mass
         M = lx.MatrixLinearOperator(M.as_matrix())
-    _, carried = jax.jvp(lambda t, q: momentum(t, q, v), (t, q), (jnp.ones_like(t), v))
-    return M, jax.grad(flat.lagrangian, argnums=1)(t, q, v) - carried
+    return M
+
+
+def _pattern_of_inertia(flat: Flat, t, q, v) -> Bool[np.ndarray, "n n"]:
+    return sparsity_pattern(jax.grad(lambda v: flat.lagrangian(t, q, v)), v)
+
+
+def _with_stand_ins(flat, M, t, q, v):
+    """M with the mean of its other masses on the coordinates of `flat.stand_ins`."""
+    here = np.isin(np.arange(v.size), flat.stand_ins)
+    diagonal = M.diagonal if isinstance(M, lx.DiagonalLinearOperator) else jnp.diagonal(M.as_matrix())
+    mean = jax.lax.stop_gradient(jnp.sum(diagonal[~here]) / max(np.sum(~here), 1))
+    masses = jnp.where(here, jnp.where(mean > 0, mean, 1), 0)
+    if v.size >= MANY and not isinstance(M, lx.DiagonalLinearOperator):
+        return _inertia(flat, lambda v: flat.lagrangian(t, q, v) + jnp.sum(masses / 2 * v**2), v)
+    if isinstance(M, lx.DiagonalLinearOperator) or (v.size > MAX_DENSE_COLUMNS and _is_diagonal(flat)):
+        return lx.DiagonalLinearOperator(diagonal + masses)
+    return lx.MatrixLinearOperator(M.as_matrix() + jnp.diag(masses))
+
+
+def _is_diagonal(flat):
+    """Whether M has no other numbers, some of which may be zero."""
+    pattern = read_once(flat, _pattern_of_inertia, stated=True)
+    return not np.any(pattern & ~np.eye(len(pattern), dtype=bool))
+
+
+def inertial_force(flat: Flat, t, q, v) -> Float[Array, " n"]:
+    """The force of the Lagrangian alone, ∂L/∂q − (∂²L/∂q̇∂q) q̇ − ∂²L/∂q̇∂t."""
+    slopes = lambda t, q: jax.grad(flat.lagrangian, argnums=(1, 2))(t, q, v)
+    (force, _), (_, carried) = jax.jvp(slopes, (t, q), (jnp.ones_like(t), v))
+    return force - carried
 
 
 def applied_force(flat: Flat, t, q, v, multipliers) -> Float[Array, " n"]:
@@ -62,9 +99,14 @@ def velocity_residual(flat: Flat, t, q, v) -> Float[Array, " m"]:
 
 def velocity_rows(flat: Flat, t, q, v) -> tuple[Float[Array, " m"], Float[Array, "m n"] | SparseMatrix, Float[Array, " m"]]:
     """ψ, G and γ, such that dψ/dt = G q̈ + γ; G sparse where it is large."""
-    psi, G = jacobian(lambda v: velocity_residual(flat, t, q, v), v)
+    psi, G = jacobian(lambda v: velocity_residual(flat, t, q, v), v, lambda: read_once(flat, pattern_of_rows))
     _, gamma = jax.jvp(lambda t, q: velocity_residual(flat, t, q, v), (t, q), (jnp.ones_like(t), v))
     return psi, rows_of(G), gamma
+
+
+def pattern_of_rows(flat: Flat, t, q, v) -> Bool[np.ndarray, "m n"]:
+    """Which numbers of G may differ from zero."""
+    return sparsity_pattern(lambda v: velocity_residual(flat, t, q, v), v)
 
 
 def constraint_rows(flat: Flat, t, q, v) -> tuple[Float[Array, " m"], Float[Array, "m n"], Float[Array, " m"]]:
@@ -110,7 +152,7 @@ def mass_matrix(
 
 
 def _mass_matrix(flat, t, q, v):
-    return inertia(flat, t, q, v)[0].as_matrix()
+    return inertia(flat, t, q, v).as_matrix()
 
 
 def momentum(system: System, q: PyTree, qdot: PyTree, params: PyTree = None, *, t: Any = 0.0, states: PyTree = None) -> PyTree:

@@ -22,6 +22,7 @@ from jaxtyping import Array, Float
 
 from .._model.flat import Flat
 from .._program.implicit import undifferentiated
+from .._program.shifted_factors import inverse_lengths
 from .friction_elements import FrictionElements
 from .lagrange import applied_force, constraint_rows, inertia
 
@@ -59,7 +60,7 @@ def shared(mode: Flat, elements: FrictionElements, t, q, v, multipliers: Float[A
     if mode.closed is not None:
         contacts = mode.rows_of_bilateral + np.arange(mode.closed.size)
         pushes, holds = pushes.at[contacts].set(mode.closed), holds.at[contacts].set(mode.closed)
-    effect, mass = constraint_rows(mode, t, q, v)[1], jnp.diagonal(inertia(mode, t, q, v)[0].as_matrix())
+    effect, mass = constraint_rows(mode, t, q, v)[1], jnp.diagonal(inertia(mode, t, q, v).as_matrix())
     if mode.needs_multipliers:  # the friction of what slips included
         effect = effect + jax.jacfwd(lambda x: applied_force(mode, t, q, v, x))(multipliers).T
     effect = jnp.where(holds[:, None], effect, 0)  # what is open has no force, whatever its friction would do
@@ -95,7 +96,7 @@ def best_share(
 
 
 def _unit_rows(rows):
-    """Those of length 1, and their lengths, 1 for rows of zeros."""
+    """Rows of length 1, and the lengths they had, 1 for rows of zeros."""
     squared = jnp.sum(rows**2, axis=1)
     length = jnp.sqrt(jnp.where(squared > 0, squared, 1))
     return rows / length[:, None], length
@@ -145,7 +146,7 @@ def _without_effect(unit):
 def _solved(H, b):
     """H⁻¹b of a symmetric H, not negative but for rounding; zero where it has zeros."""
     size = jnp.diagonal(H)
-    D = jnp.where(size > 0, jax.lax.rsqrt(jnp.where(size > 0, size, 1)), 0)
+    D, _ = inverse_lengths(size, 0)
     ridge = 10 * len(b) * jnp.finfo(b.dtype).eps + (size <= 0)
     factor = jnp.linalg.cholesky(H * jnp.outer(D, D) + jnp.diag(ridge))
     return D * jax.scipy.linalg.cho_solve((factor, True), D * b)

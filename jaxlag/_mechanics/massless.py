@@ -15,12 +15,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from .._model.flat import Flat
-from .._program.sparse_jacobian import jacobian, sparsity_pattern, underdetermined
+from .._model.flat import Flat, read_once
+from .._program.sparse_jacobian import jacobian, underdetermined
+from .._program.sparsity import sparsity_pattern
 from .convex_dissipation import by_newton, smooth_force
-from .lagrange import constraint_rows, inertia, velocity_residual
+from .lagrange import applied_force, constraint_rows, inertia, inertial_force, pattern_of_rows, velocity_residual
 from .saddle_point import Sound, reach_of, saddle_point
-from .self_consistent import is_affine
 
 RECIPROCAL = (
     "`lagrangian` and `force` must not couple the velocities of coordinates without inertia among each other, but do. "
@@ -42,35 +42,84 @@ NO_CONTACT = (
 
 
 class FirstOrder(NamedTuple):
-    """Coordinates z whose velocities D decides, and which rows of ψ these are in: both seen in the programs."""
+    """Coordinates z whose velocities D decides; which rows of ψ these are in; and whether the forces on z are affine in ż: all seen in the
+    programs.
+    """
 
     coordinates: Int[np.ndarray, " k"]
     rows: Bool[np.ndarray, " m"]
+    is_affine: bool = True
 
 
-def first_order(flat: Flat, t, q, v) -> FirstOrder:
-    """Those of the massless coordinates that constraints alone cannot hold, and that D, or a constraint with it, gives a velocity."""
+def first_order(flat: Flat) -> FirstOrder:
+    """Massless coordinates that constraints alone cannot hold, and to which D, or a constraint with it, gives a velocity."""
     if not flat.massless:
         return FirstOrder(np.zeros(0, int), np.zeros(flat.rows, bool))
-    massless, in_rows = np.array(flat.massless), _rows_with(flat, t, q, v)
-    moved = lambda w: v.at[massless].set(w)
-    decay = lambda dw: jax.jvp(lambda w: smooth_force(flat, t, q, moved(w))[massless], (v[massless],), (dw,))[1]
-    resisted = np.any(sparsity_pattern(decay, v[massless]), axis=1)
+    return read_once(flat, _first_order)
+
+
+def _first_order(flat: Flat, t, q, v) -> FirstOrder:
+    massless = np.array(flat.massless)
+    in_rows = read_once(flat, pattern_of_rows)[:, massless]
+    of_lagrangian, of_applied = read_once(flat, _inertial_slopes, stated=True), _slopes(_applied, flat, t, q, v)
+    resisted = np.any(of_lagrangian.depends | of_applied.depends, axis=1)
     stated, of_contacts = _stated_rows(flat, t, q)
     decided = underdetermined(in_rows[stated]) & (resisted | np.any(in_rows[stated], axis=0))
     rows = np.any(in_rows[:, decided], axis=1)
     if np.any(rows[of_contacts]):
         raise ValueError(NO_CONTACT)
-    return FirstOrder(massless[decided], rows)
+    if np.any(decided):
+        if flat.needs_multipliers:
+            raise ValueError(NO_MULTIPLIERS)
+        coupled = of_lagrangian.depends | _slopes(_force, flat, t, q, v).depends
+        if np.any((coupled & ~np.eye(massless.size, dtype=bool))[np.ix_(decided, decided)]):
+            raise ValueError(RECIPROCAL)
+    bends = (of_lagrangian.bends | of_applied.bends)[np.ix_(decided, decided)]
+    return FirstOrder(massless[decided], rows, not np.any(bends))
 
 
-def plastic(sliding: Flat, slip: Callable, t, q, v) -> tuple[Int[np.ndarray, " k"], Int[np.ndarray, " k"]]:
-    """Rows of `slip`, and the coordinate of each: without inertia, and resisted by dry friction on this slip alone.
+class Slopes(NamedTuple):
+    """Of the slopes of forces on massless coordinates, by their velocities: which there are, and which change with these velocities."""
+
+    depends: Bool[np.ndarray, "k k"]
+    bends: Bool[np.ndarray, "k k"]
+
+
+def _slopes(force: Callable, flat: Flat, t, q, v) -> Slopes:
+    """Slopes of `force(flat, t, q, v)` along a direction of which nothing is known."""
+    massless = np.array(flat.massless)
+
+    def slope(at_and_along):
+        at, along = jnp.split(at_and_along, 2)
+        return jax.jvp(lambda w: force(flat, t, q, v.at[massless].set(w))[massless], (at,), (along,))[1]
+
+    bends, depends = np.split(sparsity_pattern(slope, jnp.concatenate([v[massless]] * 2)), 2, axis=1)
+    return Slopes(depends, bends)
+
+
+def _inertial_slopes(flat: Flat, t, q, v) -> Slopes:
+    return _slopes(inertial_force, flat, t, q, v)
+
+
+def _applied(flat: Flat, t, q, v) -> Float[Array, " n"]:
+    return applied_force(flat, t, q, v, jnp.zeros(flat.rows, v.dtype))
+
+
+def _force(flat: Flat, t, q, v) -> Float[Array, " n"]:
+    """Q alone."""
+    return sum((Q(t, q, v, jnp.zeros(flat.rows, v.dtype)) for Q in flat.forces.values()), start=jnp.zeros_like(v))
+
+
+def plastic(sliding: Flat, slip: Callable, t, q, v) -> tuple[Int[np.ndarray, " k"], Int[np.ndarray, " k"], Int[np.ndarray, " d"]]:
+    """Rows of `slip`, and the coordinate of each: without inertia, and resisted by dry friction on this slip alone; and the coordinates
+    whose velocities D decides while all slips.
 
     Refused where it is one of several slips or coordinates, a constraint acts on it, or the other forces on it depend on velocities.
     """
-    massless, in_rows = np.array(sliding.massless), _rows_with(sliding, t, q, v)
-    undecided = underdetermined(in_rows[_stated_rows(sliding, t, q)[0]]) & ~np.isin(massless, first_order(sliding, t, q, v).coordinates)
+    massless = np.array(sliding.massless)
+    in_rows = read_once(sliding, pattern_of_rows)[:, massless]
+    decided = _first_order(sliding, t, q, v).coordinates
+    undecided = underdetermined(in_rows[_stated_rows(sliding, t, q)[0]]) & ~np.isin(massless, decided)
     slips = sparsity_pattern(lambda dv: jax.jvp(lambda v: slip(t, q, v), (v,), (dv,))[1], v)[:, massless[undecided]]
     rows, columns = np.nonzero(slips)
     coordinates = massless[undecided][columns]
@@ -79,13 +128,7 @@ def plastic(sliding: Flat, slip: Callable, t, q, v) -> tuple[Int[np.ndarray, " k
         force = lambda dv: jax.jvp(lambda v: smooth_force(sliding, t, q, v)[coordinates], (v,), (dv,))[1]
         if not alone or np.any(in_rows[:, undecided]) or np.any(sparsity_pattern(force, v)):
             raise ValueError(SEVERAL)
-    return rows, coordinates
-
-
-def _rows_with(flat: Flat, t, q, v) -> Bool[np.ndarray, "m k"]:
-    """In which rows of ψ the velocities of massless coordinates are."""
-    massless = np.array(flat.massless)
-    return sparsity_pattern(lambda w: velocity_residual(flat, t, q, v.at[massless].set(w)), v[massless])
+    return rows, coordinates, decided
 
 
 def _stated_rows(flat: Flat, t, q) -> tuple[np.ndarray, slice]:
@@ -95,7 +138,7 @@ def _stated_rows(flat: Flat, t, q) -> tuple[np.ndarray, slice]:
     return np.r_[: contacts.start, holonomic : holonomic + beside], contacts
 
 
-class Completed(NamedTuple):
+class FirstOrderRates(NamedTuple):
     """q̇ with the velocities that D decides; λ of the rows that these are in; and whether both are sound."""
 
     v: Float[Array, " n"]
@@ -103,13 +146,12 @@ class Completed(NamedTuple):
     sound: Sound
 
 
-def completed(flat: Flat, t, q, v) -> Completed:
+def with_first_order_rates(flat: Flat, t, q, v) -> FirstOrderRates:
     """q̇ with the velocities that D decides, whatever they were before."""
-    z, rows = first_order(flat, t, q, v)
+    z, rows, is_affine = first_order(flat)
     multipliers, yes = jnp.zeros(rows.size, v.dtype), jnp.array(True)
     if not z.size:
-        return Completed(v, multipliers, Sound(yes, yes))
-    _check(flat, z, t, q, v)
+        return FirstOrderRates(v, multipliers, Sound(yes, yes))
     of = lambda v, w: v.at[z].set(w)
 
     def equations(t, q, v, w):
@@ -118,42 +160,24 @@ def completed(flat: Flat, t, q, v) -> Completed:
         psi, G = jacobian(lambda w: velocity_residual(flat, t, q, of(v, w))[rows], w)
         return slope, G.as_matrix(), -F, -psi
 
-    if is_affine(lambda w: smooth_force(flat, t, q, of(v, w))[z], v[z]):  # not even by a comparison, as that of unlike dampers is not
-        found = saddle_point(*equations(t, q, v, jnp.zeros(z.size, v.dtype)))
-        w, of_rows, sound = found
+    if is_affine:  # not even by a comparison, as that of unlike dampers is not
+        w, of_rows, sound = saddle_point(*equations(t, q, v, jnp.zeros(z.size, v.dtype)))
     else:
         w, of_rows, sound = by_newton(flat, z, rows, equations, t, q, v)
-    return Completed(of(v, w), multipliers.at[np.flatnonzero(rows)].set(of_rows), sound)
-
-
-def _check(flat: Flat, z, t, q, v) -> None:
-    if flat.needs_multipliers:
-        raise ValueError(NO_MULTIPLIERS)
-
-    def unsymmetric(dw):
-        def beside_dissipation(w):
-            moved = v.at[z].set(w)
-            Q = sum((Q(t, q, moved, jnp.zeros(flat.rows, v.dtype)) for Q in flat.forces.values()), start=jnp.zeros_like(v))
-            return (inertia(flat, t, q, moved)[1] + Q)[z]
-
-        return jax.jvp(beside_dissipation, (v[z],), (dw,))[1]
-
-    coupled = sparsity_pattern(unsymmetric, v[z])
-    if np.any(coupled & ~np.eye(z.size, dtype=bool)):
-        raise ValueError(RECIPROCAL)
+    return FirstOrderRates(of(v, w), multipliers.at[np.flatnonzero(rows)].set(of_rows), sound)
 
 
 def inertial_part(flat: Flat, t, q, v, reaction: Float[Array, " n"] | None = None) -> Flat:
     """The system of what has inertia: a mass, which nothing feels, stands in for each one that is missing, and the rows of ψ that ż is in
     are left out, with the forces of their λ as a `reaction`.
     """
-    z, rows = first_order(flat, t, q, v)
+    z, rows, _ = first_order(flat)
     if not z.size:
         return flat
     size = flat.holonomic(t, q).size
     without = lambda function, rows: lambda *given: jnp.where(rows, 0, function(*given))
     forces = flat.forces if reaction is None else flat.forces | {"": lambda *_: reaction}
-    return with_masses(flat, z, t, q, v)._replace(
+    return with_masses(flat, z)._replace(
         forces=forces,
         holonomic=without(flat.holonomic, rows[:size]),
         bilateral=without(flat.bilateral, rows[: flat.rows_of_bilateral]),
@@ -162,16 +186,12 @@ def inertial_part(flat: Flat, t, q, v, reaction: Float[Array, " n"] | None = Non
     )
 
 
-def with_masses(flat: Flat, coordinates, t, q, v) -> Flat:
-    """The system with masses, as large as those of the other coordinates on average, on `coordinates`."""
-    others = np.setdiff1d(np.arange(v.size), coordinates)
-    given = jnp.diagonal(inertia(flat, t, q, v)[0].as_matrix())[others]
-    mean = jax.lax.stop_gradient(jnp.sum(given) / max(others.size, 1))
-    mass = jnp.where(mean > 0, mean, 1)
-    return flat._replace(lagrangian=lambda t, q, v: flat.lagrangian(t, q, v) + mass / 2 * jnp.sum(v[coordinates] ** 2))
+def with_masses(flat: Flat, coordinates: Int[np.ndarray, " k"]) -> Flat:
+    """The system with masses, as large as those of the other coordinates on average, on `coordinates`: for M alone, nothing feels them."""
+    return flat._replace(stand_ins=tuple(sorted({*flat.stand_ins, *map(int, coordinates)})))
 
 
 def nearest_velocity(flat: Flat, t, q, v) -> Float[Array, " n"]:
     """q̇ on the constraints, nearest in the metric of M."""
     psi, G, _ = constraint_rows(flat, t, q, v)
-    return v + saddle_point(inertia(flat, t, q, v)[0], G, jnp.zeros_like(v), -psi, reach_of(v)).x
+    return v + saddle_point(inertia(flat, t, q, v), G, jnp.zeros_like(v), -psi, reach_of(v)).x

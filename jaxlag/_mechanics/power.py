@@ -12,7 +12,7 @@ from .._model.validation import at_state
 from .constrained_acceleration import constrained_acceleration
 from .contact import in_current_mode
 from .lagrange import velocity_rows
-from .massless import completed
+from .massless import with_first_order_rates
 
 
 def powers(
@@ -47,7 +47,7 @@ def _powers(flat, t, q, v):
 
 def powers_of(flat: Flat, t, q, v) -> dict[str, Float[Array, ""]]:
     """The powers over flat vectors."""
-    v = completed(flat, t, q, v).v
+    v = with_first_order_rates(flat, t, q, v).v
     _, multipliers, _ = constrained_acceleration(flat, t, q, v)
     _, G, _ = velocity_rows(flat, t, q, v)
     rates = G @ v

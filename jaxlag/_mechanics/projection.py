@@ -15,7 +15,7 @@ from .._program.scalarise import scalarised
 from .._program.sparse_jacobian import jacobian
 from .augmented_inertia import augmented
 from .lagrange import inertia, position_rows, velocity_residual, velocity_rows
-from .massless import completed, inertial_part
+from .massless import inertial_part, with_first_order_rates
 from .saddle_point import reach_of, saddle_point
 
 
@@ -55,7 +55,7 @@ class Projection:
     ) -> tuple[Float[Array, " n"], Float[Array, " n"]]:
         """The state on the constraints that is nearest to this one, which is near already; or has its positions `found` on them."""
         part = inertial_part(flat, t, q, v)
-        M = inertia(part, t, q, v)[0]  # at the start serves throughout: corrections are small
+        M = inertia(part, t, q, v)  # at the start serves throughout: corrections are small
 
         @scalarised
         def newton(t, q, M):
@@ -65,7 +65,7 @@ class Projection:
         @scalarised
         def on_velocities(t, q, v, M):
             psi, G, _ = velocity_rows(part, t, q, v)
-            return completed(flat, t, q, _corrected(v, saddle_point(M, G, jnp.zeros_like(v), -psi, reach_of(v)).x)).v
+            return with_first_order_rates(flat, t, q, _corrected(v, saddle_point(M, G, jnp.zeros_like(v), -psi, reach_of(v)).x)).v
 
         if (flat.holonomic_names or flat.yielding) and not found:
             metric = metric_of_positions(flat, M, t, q, v)

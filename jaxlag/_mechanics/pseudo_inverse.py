@@ -11,6 +11,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from .._program.conditions import everywhere
+from .._program.shifted_factors import inverse_lengths
 
 # Exponents of eps (1.3e-5, 1.6e-10, 1.8e-12, 1.3e-6 and 1.1e-2 in double precision) and a factor, with which ranks are judged
 CLEAR, SEEN, NOISE, FOLLOWS, FAR, FARTHER = 0.3125, 0.625, 0.75, 0.375, 0.125, 2
@@ -63,8 +64,7 @@ def inverse_of(S: Float[Array, "m m"], c: Float[Array, "m k"], singular: Callabl
     if m < 2:
         D = jnp.where(size > 0, 1 / jnp.where(size > 0, size, 1), 0)
         return Inverse(jnp.array(True), D, S, S), jnp.all((size > 0)[:, None] | (c == 0))
-    there = size > (4 * eps) ** 2 * jnp.max(size)  # what is less may be nothing but rounding, and is refused
-    D = jnp.where(there, jax.lax.rsqrt(jnp.where(there, size, 1)), 0)
+    D, there = inverse_lengths(size)  # what is less may be nothing but rounding, and is refused
     nearly_zero = jnp.abs(c) <= eps**FOLLOWS * jnp.max(jnp.abs(c), axis=0, keepdims=True)
     follows = jnp.all(there[:, None] | (nearly_zero & (size == 0)[:, None]))
     one, nothing = jnp.eye(m, dtype=S.dtype), jnp.zeros_like(S)

@@ -82,7 +82,7 @@ def _for_rows(M, G):
     if isinstance(M, lx.DiagonalLinearOperator):
         return M, G
     is_sparse = isinstance(M, StructuredInertia) and isinstance(G, SparseMatrix) and G.shape[0] > FEW and not M.sums
-    if is_sparse and block_saddle_point.whole(M.slopes.places, G.places) is not None:
+    if is_sparse and block_saddle_point.whole(M.slopes.pattern, G.pattern) is not None:
         return M.slopes, G
     return M, dense(G)
 
@@ -288,11 +288,4 @@ CONTRADICTION = (
     "`holonomic` and `nonholonomic` must not contradict each other, but no acceleration satisfies them all here, or two rows are too "
     "nearly the same to tell, or one is lost in the rounding of another. Look for constraints that say nearly the same, or multiply one by "
     "a number; put a state by hand on them by `consistent_state`."
-)
-NO_INERTIA = (
-    "`lagrangian` must give every direction inertia that no constraint holds, but the mass matrix is singular "
-    "(or not positive) on the null space of the constraints. Add the missing mass (a small one with a solver for stiff systems, "
-    "`solver=diffrax.Kvaerno5()`), a constraint that holds it, or a dissipation function of its velocity: a coordinate that is not in the "
-    "kinetic energy at all may move by that alone, where it resists at every velocity and constraints on it are stated once. Or leave the "
-    "coordinate out."
 )

@@ -14,7 +14,7 @@ from jaxtyping import Array, Float
 
 from .._program.conditions import repeated
 from .._program.implicit import implicit_root, open_function
-from .._program.sparse_jacobian import sparsity_pattern
+from .._program.sparsity import sparsity_pattern
 
 ITERATIONS = 60
 SHORTEST = 1e-9  # part of a step

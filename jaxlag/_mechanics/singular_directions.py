@@ -1,5 +1,6 @@
 """Directions for which a system cannot be solved, and how a failure names the coordinates concerned."""
 
+import enum
 from typing import Any
 
 import jax
@@ -17,32 +18,48 @@ from .augmented_inertia import unit_lengths, units_alike
 from .lagrange import constraint_rows, inertia
 from .massless import first_order, with_masses
 from .pseudo_inverse import CLEAR
-from .saddle_point import NO_INERTIA
 from .self_consistent import NOT_CONSISTENT
 
 LOOKS, BESIDE, FROM_REST = 7, 3, 12  # at a constraint, in so many decades relative to the velocities that there are, or that have inertia 1
-UNDEFINED = (
-    "the functions of the system must return finite numbers, but one returns a NaN or an infinity there. Look for what is undefined, such "
-    "as the root of a negative number or 0/0, for missing values, and for a motion that grows without bounds."
-)
-NOT_AFFINE = (
-    "`nonholonomic` must be affine in qdot, but one is not. Write it as a sum of velocities with coefficients that depend on t and q: its "
-    "derivative with respect to time, or a root of it."
-)
 
 
-def explained(reason: str, system: System, q: PyTree, qdot: PyTree, params: PyTree, t: Any, states: PyTree = None) -> str:
+class Failure(enum.Enum):
+    """Why a state cannot be moved on from, or is not found; a motion ends for a result of the same name."""
+
+    undefined = (
+        "the functions of the system must return finite numbers, but one returns a NaN or an infinity there. Look for what is undefined, "
+        "such as the root of a negative number or 0/0, for missing values, and for a motion that grows without bounds."
+    )
+    no_inertia = (
+        "`lagrangian` must give every direction inertia that no constraint holds, but the mass matrix is singular "
+        "(or not positive) on the null space of the constraints. Add the missing mass (a small one with a solver for stiff systems, "
+        "`solver=diffrax.Kvaerno5()`), a constraint that holds it, or a dissipation function of its velocity: a coordinate that is not in "
+        "the kinetic energy at all may move by that alone, where it resists at every velocity and constraints on it are stated once. Or "
+        "leave the coordinate out."
+    )
+    not_affine = (
+        "`nonholonomic` must be affine in qdot, but one is not. Write it as a sum of velocities with coefficients that depend on t and q: "
+        "its derivative with respect to time, or a root of it."
+    )
+    impossible_start = (
+        "`holonomic` and `nonholonomic` must be satisfied by some state near the start, but none was found. "
+        "Start nearer, fix fewer coordinates, or look for constraints that contradict each other, or of which one is lost in the rounding "
+        "of another."
+    )
+    no_multipliers = NOT_CONSISTENT
+
+
+def explained(failure: Failure, system: System, q: PyTree, qdot: PyTree, params: PyTree, t: Any, states: PyTree = None) -> str:
     """The reason, and the coordinates concerned, where there are any and the numbers are known; or that numbers are undefined."""
-    about = {NO_INERTIA: _without_inertia, NOT_AFFINE: _nonaffine, NOT_CONSISTENT: lambda found: []}.get(reason)
-    if about is None or not is_concrete(q, qdot, params, t):
-        return reason
+    if failure in (Failure.undefined, Failure.impossible_start) or not is_concrete(q, qdot, params, t):
+        return failure.value
     found = jax.tree.map(np.asarray, at_state(_matrices, system, q, qdot, params, t, states))
     if not is_defined(found):
-        return UNDEFINED
+        return Failure.undefined.value
+    says, concerned = CONCERNED.get(failure, ("", lambda found: []))
     names = entry_names(coordinates(q, "q"), "q")
-    listed = [repr(names[i]) for i in about(found)]
-    says = {NO_INERTIA: "Without inertia and unconstrained here: ", NOT_AFFINE: "It is not affine in the velocity of: "}
-    return f"{reason} {says[reason]}{', '.join(listed)}." if listed else reason
+    listed = [repr(names[i]) for i in concerned(found)]
+    return f"{failure.value} {says}: {', '.join(listed)}." if listed else failure.value
 
 
 def tangent_basis(G: np.ndarray, eps: float, least: float | None = None) -> np.ndarray:
@@ -84,7 +101,7 @@ def is_defined(found: dict) -> bool:
 
 
 def _without_inertia(found):
-    """Those that nothing decides; where that is none, D does not resist at this velocity, and all are named."""
+    """Coordinates that nothing decides; where that is none, D does not resist at this velocity, and all are named."""
     G = found["G"]
     return massless_coordinates(found["with_masses"], G, found["units_with_masses"]) or massless_coordinates(found["M"], G, found["units"])
 
@@ -93,9 +110,15 @@ def _nonaffine(found):
     return np.flatnonzero(found["not_affine_in"])
 
 
+CONCERNED = {
+    Failure.no_inertia: ("Without inertia and unconstrained here", _without_inertia),
+    Failure.not_affine: ("It is not affine in the velocity of", _nonaffine),
+}
+
+
 def _matrices(flat: Flat, t, q, v):
-    decided, G = first_order(flat, t, q, v).coordinates, constraint_rows(flat, t, q, v)[1]
-    M, with_all = (inertia(of, t, q, v)[0].as_matrix() for of in (flat, with_masses(flat, decided, t, q, v) if decided.size else flat))
+    decided, G = first_order(flat).coordinates, constraint_rows(flat, t, q, v)[1]
+    M, with_all = (inertia(of, t, q, v).as_matrix() for of in (flat, with_masses(flat, decided) if decided.size else flat))
     return {
         "M": M,
         "with_masses": with_all,
@@ -116,7 +139,7 @@ def not_affine_in(flat: Flat, t, q, v) -> Bool[Array, " n"]:
     t, q, v = jax.lax.stop_gradient((t, q, v))
     if flat.nonholonomic(t, q, v).size == 0 or not used_arguments(slope, t, q, v)[2]:
         return jnp.zeros(v.size, bool)
-    units = units_alike(inertia(flat, t, q, v)[0], [slope(t, q, v)])
+    units = units_alike(inertia(flat, t, q, v), [slope(t, q, v)])
     fastest = jnp.max(jnp.abs(v) / jnp.where(units > 0, units, jnp.inf))
     sizes = jnp.where(fastest > 0, fastest, 1) * 10.0 ** (jnp.where(fastest > 0, BESIDE, FROM_REST) * np.linspace(-1, 1, LOOKS))
     units = jnp.where(units > 0, units, 1)

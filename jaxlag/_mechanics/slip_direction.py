@@ -75,7 +75,7 @@ def friction_and_direction(
     slope = slope * line[None, :]
     unbound = (turns & (found.bound == 0))[of]
     turned = jnp.where(unbound, unit(elements, w), _turned(elements, sigma, w, slope, turns & (found.bound != 0)))
-    begun = lambda: _begun(elements, w, slope, freed & ~found.driven & ~elements.follows, found.bound, breaks)
+    begun = lambda: _begun(elements, w, slope, freed & ~found.driven & ~elements.is_quasistatic, found.bound, breaks)
     begun = jax.lax.cond(begin, begun, lambda: jnp.zeros_like(sigma))
     return found, jnp.where((freed & anew)[of], begun, turned), jnp.any(turns)
 

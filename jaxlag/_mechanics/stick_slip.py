@@ -15,14 +15,14 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from .._model.flat import Flat
+from .._model.flat import Flat, variant
 from .._program.implicit import undifferentiated
 from .._program.scalarise import scalarised
-from .constrained_acceleration import constrained_acceleration
+from .constrained_acceleration import constrained_motion
 from .constrained_slip import directed, extent_of, freely, on_constraints
-from .friction_elements import FrictionElements
+from .friction_elements import FrictionElements, find_elements
 from .load_sharing import may_share, shared
-from .massless import completed, nearest_velocity, smooth_force
+from .massless import nearest_velocity, smooth_force
 from .slip_direction import friction_and_direction, turning, unit
 
 
@@ -39,11 +39,18 @@ def in_mode(flat: Flat, elements: FrictionElements, sigma: Float[Array, " r"]) -
         return jnp.concatenate([flat.nonholonomic(t, q, v), jnp.where(stuck, held_slip(t, q, v), otherwise)])
 
     held = {name: flat.rows + rows for name, rows in elements.own_rows.items()}
-    mode = flat._replace(dissipations={name: slipping(D) for name, D in elements.potentials.items()}, held=held)
+    mode = variant(flat, _in_some_mode, dissipations={name: slipping(D) for name, D in elements.potentials.items()}, held=held)
     if not np.any(elements.massless >= 0):
         return mode._replace(nonholonomic=lambda t, q, v: with_rows(t, q, v, 0))
     yielding, rates = _yielding(mode, elements, stuck)
     return mode._replace(nonholonomic=lambda t, q, v: with_rows(t, q, v, rates(t, q, v)), yielding=yielding)
+
+
+def _in_some_mode(flat: Flat, t, q, v) -> Flat:
+    """The system in a mode of which nothing is known."""
+    elements = find_elements(flat)
+    assert elements is not None  # or there would be no mode
+    return in_mode(flat, elements, jnp.broadcast_to(t, elements.element_of_row.size))
 
 
 def _yielding(mode: Flat, elements: FrictionElements, stuck: Bool[Array, " r"]) -> tuple[Callable, Callable]:
@@ -96,13 +103,14 @@ def friction(flat: Flat, elements: FrictionElements, sigma, t, q, v, feedback=No
 def _friction(flat, elements, sigma, t, q, v, feedback):
     stuck, of = sticking(elements, sigma), elements.element_of_row
     mode = in_mode(flat, elements, sigma)
-    qddot, multipliers, _ = constrained_acceleration(mode, t, q, v, feedback)
-    v = completed(mode, t, q, v).v
+    v, (qddot, multipliers, _) = constrained_motion(mode, t, q, v, feedback)
     slip, slip_rate = jax.jvp(elements.slip, (t, q, v), (jnp.ones_like(t), v, qddot))
-    if np.any(elements.follows):  # what has no inertia slips at once
+    if np.any(elements.is_quasistatic):  # what has no inertia slips at once
         there = v if mode.yielding is None else nearest_velocity(mode, t, q, v)
         at_once = elements.slip(t, q, there)
-        moves = elements.follows & (elements.norms(at_once) > slip_of(elements, t, q, there, 1e2 * jnp.finfo(v.dtype).eps * jnp.abs(there)))
+        moves = elements.is_quasistatic & (
+            elements.norms(at_once) > slip_of(elements, t, q, there, 1e2 * jnp.finfo(v.dtype).eps * jnp.abs(there))
+        )
         slip_rate = jnp.where(moves[of], at_once, slip_rate)
     pull = jax.vjp(lambda slip: extent_of(elements, sigma, slip), slip)[1]
     bound_of = lambda multipliers: bounds(elements, sigma, t, q, v, multipliers)
@@ -216,7 +224,7 @@ def select_mode(
             contacts,
             Mode(
                 jnp.where(anew, resting, jnp.where(within | (stage == LOOSE), sigma, mode.sigma)),
-                jnp.where(stage == HOLD, released & ~idle & ~elements.follows & (rate <= 1e-6 * search.free_rate), mode.held),
+                jnp.where(stage == HOLD, released & ~idle & ~elements.is_quasistatic & (rate <= 1e-6 * search.free_rate), mode.held),
                 jnp.where(within, agrees & ~anew, mode.consistent),
                 jnp.where(within, found.bound, mode.bound),
             ),
@@ -259,11 +267,11 @@ def first_mode(
     """The initial mode: what moves slips along its motion; what rests sticks or breaks away. And the contacts chosen with it."""
     slip = jax.lax.stop_gradient(elements.slip(t, q, v))
     size = elements.norms(slip)
-    at_rest = elements.follows | (size <= slip_of(elements, t, q, v, 1e2 * jnp.finfo(v.dtype).eps * jnp.abs(v)))
+    at_rest = elements.is_quasistatic | (size <= slip_of(elements, t, q, v, 1e2 * jnp.finfo(v.dtype).eps * jnp.abs(v)))
     sigma = slip / jnp.where(at_rest, 1, size)[elements.element_of_row]
     friction_in = friction_in or _in_modes(flat, elements, t, q, v)
     mode, contacts = select_mode(flat, elements, t, q, v, sigma, at_rest, jnp.zeros_like(at_rest), contacts, friction_in)
-    begin = at_rest & ~sticking(elements, mode.sigma) & ~mode.held & ~elements.follows
+    begin = at_rest & ~sticking(elements, mode.sigma) & ~mode.held & ~elements.is_quasistatic
     return mode._replace(sigma=turning(elements, lambda sigma: friction_in(sigma, contacts).slip_rate, mode.sigma, begin)), contacts
 
 

@@ -13,7 +13,7 @@ import lineax as lx
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from .._program.places_in_line import Line, line
+from .._program.chain_ordering import ChainOrdering, chain_ordering
 from .._program.recursive_elimination import Factors, by_factor, by_root, factor
 from .._program.running_sums import RunningSum, lifted
 from .._program.sparse_jacobian import jacobian
@@ -29,9 +29,9 @@ class StructuredInertia(lx.AbstractLinearOperator):
     sums: tuple[RunningSum, ...] = eqx.field(static=True)
 
     @property
-    def line(self) -> Line:
+    def ordering(self) -> ChainOrdering:
         """The order of its elimination."""
-        found = line(self.slopes.places, self.sums)
+        found = chain_ordering(self.slopes.pattern, self.sums)
         assert found is not None  # or it would be a full matrix
         return found
 
@@ -77,17 +77,17 @@ def _is_symmetric(M: StructuredInertia) -> bool:
 def structured_inertia(lagrangian: Callable, v: Float[Array, " n"]) -> lx.AbstractLinearOperator:
     """∂²L/∂q̇² of many coordinates; diagonal, or with all its numbers, where that is what it is."""
     found = lifted(lagrangian, v)
-    if found is not None and line(found.slopes.places, found.sums) is not None:
+    if found is not None and chain_ordering(found.slopes.pattern, found.sums) is not None:
         return StructuredInertia(found.slopes, found.sums)
     _, M = jacobian(jax.grad(lagrangian), v)
     if not isinstance(M, SparseMatrix):
         return M
-    return StructuredInertia(M, ()) if line(M.places, ()) is not None else lx.MatrixLinearOperator(M.as_matrix())
+    return StructuredInertia(M, ()) if chain_ordering(M.pattern, ()) is not None else lx.MatrixLinearOperator(M.as_matrix())
 
 
 def factorised(M: StructuredInertia) -> Factors:
     """The articulated inertias."""
-    return factor(M.line, M.slopes.values)
+    return factor(M.ordering, M.slopes.values)
 
 
 def is_positive(M: StructuredInertia, factors: Factors) -> Bool[Array, ""]:
@@ -97,10 +97,10 @@ def is_positive(M: StructuredInertia, factors: Factors) -> Bool[Array, ""]:
 
 def by_inertia(M: StructuredInertia, factors: Factors) -> Callable:
     """B ↦ M⁻¹B; its derivative is one more such solve, never that of the factors."""
-    solve = lambda _, B: by_factor(M.line, factors, B)
+    solve = lambda _, B: by_factor(M.ordering, factors, B)
     return lambda B: jax.lax.custom_linear_solve(M.mv, B, solve, symmetric=True) if B.shape[1] else B
 
 
 def root_of_inverse(M: StructuredInertia, factors: Factors) -> Callable:
     """B ↦ R⁻ᵀB where M = Rᵀ R."""
-    return lambda B: by_root(M.line, factors, B).reshape(M.line.at.size, B.shape[1])
+    return lambda B: by_root(M.ordering, factors, B).reshape(M.ordering.at.size, B.shape[1])

@@ -27,7 +27,7 @@ class Surface(NamedTuple):
 
 
 def surfaces(system: System, q: PyTree, qdot: PyTree, params: PyTree, t: Any, states: Any) -> list[Surface]:
-    """Those of all functions, whose programs are read at this state; `states`: those that are given."""
+    """Surfaces of all functions, whose programs are read at this state; `states`: those that are given."""
     values = start_values(system, states, t, q, qdot, params)
     (at, v), t = (ravel_pytree(tree)[0] for tree in (q, qdot)), jnp.asarray(t, jax.tree.leaves(q)[0].dtype)
     numbers, rest = eqx.partition(params, eqx.is_inexact_array_like)

@@ -1,6 +1,5 @@
 """The system over flat vectors: what the mechanics works on."""
 
-import weakref
 from collections.abc import Callable, Mapping
 from functools import partial
 from typing import Any, NamedTuple
@@ -15,6 +14,7 @@ from .._program.sparse_jacobian import empty_rows
 from .contact import PoissonRestitution
 from .event import Every, merged
 from .injection import asks_for, call, described, needs
+from .reading import Source, StatesAt
 from .signal import at_time, origin_of
 from .state_values import of_first_order, sampled, shaped_like
 from .states import flowing, values_at
@@ -49,24 +49,40 @@ class Flat(NamedTuple):
     rows: int  # of G, those of the user's constraints
     rows_of_bilateral: int  # of those, the first, of `holonomic` alone
     massless: tuple[int, ...]  # coordinates of which M has rows of zeros, as L is written
+    source: Source  # what it was bound from
     closed: Bool[Array, " c"] | None = None  # those of the contacts, where it was chosen
     held: dict[str, np.ndarray] = {}  # noqa: RUF012 - rows of G beyond those, with which a dissipation term sticks
     yielding: Callable[..., Float[Array, " p"]] | None = None  # h(t, q) = 0 of what slips without inertia
-
-
-class StatesAt(NamedTuple):
-    """The further states by name, and the time and the state at which they have these values."""
-
-    values: Mapping[str, PyTree]
-    t: Any
-    q: Float[Array, " n"]
-    v: Float[Array, " n"]
+    stand_ins: tuple[int, ...] = ()  # coordinates of which M has a mass, as large as those of others, that nothing feels
 
 
 def bind(system: System, like: PyTree, params: PyTree, states: StatesAt | None = None) -> Flat:
     """The system over flat vectors, for coordinates structured `like` these, which need be shapes only."""
-    bound = _Bound(system, like, params, {} if states is None else states.values)
-    if states is not None and states.values:
+    source = Source.of(system, like, params, states)
+    return _flat(source, source.read(_coordinates_without_inertia, _flat))
+
+
+def read_once(flat: Flat, question: Callable[[Flat, Any, Any, Any], Any], stated: bool = False) -> Any:
+    """What `question(flat, t, q, v)` sees in the programs of a system, whatever its numbers: asked once for each system and form of its
+    arguments, and for each `variant`; or for the system as it was `stated`, where none matters.
+    """
+    return (flat.source._replace(variants=()) if stated else flat.source).read(question, bound_from)
+
+
+def bound_from(source: Source) -> Flat:
+    """The system as it was bound, before it was varied."""
+    return bind(source.system, source.like, source.params, source.states)
+
+
+def variant(flat: Flat, of: Callable[[Flat, Any, Any, Any], Flat], **changes: Any) -> Flat:
+    """The system with some changes, as `of(flat, t, q, v)` makes them where numbers are unknown."""
+    return flat._replace(source=flat.source.with_variant(of), **changes)
+
+
+def _flat(source: Source, massless: tuple[int, ...] = ()) -> Flat:
+    system, states = source.system, source.states
+    bound = _Bound(system, source.like, source.params, {} if states is None else states.values)
+    if states is not None:
         bound.let_flow(*states[1:])
     return Flat(
         lagrangian=bound.lagrangian,
@@ -93,37 +109,15 @@ def bind(system: System, like: PyTree, params: PyTree, states: StatesAt | None =
         terms=system.terms,
         rows=bound.rows,
         rows_of_bilateral=bound.rows_of_bilateral,
-        massless=_massless(system, like, params, {} if states is None else states.values),
+        massless=massless,
+        source=source,
     )
 
 
-def _massless(system: System, *given: PyTree) -> tuple[int, ...]:
-    """Coordinates of which M has rows of zeros, whatever the numbers: read once for each structure of q, params and states."""
-    leaves, structure = jax.tree.flatten(given)
-    shapes = tuple(jax.ShapeDtypeStruct(x.shape, x.dtype) if hasattr(x, "dtype") else x for x in leaves)
-    known = _MASSLESS.setdefault(system, {})
-    if (structure, shapes) not in known:
-        known[structure, shapes] = _read_massless(system, structure, shapes)
-    return known[structure, shapes]
-
-
-_MASSLESS: weakref.WeakKeyDictionary[System, dict] = weakref.WeakKeyDictionary()
-
-
-def _read_massless(system: System, structure: Any, leaves: tuple) -> tuple[int, ...]:
-    """From the program of L."""
-    found, is_number = [], [isinstance(leaf, jax.ShapeDtypeStruct) for leaf in leaves]
-
-    def read(numbers):
-        given = iter(numbers)
-        filled = [next(given) if of_number else leaf for leaf, of_number in zip(leaves, is_number, strict=True)]
-        like, params, states = jax.tree.unflatten(structure, filled)
-        bound, q = _Bound(system, like, params, states), ravel_pytree(like)[0]  # of no known numbers
-        momentum = lambda v: jax.grad(bound.lagrangian, argnums=2)(q[0], q, v)
-        found.extend(empty_rows(lambda dv: jax.jvp(momentum, (q,), (dv,))[1], q))
-
-    jax.eval_shape(read, [leaf for leaf, of_number in zip(leaves, is_number, strict=True) if of_number])
-    return tuple(int(i) for i in found)
+def _coordinates_without_inertia(flat: Flat, t: Any, q: Any, v: Any) -> tuple[int, ...]:
+    """Coordinates of which M has rows of zeros."""
+    momentum = lambda v: jax.grad(flat.lagrangian, argnums=2)(t, q, v)
+    return tuple(int(i) for i in empty_rows(lambda dv: jax.jvp(momentum, (v,), (dv,))[1], v))
 
 
 class _Bound:

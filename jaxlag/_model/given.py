@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Array, Float, PyTree
 
 from .._program.jit import is_concrete
+from .._program.registry import Table
 
 Trees = tuple[PyTree, PyTree, PyTree]  # q, qdot, params
 
@@ -49,8 +50,7 @@ def _one_by_one(numbers):
     return [number.reshape(()) for number in jax.lax.split(numbers, [1] * len(numbers))] if len(numbers) else []
 
 
-MOST = 1000  # structures that are remembered
-_CHECKED: dict[Any, tuple[Any, tuple[bool, ...]]] = {}
+_CHECKED = Table()  # the structures that passed the checks
 
 
 def known(as_given: Trees) -> Given | None:
@@ -66,6 +66,4 @@ def remember(as_given: Trees, checked: Given) -> None:
     leaves, structure = jax.tree.flatten(as_given)
     kinds = tuple(map(type, leaves))
     if checked.structure == structure and not checked.others and {*kinds} <= {float, int, np.float64}:
-        if len(_CHECKED) >= MOST:
-            _CHECKED.clear()
         _CHECKED[structure, *kinds, checked.dtype] = (structure, checked.is_number)

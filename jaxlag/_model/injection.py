@@ -55,7 +55,7 @@ def check_function(function: Any, label: str) -> None:
 def _differentiated(function: Any) -> list[str]:
     """Variables that a function closes over and `jax.grad` or `jax.jvp` is differentiating: no program would see their derivatives."""
     cells = zip(getattr(getattr(function, "__code__", None), "co_freevars", ()), getattr(function, "__closure__", None) or (), strict=False)
-    traced = lambda x: isinstance(x, jax.core.Tracer) and hasattr(x, "tangent")
+    traced = lambda x: isinstance(x, jax.core.Tracer) and hasattr(x, "tangent")  # an attribute of JAX's: without it nothing is refused
     return [name for name, cell in cells if _is_filled(cell) and any(map(traced, jax.tree.leaves(cell.cell_contents)))]
 
 

@@ -148,14 +148,14 @@ class CalledElsewhere(Exception):
     """A function asks for a signal at another time than now, as one that delays it does."""
 
 
-def is_broken(node: Any) -> bool:
+def is_nonsmooth(node: Any) -> bool:
     """Whether a node of a pytree is a signal that jumps or bends at its samples."""
-    return is_signal(node) and node.interpolation.is_broken
+    return is_signal(node) and node.interpolation.is_nonsmooth
 
 
-def broken_signals(params: PyTree) -> list[Signal]:
+def nonsmooth_signals(params: PyTree) -> list[Signal]:
     """Those in `params`, in order."""
-    return [leaf for leaf in jax.tree.leaves(params, is_leaf=is_signal) if is_broken(leaf)]
+    return [leaf for leaf in jax.tree.leaves(params, is_leaf=is_signal) if is_nonsmooth(leaf)]
 
 
 class SinceOrigin(eqx.Module):

@@ -13,7 +13,7 @@ class AbstractInterpolation(eqx.Module):
     """How the values between two samples follow from the samples."""
 
     jumps: ClassVar[bool] = False  # at the samples
-    is_broken: ClassVar[bool] = False  # there: it jumps or bends
+    is_nonsmooth: ClassVar[bool] = False  # there: it jumps or bends
     needs_second_derivatives: ClassVar[bool] = False
 
     @abc.abstractmethod
@@ -39,7 +39,7 @@ class ZeroOrderHold(AbstractInterpolation):
     """
 
     jumps: ClassVar[bool] = True
-    is_broken: ClassVar[bool] = True
+    is_nonsmooth: ClassVar[bool] = True
 
     def evaluate(self, signal: Any, ts: Float[Array, " T"], t: Float[Array, "*n"], i: Any) -> Float[Array, "..."]:
         """The value of the latest sample; before the first sample, that of the first."""
@@ -62,7 +62,7 @@ class Linear(AbstractInterpolation):
     ```
     """
 
-    is_broken: ClassVar[bool] = True
+    is_nonsmooth: ClassVar[bool] = True
 
     def evaluate(self, signal: Any, ts: Float[Array, " T"], t: Float[Array, "*n"], i: Any) -> Float[Array, "..."]:
         """The chord between two samples; the end value outside of them."""

@@ -8,7 +8,6 @@ import os
 import sys
 import traceback
 import warnings
-import weakref
 from collections.abc import Callable, Iterator
 from types import CodeType, TracebackType
 from typing import Any
@@ -19,6 +18,7 @@ import jaxlib
 import numpy as np
 
 from .._program.kept_programs import CompiledAgain
+from .._program.registry import Table
 
 LIBRARIES = tuple(os.path.dirname(os.path.abspath(str(module.__file__))) + os.sep for module in (jax, jaxlib, eqx, np, contextlib))
 HERE = os.path.dirname(os.path.dirname(os.path.abspath(__file__))) + os.sep  # the package
@@ -77,8 +77,8 @@ def _line_of(trace: TracebackType | None) -> str:
 
 RECREATIONS = 3  # of one function body in systems of one kind, from which on it counts as recreated in a loop
 
-_seen: weakref.WeakSet = weakref.WeakSet()
-_creations: weakref.WeakKeyDictionary[CodeType, dict[str, int]] = weakref.WeakKeyDictionary()
+_seen = Table(weak=True)  # functions
+_creations = Table(weak=True)  # of each function body, by the kind of its system
 
 
 def warn_of_recreated_functions(functions: list[tuple[str, Callable]], shapes: Any) -> None:
@@ -95,7 +95,7 @@ def warn_of_recreated_functions(functions: list[tuple[str, Callable]], shapes: A
     for code, made in by_code.items():
         is_new = not any(function in _seen for _, function in made)
         for _, function in made:
-            _seen.add(function)
+            _seen[function] = True
         counts = _creations.setdefault(code, {})
         counts[kind] = counts.get(kind, 0) + is_new
         if is_new and counts[kind] == RECREATIONS:

@@ -4,9 +4,9 @@ import jax
 import numpy as np
 
 from .._mechanics.friction_elements import unread_friction
-from .._mechanics.singular_directions import explained
+from .._mechanics.singular_directions import Failure, explained
 from .._program.jit import values
-from .results import OF_THE_INPUT, OF_THE_STEPS, has_failed, reason_of
+from .results import OF_THE_INPUT, OF_THE_STEPS, first_failure, has_failed, reason_of
 from .trajectory import Trajectory
 
 
@@ -17,13 +17,13 @@ def raise_failure(trajectory: Trajectory, start: tuple | None = None) -> None:
     """
     if not has_failed(trajectory.result):
         return
-    reason = reason_of(trajectory.result)
-    if reason in map(reason_of, OF_THE_INPUT):
-        if start is None:
+    name, reason = first_failure(trajectory.result), reason_of(trajectory.result)
+    if name in OF_THE_INPUT:
+        if start is None or name not in Failure.__members__:
             raise ValueError(reason)
         q0, qdot0, states = start
         of = trajectory.provenance
-        raise ValueError(explained(reason, of.system, q0, qdot0, of.params, trajectory.ts[0], states))
+        raise ValueError(explained(Failure[name], of.system, q0, qdot0, of.params, trajectory.ts[0], states))
     known = values(trajectory.q)  # also of what is differentiated
     samples, coordinate = trajectory.ts.shape[-1], np.asarray(jax.tree.leaves(trajectory.q if known is None else known)[0])
     reached = np.isfinite(coordinate.reshape(-1, samples, coordinate.size // trajectory.ts.size)[..., 0]).sum(1).min()
@@ -34,7 +34,7 @@ def raise_failure(trajectory: Trajectory, start: tuple | None = None) -> None:
     last = np.ravel(jax.lax.stop_gradient(trajectory.ts))[-1]
     raise RuntimeError(
         f"the motion must reach t = {last:g}, but stopped at t = {np.min(trajectory.stats['reached']):g} "
-        f"after {reached} of {samples} samples: {reason} {numerics if reason in map(reason_of, OF_THE_STEPS) else ''}".rstrip()
+        f"after {reached} of {samples} samples: {reason} {numerics if name in OF_THE_STEPS else ''}".rstrip()
     )
 
 

@@ -16,14 +16,14 @@ from .._mechanics.constrained_slip import Left, left_by_constraints, on_constrai
 from .._mechanics.contact import free, in_contact
 from .._mechanics.friction_elements import FrictionElements, light_coordinates
 from .._mechanics.impact import check_impacts
-from .._mechanics.massless import completed, first_order
+from .._mechanics.massless import first_order, with_first_order_rates
 from .._mechanics.power import energy_exchange, listed_powers
 from .._mechanics.projection import Projection
 from .._mechanics.saddle_point import SaddlePoint
 from .._mechanics.stick_slip import Friction, friction, in_mode, redirected, slip_of, sticking
 from .._mechanics.surfaces import bends_by_position
 from .._model.flat import Flat, StatesAt, bind
-from .._model.signal import at_time, broken_signals
+from .._model.signal import at_time, nonsmooth_signals
 from .._model.state_values import NOTHING, Layout, of_first_order, period, ravelled, sampled
 from .._model.system import System
 from .._program.jit import jitted
@@ -60,20 +60,20 @@ class EquationsOfMotion:
         """Looks for dry friction at the start, in shapes alone."""
         z, u = (Layout.of({name: at.values[name] for name in of}) for of in (of_first_order(system), sampled(system)))
         alone = cls(system, Layout.of(q0), formulation, states=z, sampled=u, contacts=len(system.unilateral), events=len(system.events))
-        if broken_signals(params):
+        if nonsmooth_signals(params):
             of_all = lambda flat: (values_of(flat, *at[1:]), at_events(system, flat, *at[1:]))
             elsewhere = called_elsewhere(lambda params: of_all(bind(system, q0, params, at)), params)
             warn_of_delays(params, elsewhere)
             numbers, rest = eqx.partition(params, lambda leaf: isinstance(leaf, (jax.Array, np.ndarray)))
             used = used_arguments(lambda part: alone.flat_at(eqx.combine(part, rest), at).bilateral(*at[1:3]), numbers)[0]
-            driving = (k for k, signal in enumerate(broken_signals(used)) if any(jax.tree.leaves(signal)))
+            driving = (k for k, signal in enumerate(nonsmooth_signals(used)) if any(jax.tree.leaves(signal)))
             alone = dataclasses.replace(alone, elsewhere=elsewhere, driving=frozenset(driving))
-        light = light_coordinates(alone.flat_at(params, at), *at[1:])
+        light = light_coordinates(alone.flat_at(params, at))
         sees = sees_time(lambda params: values_of(alone.flat_at(params, at), *at[1:]), system, params)
         alone = dataclasses.replace(alone, light=tuple(map(int, light)), sees_time=sees)
         if any(callable(event.when) for _, event in system.events):
             alone = dataclasses.replace(alone, sided=bends_by_position(system, alone.flat_at(params, at), *at[1:]))
-        elements = formulation.friction.elements(alone.flat_at(params, at), *at[1:])
+        elements = formulation.friction.elements(alone.flat_at(params, at))
         if system.unilateral:
             check_impacts(alone.flat_at(params, at), elements, formulation.friction)
         return alone if elements is None else dataclasses.replace(alone, rows=elements.element_of_row.size, elements=elements.size)
@@ -95,7 +95,7 @@ class EquationsOfMotion:
         flat = in_contact(self.flat_at(args.params, self.states_of(t, parts)), parts.closed > 0.5)
         if not self.rows:
             return flat, None
-        elements = self.formulation.friction.elements(flat, t, parts.q, parts.v)
+        elements = self.formulation.friction.elements(flat)
         assert elements is not None  # rows were counted from them
         if args.scales is not None and np.any(elements.is_vector):
             slow = slip_of(elements, t, parts.q, parts.v, args.scales.slow)
@@ -115,7 +115,7 @@ class EquationsOfMotion:
         if not self.light:
             return parts
         _, mode, _ = self.mode(t, parts, args)
-        return parts._replace(v=completed(mode, t, parts.q, parts.v).v)
+        return parts._replace(v=with_first_order_rates(mode, t, parts.q, parts.v).v)
 
     @property
     def modes(self) -> int:
@@ -240,7 +240,7 @@ def _rates(equations: EquationsOfMotion, t, y, args):
     of = lambda is_free: lambda: equations.accelerated(t, parts, args, is_free).x
     qddot = equations.where_closed(parts, of(False), of(True))
     if equations.light:  # what follows from the rest has no rate of its own
-        qddot = qddot.at[first_order(mode, t, q, v).coordinates].set(0)
+        qddot = qddot.at[first_order(mode).coordinates].set(0)
     rates = ravelled(flat.state_rates(t, q, v), y.dtype)
     powers = listed_powers(mode, t, q, v) if equations.works else works
     stuck = parts.time_stuck if elements is None else jnp.maximum(sticking(elements, sigma).astype(y.dtype), held)

@@ -12,12 +12,12 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, PyTree
 
 from .._mechanics.consistent_state import Consistent, has_inertia, nearest_state
-from .._mechanics.contact import outside
+from .._mechanics.contact import free, outside
 from .._mechanics.friction_treatment import Regularised, StickSlip
 from .._mechanics.projection import Baumgarte, NoStabilisation, Projection
 from .._model.flat import Flat, StatesAt
 from .._model.numbers import count
-from .._model.signal import broken_signals, moves_smoothly
+from .._model.signal import moves_smoothly, nonsmooth_signals
 from .._program.single_kernel import in_one_kernel
 from .events import begun
 from .first_order import EquationsOfMotion
@@ -124,7 +124,7 @@ def _nearest(equations: EquationsOfMotion, flat: Flat, at: StatesAt, params, sea
     """The start on the constraints; where it is that itself, only whether inertia is missing remains to be reported."""
     _, t0, q, v = at
     if search != "nothing":
-        flat = flat._replace(holonomic=flat.bilateral)
+        flat = free(flat)
         return nearest_state(flat, t0, outside(flat, t0, q, v), v, found=search == "derivative")
     yes = jnp.array(True)
     if equations.elements:  # what sticks would hold directions, too
@@ -220,7 +220,7 @@ def _wrapped(options, equations, projected, adjoint, start):
 def has_nodes(equations: FirstOrderSystem, params: PyTree) -> bool:
     """Whether steps end where an input jumps or bends, or a state is updated."""
     return isinstance(equations, EquationsOfMotion) and bool(
-        equations.contacts or equations.events or equations.sampled.size or broken_signals(params)
+        equations.contacts or equations.events or equations.sampled.size or nonsmooth_signals(params)
     )
 
 

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 from equinox.internal import while_loop
 
-from .._model.signal import broken_signals
+from .._model.signal import nonsmooth_signals
 from .._program.whole_kernel import in_whole_kernel
 from .event_record import has_stopped, most
 from .interval_inputs import Inputs, Record, Recorded, packed
@@ -26,7 +26,7 @@ def integrated(
     params, args = args.params, args._replace(params=None)
     start = jax.lax.stop_gradient(ts[0])
     periods = equations.periods(params)
-    following = tuple(Record.of(signal).following(start, periods).astype(int) for signal in broken_signals(params))
+    following = tuple(Record.of(signal).following(start, periods).astype(int) for signal in nonsmooth_signals(params))
     following = (*following, *[jnp.array(1)] * len(periods))  # the first updates are in y0
     moving = _moving(equations, params, directions, reverse)
     recorded = Recorded.of(equations.elsewhere, params, tuple(of_params for of_params, _ in directions))
@@ -69,8 +69,8 @@ def integrated(
 
 def _moving(equations, params, directions, reverse) -> tuple[bool, ...]:
     """Which jumps, of signals and then of sampled states, move with what is varied."""
-    varied = [[jax.tree.leaves((s.ts, s.delay)) for s in broken_signals(of_params)] for of_params, _ in directions]
-    jumps = [signal.interpolation.jumps for signal in broken_signals(params)]
+    varied = [[jax.tree.leaves((s.ts, s.delay)) for s in nonsmooth_signals(of_params)] for of_params, _ in directions]
+    jumps = [signal.interpolation.jumps for signal in nonsmooth_signals(params)]
     of_signals = [jumps[k] and (reverse or any(of_order[k] for of_order in varied)) for k in range(len(jumps))]
     shifted = any(of_origin is not None for _, of_origin in directions)
     return (*of_signals, *((reverse or shifted or (varies and bool(directions))) for varies in equations.varying_periods))

@@ -14,7 +14,7 @@ from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from .._model.flat import Flat
 from .._model.injection import needs
-from .._model.signal import CalledElsewhere, Piece, Signal, SinceOrigin, broken_signals, is_broken, is_signal
+from .._model.signal import CalledElsewhere, Piece, Signal, SinceOrigin, is_nonsmooth, is_signal, nonsmooth_signals
 from .._model.signal_interpolation import AbstractInterpolation
 from .._model.system import System
 from .._program.walker import used_arguments
@@ -101,7 +101,7 @@ class Inputs:
             if isinstance(node, Place):
                 ts, values, interpolation = columns[node.number]
                 self.records.append(Record(ts, values, node.delay, interpolation))
-            elif is_broken(node):
+            elif is_nonsmooth(node):
                 self.records.append(Record.of(node))
 
     @property
@@ -124,7 +124,7 @@ def _replaced(params: PyTree, kept: frozenset[int], new: Callable, skipped: Call
     count = iter(range(10**9))
 
     def of(node):
-        if not (isinstance(node, Place) or is_broken(node)):
+        if not (isinstance(node, Place) or is_nonsmooth(node)):
             return node
         k = next(count)
         if k in kept:
@@ -145,8 +145,10 @@ class Recorded(NamedTuple):
     @classmethod
     def of(cls, elsewhere: frozenset[int], params: PyTree, directions: tuple) -> "Recorded":
         """Those of params, but for signals whose samples vary along directions."""
-        signals = broken_signals(params)
-        varying = {k for of_order in directions for k, s in enumerate(broken_signals(of_order)) if s.ts is not None or s.values is not None}
+        signals = nonsmooth_signals(params)
+        varying = {
+            k for of_order in directions for k, s in enumerate(nonsmooth_signals(of_order)) if s.ts is not None or s.values is not None
+        }
         kept = frozenset(elsewhere | varying)
         place = lambda k, node: Place(k, node.delay)
         recorded = {k: signal for k, signal in enumerate(signals) if k not in kept}
@@ -190,7 +192,7 @@ def sees_time(values: Callable, system: System, params: PyTree) -> bool:
 
 def warn_of_delays(params: PyTree, elsewhere: frozenset[int]) -> None:
     """Of jumps at times that are not known, which steps go over and derivatives leave out."""
-    if any(signal.interpolation.jumps for k, signal in enumerate(broken_signals(params)) if k in elsewhere):
+    if any(signal.interpolation.jumps for k, signal in enumerate(nonsmooth_signals(params)) if k in elsewhere):
         warnings.warn(
             "a zero-order hold must be asked for the present time, u(t), for steps to end where it jumps, but a function asks for another "
             "time: its derivative by that time counts as zero. Delay it by `Signal(..., delay=...)`.",

@@ -46,8 +46,8 @@ def after_jump(equations: EquationsOfMotion, t, y0, y, before: Arguments, args: 
     slip = elements.slip(t, q, v)
     size = elements.norms(slip)
     direction = slip / jnp.where(size > 0, size, 1)[elements.element_of_row]
-    at_rest = elements.follows | (size <= slip_of(elements, t, q, v, args.scales.of_velocities(v)))
-    breaking = elements.follows & ~sticking(elements, parts.sigma)
+    at_rest = elements.is_quasistatic | (size <= slip_of(elements, t, q, v, args.scales.of_velocities(v)))
+    breaking = elements.is_quasistatic & ~sticking(elements, parts.sigma)
     mode, _ = select_mode(flat, elements, t, q, v, direction, at_rest, breaking)
     y = in_other_mode(elements, moved._replace(sigma=parts.sigma), mode).y
     return equations.in_new_mode(t, y, args), mode.consistent

@@ -12,8 +12,9 @@ from .._mechanics.augmented_inertia import units_alike
 from .._mechanics.lagrange import applied_force, inertia, position_rows, velocity_rows
 from .._model.flat import Flat
 from .._program.size_of_terms import size_of_terms
-from .._program.sparse_jacobian import MANY, sparsity_pattern
+from .._program.sparse_jacobian import MANY
 from .._program.sparse_matrix import SparseMatrix
+from .._program.sparsity import sparsity_pattern
 from .batch import BatchedEquations
 from .first_order import EquationsOfMotion
 from .protocol import Arguments, AugmentedSystem, undifferentiated
@@ -41,7 +42,7 @@ def _loads(equations: Any, t, y, args: Arguments) -> dict[str, Any] | None:
         return None
     parts = equations.parts(y)
     flat, elements = equations.contents(t, parts, args)
-    M = inertia(flat, t, parts.q, parts.v)[0]
+    M = inertia(flat, t, parts.q, parts.v)
     units = units_alike(M, [])
     if not isinstance(M, lx.DiagonalLinearOperator) and equations.size >= MANY and elements is None:
         return {"units": units}
@@ -51,7 +52,7 @@ def _loads(equations: Any, t, y, args: Arguments) -> dict[str, Any] | None:
     held, given, driven = rate(jnp.where(jnp.isfinite(terms), terms, 0)), None, None
     if equations.system.constraints:
         G = velocity_rows(flat, t, parts.q, parts.v)[1]
-        G = SparseMatrix(jnp.abs(G.values), G.places) if isinstance(G, SparseMatrix) else jnp.abs(G)
+        G = SparseMatrix(jnp.abs(G.values), G.pattern) if isinstance(G, SparseMatrix) else jnp.abs(G)
         held = held + rate(G.T @ jnp.abs(equations.accelerated(t, parts, args, False).multipliers[: flat.rows]))
         if equations.projection is not None:
             given = _prescribed(flat, t, parts.q, may_move=not equations.works)  # works are integrals along what moves
@@ -69,7 +70,7 @@ def _prescribed(flat: Flat, t, q, may_move: bool) -> Bool[Array, " n"]:
     """Which coordinates a constraint on them alone gives as a function of the time, so that nothing of them is integrated; or holds."""
     G = position_rows(flat, t, q)[1]
     if isinstance(G, SparseMatrix):
-        rows, columns = np.asarray(G.places.rows), np.asarray(G.places.columns)
+        rows, columns = np.asarray(G.pattern.rows), np.asarray(G.pattern.columns)
     else:
         rows, columns = np.nonzero(sparsity_pattern(lambda q: flat.holonomic(t, q), q)) if q.size < MANY else np.zeros((2, 0), int)
     alone = np.bincount(rows, minlength=1)[rows] == 1

@@ -197,7 +197,7 @@ def behind_contact(equations: EquationsOfMotion, t, parts: Parts, args: Argument
     """
     flat, _, elements = equations.mode(t, parts, args)
     closed, q, before = parts.closed > 0.5, parts.q, parts.v
-    scales = gap_scales(flat, t, q, before, errors[0], roundings_beside(flat, t, q, before, before))
+    scales = gap_scales(flat, t, q, before, errors[0], roundings_beside(flat, t, q, before)[1])
     near = closed | of_contact | (jax.lax.stop_gradient(flat.gaps(t, q)) <= scales.gap)
     opening = of_contact & closed
     hits = near & ~opening & (gap_rates(flat, t, q, before) < -scales.rate)
@@ -229,8 +229,8 @@ def behind_contact(equations: EquationsOfMotion, t, parts: Parts, args: Argument
         slip = elements.slip(t, q, found.v)
         size = elements.norms(slip)[elements.element_of_row]
         anew = is_impact | anew | jnp.any(of_contact & ~closed)
-        at_rest = jnp.where(anew, slow | elements.follows, stuck | of_friction | (slow & ~elements.driven))
-        breaking = jnp.where(anew, elements.follows & ~stuck, of_friction & stuck)  # at its bound: the forces tell where it goes on
+        at_rest = jnp.where(anew, slow | elements.is_quasistatic, stuck | of_friction | (slow & ~elements.driven))
+        breaking = jnp.where(anew, elements.is_quasistatic & ~stuck, of_friction & stuck)  # at its bound: the forces tell where it goes on
         along = jnp.where(anew, slip / jnp.where(size > 0, size, 1), parts.sigma)
         among, there = Contacts.of(flat, t, q, found.v, resting, loose), parts.without(errors[1])
         mode, contacts = select_mode(flat, elements, t, q, there.v, along, at_rest, breaking, among, in_other(equations, t, there, args))
@@ -286,7 +286,7 @@ def started(equations: EquationsOfMotion, at: StatesAt, params) -> Start:
     flat, elements = equations.contents(t, parts, args)
     yes = jnp.array(True)
     if equations.contacts:
-        errors = tuple(roundings_beside(flat, t, parts.q, parts.v, x) for x in (parts.q, parts.v))
+        errors = roundings_beside(flat, t, parts.q, parts.v)
         inside = gap_scales(flat, t, parts.q, parts.v, jnp.finfo(parts.q.dtype).eps ** (0.5 - ROUNDING) * errors[0], parts.v).gap
         is_outside = jnp.all(flat.gaps(t, parts.q) >= -inside)
         of_contact = flat.gaps(t, parts.q) <= 0

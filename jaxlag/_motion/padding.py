@@ -12,6 +12,7 @@ from .._model.given import Given
 from .._model.signal import Signal, is_signal
 from .._model.validation import sample_times
 from .._program.jit import is_called_by_python, is_concrete
+from .._program.registry import Table
 from .trajectory import Trajectory, of_samples
 
 EXACT = 16  # lengths up to here are left: they are those of examples
@@ -46,7 +47,7 @@ class Kept(NamedTuple):
     length: int
 
 
-_KEPT: dict[int, Kept] = {}
+_KEPT = Table()
 
 
 def _keep(ts, padded, length):

@@ -9,10 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from .._mechanics.consistent_state import IMPOSSIBLE
-from .._mechanics.saddle_point import NO_INERTIA
-from .._mechanics.self_consistent import NOT_CONSISTENT
-from .._mechanics.singular_directions import NOT_AFFINE, UNDEFINED
+from .._mechanics.singular_directions import Failure
 
 
 class RESULTS(dfx.RESULTS):  # pyright: ignore
@@ -21,10 +18,10 @@ class RESULTS(dfx.RESULTS):  # pyright: ignore
     not_finite = "`q0`, `qdot0`, `ts` and `params` must be finite, but there is a NaN or an infinity among them. Look for missing values."
     unordered = "`ts` must increase, but a time is smaller than the one before it. Sort the times, and what was measured along with them."
     no_period = "`every` must be positive, but the period of a sampled state is not. Look at what it is computed from."
-    no_inertia = NO_INERTIA
-    impossible_start = IMPOSSIBLE
-    not_affine = NOT_AFFINE
-    undefined = UNDEFINED
+    no_inertia = Failure.no_inertia.value
+    impossible_start = Failure.impossible_start.value
+    not_affine = Failure.not_affine.value
+    undefined = Failure.undefined.value
     contradictory = (
         "the constraints are not satisfied there: they contradict each other, nearly repeat each other, or demand more than the mechanism "
         "can reach. Check them with `examine`, and check what drives them."
@@ -42,7 +39,7 @@ class RESULTS(dfx.RESULTS):  # pyright: ignore
         "no mode of sliding and sticking is consistent with the friction forces it causes, or more than one is (Painlevé's paradox). "
         "Lower the coefficient of friction, or give the contact its compliance."
     )
-    no_multipliers = NOT_CONSISTENT
+    no_multipliers = Failure.no_multipliers.value
     inside_obstacle = (
         "`q0` must lie outside of all obstacles, but a gap of `unilateral` is negative there. Start outside, or on the contact, g = 0."
     )
@@ -87,18 +84,18 @@ def numbered(number: Any) -> dfx.RESULTS:
     return eqx.tree_at(lambda r: r._value, successful, number.astype(successful._value.dtype))
 
 
-OF_THE_INPUT = (
-    RESULTS.not_finite,
-    RESULTS.unordered,
-    RESULTS.no_period,
-    RESULTS.no_inertia,
-    RESULTS.impossible_start,
-    RESULTS.not_affine,
-    RESULTS.negative_bound,
-    RESULTS.inside_obstacle,
-    RESULTS.not_impulsive,
+OF_THE_INPUT = (  # names of results
+    "not_finite",
+    "unordered",
+    "no_period",
+    "no_inertia",
+    "impossible_start",
+    "not_affine",
+    "negative_bound",
+    "inside_obstacle",
+    "not_impulsive",
 )
-OF_THE_STEPS = (RESULTS.max_steps_reached, RESULTS.dt_min_reached)  # which other numerical settings may cure
+OF_THE_STEPS = ("max_steps_reached", "dt_min_reached")  # which other numerical settings may cure
 
 
 def has_failed(result: Any) -> bool:
@@ -113,12 +110,14 @@ def _successful() -> int:
 
 
 def reason_of(result: Any) -> str:
-    """The sentence of a result; in a batch, that of the first failure, failures of the input before all others, which they may cause."""
-    successful: Any = RESULTS.successful
-    named = lambda value: RESULTS[eqx.tree_at(lambda r: r._value, successful, jnp.asarray(value))]  # type: ignore[misc]
-    reasons = [named(value) for value in dict.fromkeys(np.ravel(result._value)[np.ravel(result != successful)].tolist())]
-    of_input = [reason for reason in reasons if reason in [RESULTS[given] for given in OF_THE_INPUT]]  # type: ignore[misc]
-    return [*of_input, *reasons, RESULTS[successful]][0]  # type: ignore[misc]
+    """The sentence of a result; in a batch, that of `first_failure`."""
+    return RESULTS[RESULTS._name_to_item[first_failure(result)]]  # type: ignore[attr-defined,misc]
+
+
+def first_failure(result: Any) -> str:
+    """The name of a result; in a batch, that of the first failure, failures of the input before all others, which they may cause."""
+    failures = [name for name in np.ravel(names_of(result)).tolist() if name != "successful"]
+    return next((name for name in failures if name in OF_THE_INPUT), [*failures, "successful"][0])
 
 
 def names_of(result: Any) -> np.ndarray:

@@ -115,10 +115,11 @@ def tolerances_of(rtol, atol, q: PyTree) -> tuple[Array | np.ndarray, Array | np
     if atol is None:
         return rtol, None
     cure = "Leave it out, and each coordinate is compared with its own scale."
-    given, like = (jax.tree.flatten(tree) for tree in (atol, q))
-    if jax.tree_util.treedef_is_leaf(given[1]) and np.ndim(atol) == 0:
+    given, like = jax.tree.leaves(atol), jax.tree.leaves(q)
+    if jax.tree_util.treedef_is_leaf(jax.tree.structure(atol)) and np.ndim(atol) == 0:
         return rtol, number(atol, "`atol`", dtype, positive=True, cure=cure)
-    if not (str(given[1]) == str(like[1]) and all(np.shape(x) in ((), np.shape(y)) for x, y in zip(given[0], like[0], strict=True))):
+    is_alike = jax.tree.structure(atol) == jax.tree.structure(q)  # type: ignore[operator]
+    if not (is_alike and all(np.shape(x) in ((), np.shape(y)) for x, y in zip(given, like, strict=True))):
         raise ValueError(f"`atol` must be a number, or one for each coordinate in a pytree like `q0`, but is {atol!r}. {cure}")
     each = jax.tree.map(lambda x, like: jnp.broadcast_to(numbers(x, "`atol`", dtype), np.shape(like)), atol, q)
     each = ravel_pytree(each)[0]

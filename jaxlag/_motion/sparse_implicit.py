@@ -28,8 +28,8 @@ from .._mechanics.lagrange import imbalance
 from .._program.conditions import repeated
 from .._program.jit import jitted
 from .._program.sparse_jacobian import MANY
-from .._program.sparse_matrix import Places
-from .._program.sparse_newton import NewtonFactors, by_factors, factors_along, linear_solution, newton_places
+from .._program.sparse_matrix import SparsityPattern
+from .._program.sparse_newton import NewtonFactors, by_factors, factors_along, linear_solution, newton_pattern
 from .batch import BatchedEquations
 from .first_order import EquationsOfMotion
 from .protocol import Arguments, AugmentedSystem, FirstOrderSystem
@@ -67,7 +67,7 @@ class SparseImplicit(dfx.AbstractImplicitSolver, dfx.AbstractAdaptiveSolver):
 
     scheme: type[dfx.AbstractESDIRK] = eqx.field(static=True)
     equations: Any = eqx.field(static=True)
-    places: Places = eqx.field(static=True)  # of Newton's matrix
+    pattern: SparsityPattern = eqx.field(static=True)  # of Newton's matrix
     root_finder: Any  # diffrax's, with its tolerances
     root_find_max_steps: int
     term_structure = dfx.AbstractTerm
@@ -80,14 +80,14 @@ class SparseImplicit(dfx.AbstractImplicitSolver, dfx.AbstractAdaptiveSolver):
         return self.scheme().order(terms)
 
     def init(self, terms, t0, t1, y0, args):
-        n = self.places.last
-        return terms.vf(t0, y0, args), jnp.zeros((self.places.shape[0] - n, *y0.shape[1:]), y0.dtype)
+        n = self.pattern.last
+        return terms.vf(t0, y0, args), jnp.zeros((self.pattern.shape[0] - n, *y0.shape[1:]), y0.dtype)
 
     def func(self, terms, t0, y0, args):
         return terms.vf(t0, y0, args)
 
     def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
-        tableau, h, n = self.scheme.tableau, t1 - t0, self.places.last
+        tableau, h, n = self.scheme.tableau, t1 - t0, self.pattern.last
         gamma_h = float(tableau.a_diagonal[-1]) * h
         first, multipliers = solver_state
         if made_jump is not False:
@@ -103,7 +103,7 @@ class SparseImplicit(dfx.AbstractImplicitSolver, dfx.AbstractAdaptiveSolver):
         at_start = jnp.concatenate([y0[:n] - gamma_h * y0[n : 2 * n], y0[n : 2 * n] - gamma_h * first[n : 2 * n], y0[2 * n :]])
         u0 = jnp.concatenate([first[n : 2 * n], multipliers])
         _, push = jax.linearize(lambda u: residual(u, t0, at_start), u0)
-        factors = factors_along(push, self.places, u0)
+        factors = factors_along(push, self.pattern, u0)
 
         def stage(carry, row):
             f, multipliers, solved = carry
@@ -128,11 +128,11 @@ class SparseImplicit(dfx.AbstractImplicitSolver, dfx.AbstractAdaptiveSolver):
 
     def _root(self, residual: Callable, guess, base, state: Callable, factors: NewtonFactors):
         """Where the residual is zero, with the derivative of what that says; and whether it was found."""
-        finder, n = self.root_finder, self.places.last
+        finder, n = self.root_finder, self.pattern.last
 
         def iterated(residual, guess):
             def changed(iteration):
-                u = iteration.u - by_factors(self.places, factors, residual(iteration.u))
+                u = iteration.u - by_factors(self.pattern, factors, residual(iteration.u))
                 of_both = (state(u, base) - state(iteration.u, base))[: 2 * n]
                 scale = (finder.atol + finder.rtol * jnp.abs(state(u, base)))[: 2 * n]
                 return Iteration(u, finder.norm(of_both / scale), iteration.size, iteration.count + 1)
@@ -142,7 +142,7 @@ class SparseImplicit(dfx.AbstractImplicitSolver, dfx.AbstractAdaptiveSolver):
             end = repeated(changed, start, lambda it: it.goes_on(finder.kappa, self.root_find_max_steps))
             return end.u, end.has_converged(finder.kappa).astype(guess.dtype)  # a number: JAX wants its derivative, too
 
-        u, converged = lax.custom_root(residual, guess, iterated, lambda push, b: linear_solution(push, self.places, b), has_aux=True)
+        u, converged = lax.custom_root(residual, guess, iterated, lambda push, b: linear_solution(push, self.pattern, b), has_aux=True)
         return u, converged > 0
 
 
@@ -160,15 +160,15 @@ def stage_imbalance(equations: FirstOrderSystem, t, state, args: Arguments) -> A
     return jnp.concatenate([left, rates if feedback is None else rates + feedback(mode, t, parts.q, parts.v)])
 
 
-def _places(equations: EquationsOfMotion, t, y, args: Arguments) -> Places | None:
-    """Those of the derivatives of the imbalance by q̈ and λ where q̇, and q, move with q̈; None where a dense matrix serves better."""
+def _pattern(equations: EquationsOfMotion, t, y, args: Arguments) -> SparsityPattern | None:
+    """The pattern of the derivatives of the imbalance by q̈ and λ where q̇, and q, move with q̈; None where a dense matrix serves better."""
     n, rows = equations.size, equations.flat_at(args.params, equations.states_of(t, equations.parts(y))).rows
 
     def left(x):
         q, v, u = jnp.split(x, [n, 2 * n])
         return stage_imbalance(equations, t, (jnp.concatenate([q, v, y[2 * n :]]), u), args)
 
-    return newton_places(left, jnp.concatenate([y[: 2 * n], jnp.zeros(n + rows, y.dtype)]), n)
+    return newton_pattern(left, jnp.concatenate([y[: 2 * n], jnp.zeros(n + rows, y.dtype)]), n)
 
 
 def in_structure(solver: Any, equations: FirstOrderSystem, t0, y0, args: Arguments) -> Any:
@@ -185,5 +185,5 @@ def in_structure(solver: Any, equations: FirstOrderSystem, t0, y0, args: Argumen
     if chosen or alone.modes or alone.light or alone.states.size:
         return solver
     y, args = y0[(..., *[0] * (y0.ndim - 1))], Arguments(params, args.scales)
-    places = _places(alone, t0, y, args)
-    return solver if places is None else SparseImplicit(type(solver), equations, places, solver.root_finder, solver.root_find_max_steps)
+    pattern = _pattern(alone, t0, y, args)
+    return solver if pattern is None else SparseImplicit(type(solver), equations, pattern, solver.root_finder, solver.root_find_max_steps)

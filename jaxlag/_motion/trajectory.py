@@ -244,7 +244,7 @@ class Trajectory(eqx.Module):
 @compiled  # so that parameters are unknown, as they were in the motion: a friction of 0 is one, too
 def _slips(motion: Trajectory) -> dict[str, Float[Array, "..."]]:
     def elements_at(states, *state):
-        return find_elements(motion._flat((states, *state)), *state)
+        return find_elements(motion._flat((states, *state)))
 
     elements = elements_at(*motion._first()) if motion.friction else None
     if elements is None:

@@ -20,6 +20,8 @@ from sympy.logic.boolalg import Boolean
 
 from .._program.expressions import Algebra, filled
 from .._program.interpreter import evaluate
+from .._program.primitives import INTEGRAL
+from .._program.walker import is_call_of
 
 
 def formulas(function: Callable, *arguments: PyTree[np.ndarray]) -> PyTree[np.ndarray]:
@@ -73,7 +75,7 @@ class Formulas(Algebra):
         if primitive.name == "convert_element_type":
             return _converting(dtype)
         is_whole = np.issubdtype(dtype, np.integer)
-        return None if is_whole and primitive.name in ("div", "rem", "and", "or", "xor", "not") else FUNCTIONS.get(primitive.name)
+        return None if is_whole and primitive.name in INTEGRAL else FUNCTIONS.get(primitive.name)
 
     def shortcut(self, equation):
         """Plain formulas of JAX functions whose programs guard against overflow or pivot."""
@@ -81,10 +83,7 @@ class Formulas(Algebra):
         if name not in SHORTCUTS:
             return None
         function, formula = SHORTCUTS[name]
-        avals = [atom.aval for atom in equation.invars]
-        shapes = [jax.ShapeDtypeStruct(aval.shape, aval.dtype, weak_type=aval.weak_type) for aval in avals]
-        (call,) = jax.make_jaxpr(function)(*shapes).eqns
-        return formula if str(call.params["jaxpr"]) == str(equation.params["jaxpr"]) else None
+        return formula if is_call_of(equation, function) else None
 
 
 def _is_truth(x: Any) -> bool:

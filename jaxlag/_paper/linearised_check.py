@@ -8,7 +8,7 @@ import sympy
 from jax.flatten_util import ravel_pytree
 from sympy import Expr, Symbol
 
-from .._mechanics.lagrange import applied_force, constraint_rows, inertia
+from .._mechanics.lagrange import applied_force, constraint_rows, inertia, inertial_force
 from .._model.flat import StatesAt
 from .._model.system import System
 from .._model.validation import coordinates
@@ -45,7 +45,7 @@ def check_against_derivatives(
 
     def balance(q_, v, p):
         flat = bound(system, like, unravel(p), params, StatesAt(states.tree.numbers, t, q_, v))
-        M, force = inertia(flat, t, q_, v)
+        M, force = inertia(flat, t, q_, v), inertial_force(flat, t, q_, v)
         force = force + applied_force(flat, t, q_, v, multipliers)
         return force + constraint_rows(flat, t, q_, v)[1].T @ multipliers, M.as_matrix()
 

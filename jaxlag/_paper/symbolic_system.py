@@ -13,7 +13,7 @@ from jaxtyping import PyTree
 from sympy import Matrix, Symbol
 
 from .._mechanics.contact import in_contact
-from .._mechanics.lagrange import applied_force, constraint_rows, inertia
+from .._mechanics.lagrange import applied_force, constraint_rows, inertia, inertial_force
 from .._model.flat import Flat, StatesAt, bind, rows_by_name
 from .._model.state_values import of_first_order, ravelled, sampled, start_values
 from .._model.system import System
@@ -131,7 +131,7 @@ def check_against_simulation(system: System, s: SymbolicSystem, steps: Steps, q:
 
     def simulated(t, q_, v, multipliers, params_, states_):
         flat = bound(system, like, params_, params, StatesAt(states_, t, q_, v))
-        M, force = inertia(flat, t, q_, v)
+        M, force = inertia(flat, t, q_, v), inertial_force(flat, t, q_, v)
         _, G, gamma = constraint_rows(flat, t, q_, v)
         return M.as_matrix(), force + applied_force(flat, t, q_, v, multipliers), G, gamma
 

@@ -14,9 +14,10 @@ from typing import Any
 import numpy as np
 from jax import lax
 
-from .dependence import ORDER, Structure, split_coefficient
 from .expressions import Node, is_number
 from .polynomials import Modulus, Monomial, Polynomial, Sign, added, combined_powers, moduli_in, multiplied, scaled
+from .primitives import EQUALITIES, MODULI, NONSMOOTH, ORDER, SIGMOIDS, SUMS, UNCHANGED
+from .velocity_degrees import VelocityDegrees, split_coefficient
 
 Powers = dict[Any, Any]  # nodes and their exponents
 
@@ -24,7 +25,7 @@ Powers = dict[Any, Any]  # nodes and their exponents
 class Moduli:
     """The nodes of one program that are polynomials in moduli."""
 
-    def __init__(self, structure: Structure, results: Iterable[Any]):
+    def __init__(self, structure: VelocityDegrees, results: Iterable[Any]):
         self.structure, self.places, self.results = structure, structure.places, list(results)
         self.components: dict[Modulus, list[Polynomial]] = {}
         self.genuine: set[Modulus] = set()  # an absolute value or a norm, not only a maximum or a selection
@@ -93,7 +94,7 @@ class Moduli:
         if not self._depends(node):
             return
         is_nonsmooth = any(x in self.forms or x in self.unresolved for x in node.operands)
-        form = self._form(node) if is_nonsmooth or node.name in READABLE else None
+        form = self._form(node) if is_nonsmooth or node.name in MODULI else None
         if form is not None and not any(isinstance(factor, Sign) for monomial in form for factor, _ in monomial):
             known = all(u in self.components or self._absolute(u.of[0], 1.0) for u in moduli_in(form))
             if known and node in self.places and all(map(self._has_places, form)):
@@ -133,9 +134,9 @@ class Moduli:
             return self._selected(*of)
         if name == "mul":
             return multiplied(self._polynomial(of[0]), self._polynomial(of[1]))
-        if name in ("add", "sub", "add_any"):
+        if name in SUMS:
             return added(self._polynomial(of[0]), self._polynomial(of[1], -1.0 if name == "sub" else 1.0))
-        if name in ("neg", "convert_element_type", "copy", "stop_gradient"):
+        if name == "neg" or name in UNCHANGED:
             return self._polynomial(of[0], -1.0 if name == "neg" else 1.0)
         if name == "div" and not self._depends(of[1]):
             return multiplied(
@@ -202,14 +203,14 @@ class Moduli:
             number, powers, x = pending.pop()
             factor, node = split_coefficient(x)
             number *= float(factor)
-            if node is not None and node.name in ("add", "sub", "add_any"):
+            if node is not None and node.name in SUMS:
                 x, y = node.operands
                 pending += [(-number if node.name == "sub" else number, powers, y), (number, powers, x)]
                 continue
             numbers, factors = self._factors(node)
             number, powers = number * numbers, combined_powers(powers, factors)
             varying = [f for f in powers if self._depends(f)]
-            sums = [f for f in varying if f.name in ("add", "sub", "add_any") and powers[f] == 1]
+            sums = [f for f in varying if f.name in SUMS and powers[f] == 1]
             if len(varying) == 1 and sums:  # a weight in front of the sum
                 pending.append((number, {f: n for f, n in powers.items() if f is not sums[0]}, sums[0]))
                 continue
@@ -278,13 +279,10 @@ class Moduli:
     def _at_rest(self, which, square) -> bool:
         """Whether a comparison asks whether a sum of squares, or its root, is zero or next to it."""
         numbers, nodes = [x for x in which.operands if is_number(x)], [x for x in which.operands if not is_number(x)]
-        if which.name not in (*ORDER, "eq", "ne") or len(numbers) != 1 or not abs(numbers[0]) <= 1e-10:
+        if (which.name not in ORDER and which.name not in EQUALITIES) or len(numbers) != 1 or not abs(numbers[0]) <= 1e-10:
             return False
         one = nodes[0].operands[0] if nodes[0].name == "sqrt" else nodes[0]
         return split_coefficient(one)[1] is split_coefficient(square)[1]
 
 
-SIGMOIDS = frozenset(("tanh", "atan", "erf", "logistic"))
 STEEP = 100  # per unit of velocity
-READABLE = frozenset(("abs", "sign", "max", "min", "sqrt", "select_n", *ORDER))  # in terms of moduli and signs
-NONSMOOTH = READABLE - {"sqrt"} | {"floor", "ceil", "round", "rem", "clamp", "eq", "ne"}

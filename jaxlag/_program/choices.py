@@ -8,15 +8,10 @@ import jax
 import jax.numpy as jnp
 from jax.extend import source_info_util
 
-from .walker import CALLS, CALLS_WITH_DERIVATIVE_RULE, called_program, parts_of_scan, walk
+from .primitives import ANY_CALL, CHOOSING, EQUALITIES, LOOKUPS, NAMES_IN_NUMPY
+from .walker import called_program, columns_of_branches, parts_of_scan, walk
 
 OWN = str(pathlib.Path(__file__).parents[1])
-BY_VALUE = {
-    "max": "maximum", "min": "minimum", "abs": "abs", "sign": "sign", "clamp": "clip", "reduce_max": "max", "reduce_min": "min",
-    "floor": "floor", "ceil": "ceil", "round": "round", "rem": "remainder", "argmax": "argmax", "argmin": "argmin", "sort": "sort",
-}  # fmt: skip
-BY_PLACE = ("gather", "dynamic_slice")  # what stands behind the first operand are places
-GUARDS = ("eq", "ne")  # true at points alone: what is smooth is guarded by them
 SMOOTH = frozenset(["hypot", "logaddexp", "logaddexp2", "sinc", "softplus"])  # though they choose inside
 Marks = frozenset[str]
 
@@ -62,8 +57,7 @@ def choices(function: Callable, *marked: tuple[Any, str]) -> list[Choice]:
 
 def _walked(program: Any, inputs: Iterable[Value], within: _Call | None) -> list[Value]:
     """The outputs; what chooses within a program that is called is the call."""
-    evaluate = lambda equation, operands: _evaluated(equation, operands, within)
-    return walk(program, inputs, evaluate, constant=lambda _: Value(), literal=lambda _: Value())
+    return walk(program, inputs, lambda equation, operands: _evaluated(equation, operands, within), lambda _: Value())
 
 
 def _evaluated(equation: Any, operands: list[Value], within: _Call | None) -> Sequence[Value]:
@@ -73,29 +67,29 @@ def _evaluated(equation: Any, operands: list[Value], within: _Call | None) -> Se
     def chosen(what: str, by: Marks) -> Value:
         return found._replace(choices=found.choices | {Choice(here.what or what, here.line, by)}) if by else found
 
-    if name in CALLS or name in CALLS_WITH_DERIVATIVE_RULE:
+    if name in ANY_CALL:
         program = called_program(equation)
         called = str(params.get("name") or program.jaxpr.debug_info.func_name).strip("_<>")
         inner = _Call(here.what or (called if called != "lambda" else None), here.line)
         given = operands[len(operands) - len(program.jaxpr.invars) :]
         return [found] * len(equation.outvars) if called in SMOOTH else _walked(program, given, inner)
     if name == "cond":
-        of_branches = zip(*(_walked(branch, operands[1:], here) for branch in params["branches"]), strict=True)
-        return [Value.of((chosen("cond", operands[0].marks), *of)) for of in of_branches]
+        columns = columns_of_branches(params, operands[1:], lambda branch, given: _walked(branch, given, here))
+        return [Value.of((chosen("cond", operands[0].marks), *of)) for of in columns]
     if name == "scan":
         return _scanned(params, operands, here)
-    if name in GUARDS:
+    if name in EQUALITIES:  # what is smooth is guarded by them
         found = Value()
     elif name == "stop_gradient":
         found = found._replace(choices=frozenset())
     elif name == "select_n":
         found = chosen("where", operands[0].marks)
-    elif name in BY_PLACE:
+    elif name in LOOKUPS:
         found = chosen("a table", Value.of(operands[1:]).marks)
     elif name == "convert_element_type" and _counts(equation.outvars[0]) and not _counts(equation.invars[0]):
         found = chosen("a conversion to integers", found.marks)
-    elif name in BY_VALUE:
-        found = chosen(BY_VALUE[name], found.marks)
+    elif name in CHOOSING:
+        found = chosen(NAMES_IN_NUMPY.get(name, name), found.marks)
     return [found] * len(equation.outvars)
 
 

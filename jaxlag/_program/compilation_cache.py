@@ -3,12 +3,14 @@
 import contextlib
 import errno
 import os
+import stat
 import sys
+import warnings
 from pathlib import Path
 
 import jax
-from jax.experimental.compilation_cache import compilation_cache
 
+from .cache_of_jax import read_settings
 from .kept_programs import KEPT
 
 SMALLEST = {  # programs of any size: a fit has dozens of small ones, which take longer to compile than to read
@@ -31,7 +33,7 @@ def keep_compiled(folder: str | os.PathLike | None = None, *, max_bytes: int = 2
     - `folder`: where to keep them. Default: the folder that is already set by `JAX_COMPILATION_CACHE_DIR` or `jax.config`, otherwise the
       user's cache folder: `$XDG_CACHE_HOME/jaxlag` or `~/.cache/jaxlag` on Linux, `~/Library/Caches/jaxlag` on macOS and
       `%LOCALAPPDATA%\jaxlag` on Windows. It is created if necessary, for this user alone: whoever can write to it can run code in your
-      processes.
+      processes. So a folder that others can write to is not used, with a warning.
     - `max_bytes`: if the folder is larger when this is called, the least recently used programs are deleted; a folder that was already set
       is left to its owner.
 
@@ -60,15 +62,18 @@ def keep_compiled(folder: str | os.PathLike | None = None, *, max_bytes: int = 2
     if folder is None and chosen:
         if "://" not in chosen:  # JAX knows folders of the cloud, too
             with contextlib.suppress(OSError):
-                Path(chosen).mkdir(parents=True, exist_ok=True)
-        KEPT.keep_in(Path(chosen))
+                Path(chosen).mkdir(mode=0o700, parents=True, exist_ok=True)
+        KEPT.keep_in(Path(chosen) if _is_private(Path(chosen)) else None)
         return Path(chosen)
     path = _user_cache() / "jaxlag" if folder is None else Path(folder).expanduser().absolute()
     _make(path)
+    if not _is_private(path):
+        KEPT.keep_in(None)
+        return path
     _shrink(path, max_bytes)
     if chosen != str(path):
-        compilation_cache.reset_cache()  # JAX looks at the setting only once
-        compilation_cache.set_cache_dir(str(path))
+        read_settings()
+        jax.config.update("jax_compilation_cache_dir", str(path))
     KEPT.keep_in(path)
     return path
 
@@ -91,6 +96,21 @@ def _make(folder):
         raise _unusable(folder, error.strerror) from error
     if not os.access(folder, os.W_OK | os.X_OK):
         raise _unusable(folder, os.strerror(errno.EACCES))
+
+
+def _is_private(folder):
+    """Whether only this user can write to a folder; warns where others can."""
+    if not hasattr(os, "getuid") or not folder.exists():  # Windows has other rights; in the cloud nothing of ours is kept
+        return True
+    found = folder.stat()
+    if found.st_uid == os.getuid() and not found.st_mode & (stat.S_IWGRP | stat.S_IWOTH):
+        return True
+    warnings.warn(
+        f"`folder` must be a folder that only you can write to, since the programs in it are run, but others can write to {folder}. "
+        "Nothing is kept there. Take the right away from them, `chmod go-w`, or give another folder.",
+        stacklevel=3,
+    )
+    return False
 
 
 def _unusable(folder, reason):

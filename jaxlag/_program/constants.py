@@ -30,7 +30,7 @@ def has_extended_dtype(atom: Any) -> bool:
 
 def folded(primitive: core.Primitive, params: dict, dtype: Any, *numbers: Any) -> Any:
     """An element-wise primitive of numbers, as JAX computes it."""
-    function = ELEMENTWISE.get(primitive.name)
+    function = NUMPY.get(primitive.name)
     result = converted(numbers[0], dtype) if primitive.name == "convert_element_type" else function(*numbers) if function else None
     if result is None:
         with jax.ensure_compile_time_eval():
@@ -56,9 +56,9 @@ def _remainder(x, y):
     return None if x.dtype.kind != "f" and np.any(y == 0) else np.fmod(x, y)
 
 
-# Element-wise primitives and their NumPy functions; None: folded by JAX itself, as where the function returns None.
+# NumPy functions of element-wise primitives; others are folded by JAX itself, as where the function returns None.
 
-ELEMENTWISE: dict[str, Callable | None] = {
+NUMPY: dict[str, Callable] = {
     **dict(add=np.add, add_any=np.add, sub=np.subtract, mul=np.multiply, neg=np.negative, abs=np.abs, sign=np.sign, pow=np.power),
     **dict(exp=np.exp, exp2=np.exp2, log=np.log, log1p=np.log1p, expm1=np.expm1, sqrt=np.sqrt, cbrt=np.cbrt),
     **dict(sin=np.sin, cos=np.cos, tan=np.tan, asin=np.arcsin, acos=np.arccos, atan=np.arctan, atan2=np.arctan2),
@@ -78,7 +78,6 @@ ELEMENTWISE: dict[str, Callable | None] = {
     "clamp": lambda low, x, high: np.minimum(np.maximum(low, x), high),
     "select_n": lambda which, *cases: np.choose(which, cases, mode="clip"),
     "stop_gradient": lambda x: x,
-    **dict.fromkeys(("round", "logistic", "erf", "erfc", "erf_inv", "lgamma", "digamma")),
 }
 
 
@@ -88,6 +87,12 @@ def as_function(equation: Any) -> Callable[..., list]:
     jaxpr = _empty_jaxpr().replace(invars=list(places), outvars=equation.outvars, eqns=[equation], effects=equation.effects)
     function = core.jaxpr_as_fun(core.ClosedJaxpr(jaxpr, ()))
     return lambda *operands: function(*(operands[i] for i in places.values()))
+
+
+def bound(equation: Any, *operands: Any) -> list:
+    """The outputs of its primitive for operands of any kind, in place of numbers in the equation, too."""
+    out = equation.primitive.bind(*operands, **equation.primitive.get_bind_params(equation.params))
+    return list(out) if equation.primitive.multiple_results else [out]
 
 
 @functools.cache

@@ -1,6 +1,6 @@
 """Rules of primitives that move data: reshaping, joining and slicing, gather and scatter, dynamic slices."""
 
-import functools
+import math
 from collections.abc import Callable
 
 import numpy as np
@@ -8,7 +8,7 @@ from jax import lax
 from jax.extend import core
 
 from .expressions import objects
-from .rules import RULES, map_elements, promoted, rule
+from .rules import RULES, promoted, rule
 
 
 def _register_movements(**movements: Callable) -> None:
@@ -51,55 +51,65 @@ _register_movements(
 )
 
 
-def _windows(starts, shape, sizes, start_dims, batch_dims, start_batch_dims, clip):
-    """For each vector of starts, its position among them and its window of an array; None for a window that does not fit."""
+def _windows(starts, shape, sizes, start_dims, batch_dims, start_batch_dims, clip) -> np.ndarray:
+    """The number that each element of each window has in an array of this shape; −1 in windows that do not fit."""
     room = np.array(shape, int) - sizes
-    for at in np.ndindex(starts.shape[:-1]):
-        start = np.zeros(len(shape), int)
-        start[list(start_dims)] = starts[at]
-        start[list(batch_dims)] = [at[d] for d in start_batch_dims]
-        start = np.clip(start, 0, room) if clip else start
-        fits = ((start >= 0) & (start <= room)).all()
-        yield at, tuple(slice(i, i + n) for i, n in zip(start, sizes, strict=True)) if fits else None
+    start = np.zeros((*starts.shape[:-1], len(shape)), int)
+    start[..., list(start_dims)] = starts
+    for d, k in zip(batch_dims, start_batch_dims, strict=True):
+        start[..., d] = np.expand_dims(np.arange(starts.shape[k]), [i for i in range(starts.ndim - 1) if i != k])
+    start = np.clip(start, 0, room) if clip else start
+    fits = ((start >= 0) & (start <= room)).all(-1)
+    strides = np.array([math.prod(shape[d + 1 :]) for d in range(len(shape))], int)
+    windows, whole = (x.reshape(*x.shape, *[1] * len(sizes)) for x in (start @ strides, fits))
+    return np.where(whole, windows + np.tensordot(strides, np.indices(sizes), 1), -1)
 
 
 @rule("gather")
 def _gather(interpreter, equation, x, starts):
+    """Without an interpreter −1 in windows that do not fit."""
     p, dims = equation.params, equation.params["dimension_numbers"]
     if starts.dtype == object:
         return NotImplemented
     clip = p["mode"] in (lax.GatherScatterMode.CLIP, lax.GatherScatterMode.PROMISE_IN_BOUNDS)
-    out = np.empty(equation.outvars[0].aval.shape, x.dtype)
-    part = np.moveaxis(out, [d for d in range(out.ndim) if d not in dims.offset_dims], range(starts.ndim - 1))
-    dropped = (*dims.collapsed_slice_dims, *dims.operand_batching_dims)
-    kept = [n for d, n in enumerate(p["slice_sizes"]) if d not in dropped]
     batch = dims.operand_batching_dims, dims.start_indices_batching_dims
-    for at, window in _windows(starts, x.shape, p["slice_sizes"], dims.start_index_map, *batch, clip):
-        if window is None:
-            return NotImplemented
-        part[(*at, ...)] = x[window].reshape(kept)
-    return out
+    places = _windows(starts, x.shape, p["slice_sizes"], dims.start_index_map, *batch, clip)
+    dropped = [starts.ndim - 1 + d for d in (*dims.collapsed_slice_dims, *dims.operand_batching_dims)]
+    shape = equation.outvars[0].aval.shape
+    batch_axes = [d for d in range(len(shape)) if d not in dims.offset_dims]
+    places = np.moveaxis(places.squeeze(tuple(dropped)), range(starts.ndim - 1), batch_axes)
+    if interpreter is not None and np.any(places < 0):
+        return NotImplemented
+    flat = x.ravel() if np.all(places >= 0) else np.append(x.ravel(), -1)
+    return flat[places.ravel()].reshape(places.shape)
+
+
+def scattered(equation, x, starts, updates) -> tuple[np.ndarray, np.ndarray]:
+    """Where updates go: for each that goes anywhere the number of the element of x, and itself."""
+    p, dims = equation.params, equation.params["dimension_numbers"]
+    part = np.moveaxis(updates, [d for d in range(updates.ndim) if d not in dims.update_window_dims], range(starts.ndim - 1))
+    dropped = (*dims.inserted_window_dims, *dims.operand_batching_dims)
+    windows = iter(updates.shape[d] for d in dims.update_window_dims)
+    sizes = [1 if d in dropped else next(windows) for d in range(len(x.shape))]
+    batch = dims.operand_batching_dims, dims.scatter_indices_batching_dims
+    clip = p["mode"] == lax.GatherScatterMode.CLIP
+    places = _windows(starts, x.shape, sizes, dims.scatter_dims_to_operand_dims, *batch, clip).ravel()
+    return places[places >= 0], part.ravel()[places >= 0]
 
 
 def _register_scatter(name: str, primitive: core.Primitive | None) -> None:
     @rule(name)
     def scatter(interpreter, equation, x, starts, updates):
-        p, dims = equation.params, equation.params["dimension_numbers"]
-        if starts.dtype == object or (primitive is None and p["update_jaxpr"] is not None):
+        if starts.dtype == object or (primitive is None and equation.params["update_jaxpr"] is not None):
             return NotImplemented  # the latter applies a function to the element in place
-        combine = functools.partial(interpreter.apply, primitive, {}, equation.outvars[0].aval.dtype)
-        x, updates = objects(x).copy(), objects(updates)
-        part = np.moveaxis(updates, [d for d in range(updates.ndim) if d not in dims.update_window_dims], range(starts.ndim - 1))
-        dropped = (*dims.inserted_window_dims, *dims.operand_batching_dims)
-        sizes = np.ones(x.ndim, int)
-        sizes[[d for d in range(x.ndim) if d not in dropped]] = [updates.shape[d] for d in dims.update_window_dims]
-        batch = dims.operand_batching_dims, dims.scatter_indices_batching_dims
-        clip = p["mode"] == lax.GatherScatterMode.CLIP
-        for at, window in _windows(starts, x.shape, sizes, dims.scatter_dims_to_operand_dims, *batch, clip):
-            if window is not None:
-                update = part[(*at, ...)].reshape(sizes)
-                x[window] = update if primitive is None else map_elements(combine, x[window], update)
-        return x
+        x, updates = promoted(x, updates)
+        flat = objects(x).ravel().copy() if primitive else x.ravel().copy()
+        places, new = scattered(equation, x, starts, updates)
+        if primitive is None:
+            flat[places] = new
+        for place, update in zip(places, objects(new), strict=True) if primitive else ():
+            flat[place] = interpreter.apply(primitive, {}, equation.outvars[0].aval.dtype, flat[place], update)
+        return flat.reshape(x.shape)
 
 
 _register_scatter("scatter", None)

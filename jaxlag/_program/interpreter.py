@@ -11,19 +11,18 @@ import operator
 from collections.abc import Callable, Sequence
 from typing import Any
 
-import jax
 import numpy as np
 from jax.extend import core
 
-from . import control_flow as control_flow  # its rules
-from . import data_movement as data_movement
+from . import data_movement as data_movement  # its rules
 from . import elimination as elimination
-from .constants import ELEMENTWISE, fold_by_jax, folded, has_extended_dtype, is_foldable
+from .constants import fold_by_jax, folded, has_extended_dtype, is_foldable, is_numeric
 from .expressions import Algebra, Arrays, Node, TooLong, UnknownPrimitive, filled, is_number, objects
+from .primitives import ANY_CALL, ELEMENTWISE, LINEAR_ALGEBRA
 from .rules import RULES, map_elements
 from .scalar_graph import ScalarGraph
 from .signed_zeros import equations_with_signed_zeros
-from .walker import CALLS, CALLS_WITH_DERIVATIVE_RULE, called_program, constants_as_inputs, walk
+from .walker import called_program, constants_as_inputs, walk
 
 MAX_FOLDED_OPERATIONS = 1000  # on numbers: some 20 ms in Python, less than a program takes to compile
 
@@ -61,9 +60,7 @@ def traced(closed: Any, interpreter: "Interpreter") -> tuple[Arrays, Arrays]:
     interpreter.with_signed_zeros = equations_with_signed_zeros(closed)
     given = [*closed.consts, *([None] * len(closed.jaxpr.invars))]
     inputs = [
-        np.asarray(x)
-        if isinstance(x, (np.ndarray, jax.Array)) and not isinstance(x, jax.core.Tracer)
-        else filled(v.aval.shape, [interpreter.argument(v.aval.dtype) for _ in range(v.aval.size)])
+        np.asarray(x) if is_numeric(x) else filled(v.aval.shape, [interpreter.argument(v.aval.dtype) for _ in range(v.aval.size)])
         for x, v in zip(given, jaxpr.invars, strict=True)
     ]
     return inputs, interpreter.run(jaxpr, [numeric_if_known(x, v.aval.dtype) for x, v in zip(inputs, jaxpr.invars, strict=True)])
@@ -74,18 +71,13 @@ class Interpreter(ScalarGraph):
 
     with_signed_zeros: frozenset[int] = frozenset()  # equations, by their `id`
 
-    @np.errstate(all="ignore")  # 1/0 among numbers is JAX's inf, without a warning
     def run(self, program: Any, inputs: Any) -> Arrays:
         """The outputs of a jaxpr, closed or not, whose constants are numbers."""
-        return walk(
-            program,
-            inputs,
-            self._evaluate,
-            constant=lambda value: self.known(np.asarray(value)),
-            literal=lambda atom: self.known(np.asarray(atom.val, atom.aval.dtype)),
-        )
+        return walk(program, inputs, self.evaluated, lambda value: self.known(np.asarray(value)))
 
-    def _evaluate(self, equation: Any, operands: Arrays) -> Arrays:
+    @np.errstate(all="ignore")  # 1/0 among numbers is JAX's inf, without a warning
+    def evaluated(self, equation: Any, operands: Arrays) -> Arrays:
+        """The outputs of one equation, as arrays of numbers where all elements are known."""
         results = self.equation(equation, operands)
         return [numeric_if_known(array, variable.aval.dtype) for array, variable in zip(results, equation.outvars, strict=True)]
 
@@ -161,9 +153,9 @@ def _operations(equation: Any) -> int | float:
         return math.inf  # as long as it takes
     if name == "cond":
         return max(sum(map(_operations, branch.jaxpr.eqns)) for branch in p["branches"])
-    if name in (*CALLS, *CALLS_WITH_DERIVATIVE_RULE, "scan", "custom_linear_solve"):
+    if name in ANY_CALL or name in ("scan", "custom_linear_solve"):
         return p.get("length", 1) * sum(map(_operations, called_program(equation).jaxpr.eqns))
-    if name in ("cholesky", "lu", "triangular_solve"):
+    if name in LINEAR_ALGEBRA:
         return equation.invars[0].aval.size * equation.invars[0].aval.shape[-1]
     windows = math.prod(equation.invars[1].aval.shape[:-1]) if name.startswith(("gather", "scatter")) else 1
     return windows + equation.invars[0].aval.size if name.startswith("scatter") else windows

@@ -208,18 +208,3 @@ INTERVAL_RULES: dict[str, Callable[..., Interval]] = {
     "eq": lambda _, x, y: _equal(x, y),
     "ne": lambda _, x, y: tuple(~end for end in reversed(_equal(x, y))),
 }  # fmt: skip
-ARRAY_OPERATIONS = {
-    "reshape", "squeeze", "expand_dims", "broadcast_in_dim", "transpose", "rev", "slice", "split", "pad", "concatenate", "stack",
-    "unstack", "tile", "copy", "stop_gradient", "reduce_sum", "reduce_max", "reduce_min", "reduce_and",
-    "reduce_or", "cumsum", "cummax", "cummin", "optimization_barrier",
-}  # fmt: skip
-INCREASING = ARRAY_OPERATIONS | {
-    "add", "add_any", "max", "min", "clamp", "exp", "exp2", "expm1", "log", "log1p", "sqrt", "cbrt", "sinh", "tanh", "asinh", "acosh",
-    "atanh", "asin", "atan", "erf", "logistic", "floor", "ceil", "round", "sign", "and", "or",
-}  # fmt: skip
-DECREASING = {"neg", "rsqrt", "acos", "erfc", "not"}
-MAY_OVERFLOW = {
-    "add", "add_any", "sub", "mul", "neg", "div", "abs", "square", "integer_pow", "pow", "reduce_sum", "reduce_prod", "cumsum",
-    "dot_general",
-}  # fmt: skip
-LOGICAL = {"and", "or", "not", "reduce_and", "reduce_or"}  # on other integers they are neither increasing nor decreasing

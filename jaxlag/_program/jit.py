@@ -3,13 +3,9 @@
 On a CPU, XLA compiles each kernel with MLIR, which takes long. With its older emitters, programs compile a third faster and run as fast,
 except in batches (tests/benchmarks/bench_emitters.py). Programs called from Python get these options; within a user's own `jit` the
 choice is the user's: the environment variable XLA_FLAGS="--xla_cpu_use_fusion_emitters=false".
-
-While a program is traced, Python makes hundreds of thousands of small objects that stay, and its collector of cyclic garbage goes through
-all that there is again and again: a fifth of the time of README's first example. It waits until the program is there.
 """
 
 import functools
-import gc
 from collections.abc import Callable, Iterable
 from typing import Any
 
@@ -20,24 +16,11 @@ from jax.extend.core import get_opaque_trace_state
 from jaxtyping import PyTree
 
 from .kept_programs import KEPT
+from .registry import remembered
 
 OLD_EMITTERS = {"xla_cpu_use_fusion_emitters": False}
 with jax.ensure_compile_time_eval():
     NOTHING_TRACED = get_opaque_trace_state()
-
-
-class GarbageStays:
-    """A block in which Python's collector of cyclic garbage waits; within another one it goes on waiting."""
-
-    __slots__ = ("waits",)
-
-    def __enter__(self) -> None:
-        self.waits = gc.isenabled()
-        gc.disable()
-
-    def __exit__(self, *_: object) -> None:
-        if self.waits:
-            gc.enable()
 
 
 def jitted(function: Callable, **options: Any) -> Callable:
@@ -49,8 +32,7 @@ def jitted(function: Callable, **options: Any) -> Callable:
 
     @functools.wraps(function)
     def call(*given, **named):
-        with GarbageStays():
-            return program(*_split(given, named))
+        return program(*_split(given, named))
 
     return call
 
@@ -62,13 +44,12 @@ def compiled(function: Callable) -> Callable:
     @functools.wraps(function)
     def call(*given, **named):
         arrays, static = _split(given, named)
-        with GarbageStays():
-            if not is_called_by_python(arrays):
-                return within(arrays, static)
-            program = _program_with_options(function)
-            if KEPT.folder is None or _has_tracers(arrays):
-                return program(arrays, static)
-            return KEPT.called(program, call, arrays, static)
+        if not is_called_by_python(arrays):
+            return within(arrays, static)
+        program = _program_with_options(function)
+        if KEPT.folder is None or _has_tracers(arrays):
+            return program(arrays, static)
+        return KEPT.called(program, call, arrays, static)
 
     return call
 
@@ -107,9 +88,17 @@ def _has_tracers(leaves):
 
 def _is_known(leaf):
     """Whether it is a value, or a batch of values."""
-    while isinstance(leaf, jax.core.Tracer) and hasattr(leaf, "batch_dim"):
-        leaf = leaf.val
+    while (batch := _batch(leaf)) is not None:
+        leaf, _ = batch
     return not isinstance(leaf, jax.core.Tracer)
+
+
+def _batch(leaf):
+    """The values of a batch under an eager `vmap`, and the axis of its members. None for anything else, and for all where JAX has these
+    attributes no longer: then batches are compiled without options, and not looked at.
+    """
+    is_batch = isinstance(leaf, jax.core.Tracer) and hasattr(leaf, "batch_dim") and hasattr(leaf, "val")
+    return (leaf.val, leaf.batch_dim) if is_batch else None
 
 
 @jax.jit
@@ -117,7 +106,7 @@ def _nothing():
     return 0
 
 
-@functools.cache
+@remembered
 def _program_with_options(function):
     return _program(function, compiler_options=options())
 
@@ -157,9 +146,9 @@ def _looked_at(tree, look):
 
 def _seen(leaf):
     leaf = jax.lax.stop_gradient(leaf)
-    while isinstance(leaf, jax.core.Tracer) and hasattr(leaf, "batch_dim"):
-        values = leaf.val if leaf.batch_dim is None else jnp.take(leaf.val, 0, axis=leaf.batch_dim)
-        leaf = jax.lax.stop_gradient(values)
+    while (batch := _batch(leaf)) is not None:
+        values, axis = batch
+        leaf = jax.lax.stop_gradient(values if axis is None else jnp.take(values, 0, axis=axis))
     return leaf
 
 

@@ -15,10 +15,9 @@ import pickle
 import platform
 import sys
 import tempfile
-import threading
 import warnings
 import weakref
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -26,11 +25,11 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.experimental import serialize_executable
-from jax.experimental.compilation_cache import compilation_cache
 from jax.tree_util import PyTreeDef, default_registry
 
+from .cache_of_jax import ELSEWHERE, compiled_afresh, loaded, written
 from .description import NotDescribable, Words, answer_of
+from .registry import Table
 from .user_calls import LEDGER, Call
 
 PACKAGE = Path(__file__).parents[1]
@@ -46,7 +45,6 @@ SETTINGS = (  # of JAX, that a program depends on
     "jax_threefry_partitionable",
 )
 BY_HAND = ("jax_debug_infs", "jax_debug_nans", "jax_default_device", "jax_disable_jit")  # with one of these a user looks into programs
-MOST = 128  # programs that a process finds again at once; one has some megabytes
 
 
 class CompiledAgain(UserWarning):
@@ -58,25 +56,24 @@ class KeptPrograms:
 
     def __init__(self) -> None:
         self.folder: Path | None = None
-        self._found: dict[Any, Callable | None] = {}
+        self._found = Table()
         self._mark: weakref.ref | None = None
 
     def keep_in(self, folder: Path | None) -> None:
         """From here on programs are kept in this folder, or in none, or none that cannot be written to."""
         self.folder = folder if folder is not None and os.access(folder, os.W_OK | os.X_OK) else None
         LEDGER.digest = None if self.folder is None else answer_of
-        self._found = {}
+        self._found.clear()
 
     def called(self, program: Any, function: Callable, arrays: list, static: Any) -> Any:
         """`program(arrays, static)`, from the folder if it is there, and into it if not."""
         if self._mark is None or self._mark() is None:  # after `jax.clear_caches()` nothing is left of what was found before
-            self._found, self._mark = {}, _marked_in_caches()
-        key, of_all = (function, static, tuple(map(_kind, arrays)), _settings()), self._found
-        if key not in of_all:
-            if len(of_all) >= MOST:
-                of_all.clear()
-            of_all[key] = self._load_or_compile(program, function, arrays, static)
-        found = of_all.get(key)
+            self._found.clear()
+            self._mark = _marked_in_caches()
+        key = function, static, tuple(map(_kind, arrays)), _settings()
+        if key not in self._found:
+            self._found[key] = self._load_or_compile(program, function, arrays, static)
+        found = self._found.get(key)
         return program(arrays, static) if found is None else found(arrays)
 
     def _load_or_compile(self, program, function, arrays, static):
@@ -87,12 +84,12 @@ class KeptPrograms:
                 return found
             lowered = _lowered(program, arrays, static)
             name, head = _head(words, lowered.out_tree)
-        except (NotDescribable, OSError):
+            with compiled_afresh():
+                compiled = lowered.compile()
+        except (NotDescribable, OSError, *ELSEWHERE):
             return None
-        with _compiled_afresh():
-            compiled = lowered.compile()
         with contextlib.suppress(Exception):  # a full disk; a program that calls Python, which says so in many ways
-            _write(self.folder / name, head + serialize_executable.serialize(compiled)[0])
+            _write(self.folder / name, head + written(compiled))
         return compiled
 
 
@@ -186,23 +183,6 @@ def _head(words, out_tree) -> tuple[str, bytes]:
     return f"jaxlag-{words.digest()}-{hashlib.sha256(head).hexdigest()[:32]}-{_digest(then)}-cache", head
 
 
-_ONE_AT_A_TIME = threading.Lock()
-
-
-@contextlib.contextmanager
-def _compiled_afresh() -> Iterator[None]:
-    """Without JAX's cache: XLA writes down only half of a program that it has not compiled but read."""
-    with _ONE_AT_A_TIME:
-        before = jax.config.values["jax_enable_compilation_cache"]
-        try:
-            jax.config.update("jax_enable_compilation_cache", False)
-            compilation_cache.reset_cache()  # JAX looks at the setting only once
-            yield
-        finally:
-            jax.config.update("jax_enable_compilation_cache", before)
-            compilation_cache.reset_cache()
-
-
 def _write(path, content):
     """At once, as another process may read it; behind its digest."""
     with tempfile.TemporaryDirectory(dir=path.parent) as folder:
@@ -225,9 +205,8 @@ def _read(folder, words, arrays):
             asked[head] = asked.get(head) or _digest(_answers(words, _Unpickler(content, words.objects).load()))
             if asked[head] == answers:
                 _have_lapack()
-                out_tree, in_tree = _Unpickler(content, words.objects).load(), jax.tree.structure(((arrays,), {}))
-                of_file = content.read(), in_tree, out_tree
-                return serialize_executable.deserialize_and_load(*of_file, execution_devices=jax.devices()[:1])
+                out_tree = _Unpickler(content, words.objects).load()
+                return loaded(content.read(), jax.tree.structure(((arrays,), {})), out_tree)
         except Exception:  # a file of another kind; what was loaded would have been the same program
             continue
     return None

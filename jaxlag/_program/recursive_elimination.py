@@ -16,7 +16,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float
 
-from .places_in_line import Line
+from .chain_ordering import ChainOrdering
 from .scalarise import scalarised
 
 WRITTEN_OUT = 2000  # scalar operations of a turn: a loop of few numbers a turn is one kernel, at 10 ns for a link in the plane
@@ -34,39 +34,39 @@ class Factors(NamedTuple):
     pivot: Float[Array, ""]
 
 
-def factor(line: Line, entries: Float[Array, " e"]) -> Factors:
+def factor(ordering: ChainOrdering, entries: Float[Array, " e"]) -> Factors:
     """The minimum over x of one block after the other, as a form of what comes before."""
-    given = jnp.concatenate([entries, jnp.array([0, 1], entries.dtype)])[line.entry]
-    P = jnp.zeros((line.handed.size, line.handed.size), entries.dtype)
-    turn = scalarised(functools.partial(_eliminated, line), limit=WRITTEN_OUT)
+    given = jnp.concatenate([entries, jnp.array([0, 1], entries.dtype)])[ordering.entry]
+    P = jnp.zeros((ordering.handed.size, ordering.handed.size), entries.dtype)
+    turn = scalarised(functools.partial(_eliminated, ordering), limit=WRITTEN_OUT)
     _, (L, K, pivots) = lax.scan(turn, (P, P[0]), given, reverse=True)
-    by_x, by_before = jax.vmap(lambda given: _by_parts(line, _matrices(line, given)))(given)
+    by_x, by_before = jax.vmap(lambda given: _by_parts(ordering, _matrices(ordering, given)))(given)
     pivot = jnp.where(jnp.any(jnp.isnan(pivots)), jnp.nan, jnp.min(pivots))  # a minimum of thousands leaves NaN out on a CPU
-    return Factors(L, K, by_x[:, line.handed], by_before[:, line.handed], pivot)
+    return Factors(L, K, by_x[:, ordering.handed], by_before[:, ordering.handed], pivot)
 
 
-def _matrices(line: Line, given: Float[Array, " g"]) -> list[Array]:
+def _matrices(ordering: ChainOrdering, given: Float[Array, " g"]) -> list[Array]:
     numbers = jnp.concatenate([given, jnp.array([0, 1], given.dtype)])
-    return [numbers[slots] for slots in line.slots]
+    return [numbers[slots] for slots in ordering.slots]
 
 
-def _by_parts(line: Line, matrices: list[Array]) -> tuple[Float[Array, "p a"], Float[Array, "p c"]]:
+def _by_parts(ordering: ChainOrdering, matrices: list[Array]) -> tuple[Float[Array, "p a"], Float[Array, "p c"]]:
     """How the numbers of a block depend on its x and on what is handed to it: each sum is one of what is before it."""
     _, _, within, before = matrices
-    a = line.at.shape[1]
-    by_x, by_before = [*jnp.eye(a, dtype=within.dtype)], [*jnp.zeros((a, line.handed.size), within.dtype)]
-    for k, row in enumerate(line.slots[2]):
-        of = [j for j in range(a + k) if row[j] != line.entry.shape[1]]
+    a = ordering.at.shape[1]
+    by_x, by_before = [*jnp.eye(a, dtype=within.dtype)], [*jnp.zeros((a, ordering.handed.size), within.dtype)]
+    for k, row in enumerate(ordering.slots[2]):
+        of = [j for j in range(a + k) if row[j] != ordering.entry.shape[1]]
         by_x.append(sum((within[k, j] * by_x[j] for j in of), start=jnp.zeros_like(by_x[0])))
         by_before.append(sum((within[k, j] * by_before[j] for j in of if j >= a), start=before[k]))
     return jnp.stack(by_x), jnp.stack(by_before)
 
 
-def _eliminated(line: Line, carry: tuple[Array, Array], given: Float[Array, " g"]) -> tuple[tuple, tuple]:
+def _eliminated(ordering: ChainOrdering, carry: tuple[Array, Array], given: Float[Array, " g"]) -> tuple[tuple, tuple]:
     """A turn: P is the form of what follows in the numbers handed on, `root` the roots of its diagonal before the elimination."""
-    (P, root), (H, beside, *sums) = carry, _matrices(line, given)
-    X, B = _by_parts(line, [H, beside, *sums])
-    X_on, B_on = X[line.handed], B[line.handed]
+    (P, root), (H, beside, *sums) = carry, _matrices(ordering, given)
+    X, B = _by_parts(ordering, [H, beside, *sums])
+    X_on, B_on = X[ordering.handed], B[ordering.handed]
     pulled = H @ B + beside
     form = X.T @ H @ X + X_on.T @ P @ X_on
     L = jnp.linalg.cholesky(form)
@@ -76,7 +76,7 @@ def _eliminated(line: Line, carry: tuple[Array, Array], given: Float[Array, " g"
     return (whole - K.T @ K, jnp.sqrt(jnp.abs(jnp.diagonal(whole)))), (L, K, jnp.min(jnp.diagonal(L) ** 2 / size))
 
 
-def by_root(line: Line, factors: Factors, F: Float[Array, "n k"]) -> Float[Array, "b a k"]:
+def by_root(ordering: ChainOrdering, factors: Factors, F: Float[Array, "n k"]) -> Float[Array, "b a k"]:
     """R⁻ᵀF where M = Rᵀ R is the matrix of the whole form in x."""
 
     @scalarised
@@ -86,13 +86,13 @@ def by_root(line: Line, factors: Factors, F: Float[Array, "n k"]) -> Float[Array
         return by_before.T @ beta - K.T @ e, e
 
     def of_one(f):
-        beta = jnp.zeros(line.handed.size, f.dtype)
-        return lax.scan(turn, beta, (factors[:4], jnp.append(f, 0)[line.at]), reverse=True)[1]
+        beta = jnp.zeros(ordering.handed.size, f.dtype)
+        return lax.scan(turn, beta, (factors[:4], jnp.append(f, 0)[ordering.at]), reverse=True)[1]
 
     return of_columns(of_one, F)
 
 
-def by_factor(line: Line, factors: Factors, F: Float[Array, "n k"]) -> Float[Array, "n k"]:
+def by_factor(ordering: ChainOrdering, factors: Factors, F: Float[Array, "n k"]) -> Float[Array, "n k"]:
     """M⁻¹F: what makes the form least."""
 
     @scalarised
@@ -102,10 +102,10 @@ def by_factor(line: Line, factors: Factors, F: Float[Array, "n k"]) -> Float[Arr
         return by_x @ x + by_before @ handed, x
 
     def of_one(e):
-        handed = jnp.zeros(line.handed.size, e.dtype)
-        return lax.scan(turn, handed, (factors[:4], e))[1].ravel()[line.back]
+        handed = jnp.zeros(ordering.handed.size, e.dtype)
+        return lax.scan(turn, handed, (factors[:4], e))[1].ravel()[ordering.back]
 
-    return of_columns(of_one, by_root(line, factors, F))
+    return of_columns(of_one, by_root(ordering, factors, F))
 
 
 def of_columns(function: Callable, F: Float[Array, "*n k"]) -> Float[Array, "*m k"]:

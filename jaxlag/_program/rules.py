@@ -1,19 +1,22 @@
-"""Rules of primitives: how equations over arrays become operations on their elements. Here arithmetic, reductions and products.
+"""Rules of primitives: how equations over arrays become operations on their elements. Here arithmetic, sums, products, calls, loops.
 
 Each rule takes the interpreter (`_program.interpreter`), the equation and its operands, and returns the outputs; NotImplemented
-leaves the equation whole. Others are in `_program.data_movement`, `_program.control_flow` and `_program.elimination`.
+leaves the equation whole. Others are in `_program.data_movement` and `_program.elimination`.
 """
 
 import functools
 import math
 from collections.abc import Callable
 
+import jax
 import numpy as np
 from jax import lax
 from jax.extend import core
 
 from .constants import folded
 from .expressions import Arrays, Node, objects
+from .primitives import CALLS, CALLS_WITH_DERIVATIVE_RULE
+from .walker import branch_index, called_program, unrolled_scan
 
 RULES: dict[str, Callable] = {}
 
@@ -52,7 +55,9 @@ def _convert(interpreter, equation, x):
 
 @rule("integer_pow", "square")
 def _power(interpreter, equation, x):
-    return map_elements(functools.partial(interpreter.power, n=equation.params.get("y", 2)), x)
+    n = equation.params.get("y", 2)
+    numbers = _fold(interpreter, np.square, x) if n == 2 else None
+    return map_elements(functools.partial(interpreter.power, n=n), x) if numbers is None else numbers
 
 
 def _fold(interpreter, function: Callable, *arrays: np.ndarray) -> np.ndarray | None:
@@ -127,3 +132,53 @@ def _dot_general(interpreter, equation, x, y):
     if products.size == 0:
         return np.zeros(aval.shape, aval.dtype)
     return np.frompyfunc(interpreter.add, 2, 1).reduce(products, -1).reshape(aval.shape)
+
+
+@rule(*CALLS)
+def _call(interpreter, equation, *operands):
+    shortcut = interpreter.algebra.shortcut(equation)
+    if shortcut is not None and any(x.dtype == object for x in operands):
+        return interpreter.block(shortcut, operands, equation.outvars)
+    return interpreter.run(called_program(equation), operands)
+
+
+@rule(*CALLS_WITH_DERIVATIVE_RULE)
+def _call_with_derivative_rule(interpreter, equation, *operands):
+    """Taken apart, unless the algebra differentiates nodes: then it stays in one piece, with its rule."""
+    results, known = _call(interpreter, equation, *operands), all(x.dtype != object for x in operands)
+    return results if known or interpreter.algebra.block(equation) is None else NotImplemented
+
+
+@rule("platform_index")
+def _platform_index(interpreter, equation):
+    fits = [names is None or jax.default_backend() in names for names in equation.params["platforms"]]
+    return np.asarray(fits.index(True), np.int32)
+
+
+@rule("cond")
+def _cond(interpreter, equation, index, *operands):
+    if index.dtype == object:
+        return NotImplemented
+    return interpreter.run(equation.params["branches"][branch_index(index, equation.params)], operands)
+
+
+@rule("while")
+def _while(interpreter, equation, *operands):
+    p = equation.params
+    i, j = p["cond_nconsts"], p["cond_nconsts"] + p["body_nconsts"]
+    condition, consts, state = operands[:i], operands[i:j], list(operands[j:])
+    while (goes_on := interpreter.run(p["cond_jaxpr"], [*condition, *state])[0]).dtype != object and goes_on.ndim == 0:
+        if not goes_on:
+            return state
+        state = interpreter.run(p["body_jaxpr"], [*consts, *state])
+    return NotImplemented
+
+
+@rule("scan")
+def _scan(interpreter, equation, *operands):
+    p = equation.params
+    if not p["length"]:
+        return NotImplemented
+    row = lambda x, k: np.asarray(x[k], x.dtype)
+    carry, columns = unrolled_scan(p, operands, lambda inputs: interpreter.run(p["jaxpr"], inputs), row)
+    return [*carry, *(np.stack(promoted(*column)) for column in columns)]

@@ -13,13 +13,14 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from .array_dependence import dependence
-from .constants import ELEMENTWISE, as_function, fold_by_jax, has_extended_dtype, is_numeric
+from .constants import as_function, fold_by_jax, has_extended_dtype, is_numeric
 from .expressions import TooLong
+from .primitives import CALLS, ELEMENTWISE
 from .sparse_jacobian import entries
 from .sparse_matrix import SparseMatrix, colors
+from .sparsity import dependence
 from .sums_in_scans import in_running_sums
-from .walker import CALLS, called_program, primitive_names, walk
+from .walker import called_program, primitive_names, walk
 
 MIN_LENGTH = 16  # of an axis, from which on a sum along it is cut
 MAX_COLORS = 48  # directions of a chain of bodies in space with some sums each; more, and it is not sparse between the cuts
@@ -117,14 +118,14 @@ class _Cuts:
 
     def within(self, program: Any, operands: list) -> list:
         """The results of a program, or of one that it calls."""
-        return walk(program, operands, self.equation, lambda array: (array, False), lambda atom: (atom.val, False))
+        return walk(program, operands, self.equation, lambda array: (array, False))
 
     def equation(self, equation: Any, operands: list) -> list:
         """The rule of running sums; all else is as it was."""
         name, p = equation.primitive.name, equation.params
         arrays, depends = [array for array, _ in operands], any(moves for _, moves in operands)
         is_known = not depends and all(map(is_numeric, arrays)) and not any(map(has_extended_dtype, equation.outvars))
-        if self.needs_numbers and is_known:  # something may be multiplied by it, or picked
+        if self.needs_numbers and is_known:  # something may be multiplied by it, or gather_static
             return [(array, False) for array in fold_by_jax(equation, arrays)]
         same = equation.outvars and equation.outvars[0].aval.dtype == self.dtype
         if name == "dot_general" and same and (product := _as_running_sum(arrays, [moves for _, moves in operands], p)) is not None:

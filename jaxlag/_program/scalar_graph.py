@@ -15,6 +15,7 @@ from jax.extend import core
 
 from .constants import folded
 from .expressions import Algebra, Arrays, Node, TooLong, UnknownPrimitive, filled, is_number, objects, order
+from .primitives import EVEN, ODD
 
 WORK_PER_NODE = 50  # steps for each operation that is allowed; mechanical systems take up to 20
 
@@ -205,10 +206,6 @@ def _inverse_root(x) -> tuple[Any, Node | None]:
             if _inverse_root(factor)[1] is factor:
                 return rest, factor
     return x, None
-
-
-ODD = frozenset(("sin", "tan", "asin", "atan", "sinh", "tanh", "asinh", "atanh", "cbrt", "erf"))
-EVEN = frozenset(("cos", "cosh"))  # not abs: there the derivative at 0 would change its sign
 
 
 # What is simplified before it becomes a node; None where nothing is.

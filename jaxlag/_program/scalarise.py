@@ -20,17 +20,16 @@ from .interpreter import Interpreter, evaluate, traced, unflattened
 class _Jax(Algebra):
     """Scalars are JAX arrays of rank 0. Derivative rules are kept: a function with one stays in one piece, its body as scalar code."""
 
-    names = ("add", "sub", "mul", "div", "neg", "sqrt", "max", "min")
-    arithmetic = {name: getattr(lax, name) for name in names} | {"and": lax.bitwise_and, "or": lax.bitwise_or}
-
     def function(self, primitive, params, dtype):
-        return self.arithmetic.get(primitive.name) or functools.partial(primitive.bind, **params)
+        return ARITHMETIC.get(primitive.name) or functools.partial(primitive.bind, **params)
 
     def block(self, equation):
         special = {"custom_linear_solve": _linear_solve_as_scalar_code, "custom_jvp_call": _custom_jvp_as_scalar_code}
         return functools.partial(special.get(equation.primitive.name, _whole), equation)
 
 
+ARITHMETIC = dict(add=lax.add, sub=lax.sub, mul=lax.mul, div=lax.div, neg=lax.neg, sqrt=lax.sqrt, max=lax.max, min=lax.min)
+ARITHMETIC |= {"and": lax.bitwise_and, "or": lax.bitwise_or}
 JAX_ALGEBRA = _Jax()
 FEW = 6  # entries of a result that are put together one by one
 

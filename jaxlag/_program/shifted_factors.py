@@ -1,4 +1,4 @@
-"""Factors of a matrix that may be singular: then something is added to its diagonal, and what it solves is put right by what is left."""
+"""Factors of a matrix that may be singular: then something is added to its diagonal, and what it solves is refined by what is left."""
 
 from collections.abc import Callable
 from typing import Any
@@ -38,7 +38,7 @@ def shifted_where_singular(factored: Callable, probed: Callable, shift: Array, i
     return factors, shifted
 
 
-def put_right(once: Callable, matvec: Callable, b: Array, least: int, shifted: Bool[Array, ""]) -> Array:
+def refine(once: Callable, matvec: Callable, b: Array, least: int, shifted: Bool[Array, ""]) -> Array:
     """A⁻¹ b by `once(b)`, which is near it, and by what is left of that: `least` times, and where the factors are `shifted` some times, and
     then as long as the changes shrink and are more than rounding. NaN where they still do after all that.
     """
@@ -59,6 +59,20 @@ def put_right(once: Callable, matvec: Callable, b: Array, least: int, shifted: B
     to_come = change**2 / jnp.where(before > change, before - change, 1)  # of a geometric series
     is_found = ~shifted | (i < most) | (to_come <= jnp.finfo(b.dtype).eps ** 0.5 * largest(x))
     return jnp.where(is_found, x, jnp.nan)
+
+
+def inverse_lengths(squares: Float[Array, "*m"], least: int | None = None) -> tuple[Float[Array, "*m"], Bool[Array, "*m"]]:
+    """1/√ of the squares of lengths, 0 where they are not above the `least`, and where they are; without one, more than rounding beside
+    the largest: a row of nothing but that has no part in a matrix.
+    """
+    present = squares > ((4 * jnp.finfo(squares.dtype).eps) ** 2 * jnp.max(squares) if least is None else least)
+    return jnp.where(present, lax.rsqrt(jnp.where(present, squares, 1)), 0), present
+
+
+def shifts(D: Float[Array, "*m"], present: Bool[Array, "*m"]) -> Float[Array, "*m"]:
+    """What is added to the diagonal of a matrix whose rows are scaled by D: as much for each in the units given, about eps^`SHIFT`."""
+    mean = jnp.sum(jnp.where(present, jnp.log(jnp.where(present, D, 1)), 0)) / jnp.maximum(jnp.sum(present), 1)
+    return jnp.finfo(D.dtype).eps ** SHIFT * D**2 * jnp.exp(-2 * mean)
 
 
 def scales(diagonal: Float[Array, " n"]) -> Float[Array, " n"]:

@@ -7,10 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax.extend import core
 
-from .walker import CALLS, CALLS_WITH_DERIVATIVE_RULE, called_program, programs_within
-
-DECIDED = {"div": (1,), "rsqrt": (0,), "pow": (0,), "atan2": (0, 1), "nextafter": (0, 1), "bitcast_convert_type": (0,)}  # by these operands
-EVEN = frozenset(("abs", "square", "exp", "exp2", "cos", "cosh", "logistic"))  # of which a zero of either sign makes the same
+from .primitives import ANY_CALL, SIGN_OF_ZERO, STRICT, ZERO_UNSIGNED
+from .walker import called_program, programs_within
 
 
 def equations_with_signed_zeros(program: Any) -> frozenset[int]:
@@ -24,7 +22,7 @@ def _operands_of_program(program: Any, results: Sequence[bool], found: set[int])
     """For each argument whether the sign of a zero matters, given the results of which it does; the equations are added to `found`."""
     jaxpr = getattr(program, "jaxpr", program)
     signed = {x for x, matters in zip(jaxpr.outvars, results, strict=False) if matters and not isinstance(x, core.Literal)}
-    compared = {e.outvars[0]: e.invars for e in jaxpr.eqns if e.primitive.name in ("gt", "lt", "ne")}
+    compared = {e.outvars[0]: e.invars for e in jaxpr.eqns if e.primitive.name in STRICT}
     for equation in reversed(jaxpr.eqns):
         matters = [x in signed for x in equation.outvars]
         if any(matters):
@@ -55,7 +53,7 @@ def _chosen_where_not_zero(equation: Any, compared: dict) -> Any:
 def _operands(equation: Any, matters: list[bool], found: set[int]) -> list[bool]:
     """The same for one equation."""
     name, count = equation.primitive.name, len(equation.invars)
-    if name in (*CALLS, *CALLS_WITH_DERIVATIVE_RULE):
+    if name in ANY_CALL:
         return _operands_of_program(called_program(equation), matters, found)
     within = programs_within(equation)
     if within:  # of loops and choices the results are arguments again
@@ -65,6 +63,6 @@ def _operands(equation: Any, matters: list[bool], found: set[int]) -> list[bool]
             return [True] * count
         return [False] * count
     power = equation.params.get("y", 1) if name == "integer_pow" else 1
-    if name in EVEN or power % 2 == 0 or (name == "mul" and equation.invars[0] is equation.invars[1]):
+    if name in ZERO_UNSIGNED or power % 2 == 0 or (name == "mul" and equation.invars[0] is equation.invars[1]):
         return [False] * count
-    return [any(matters) or k in DECIDED.get(name, ()) or power < 0 for k in range(count)]
+    return [any(matters) or k in SIGN_OF_ZERO.get(name, ()) or power < 0 for k in range(count)]

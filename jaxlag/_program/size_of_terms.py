@@ -1,16 +1,15 @@
 """How large the terms are that a function adds up: where they cancel to zero, rounding is small compared with them."""
 
 from collections.abc import Callable
-from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from .walker import CALLS, called_program, walk
-
-ADDING = ("add", "sub", "add_any", "reduce_sum", "dot_general", "cumsum")
+from .constants import bound
+from .primitives import CALLS, SUMS
+from .walker import walk
 
 
 def size_of_terms(function: Callable, x: Float[Array, " n"]) -> Float[Array, " m"]:
@@ -26,23 +25,15 @@ def size_of_terms(function: Callable, x: Float[Array, " n"]) -> Float[Array, " m
         draw = np.random.default_rng(0)
 
         def evaluate(equation, operands):
-            if equation.primitive.name in CALLS:
-                return walk(called_program(equation), operands, evaluate, _fixed, lambda atom: _fixed(atom.val))
             values, depends = [value for value, _ in operands], any(of_x for _, of_x in operands)
-            if depends and equation.primitive.name in ADDING:
+            if depends and equation.primitive.name in SUMS:
                 values = [_changed(value, share, draw) for value in values]
-            found = equation.primitive.bind(*values, **equation.primitive.get_bind_params(equation.params))
-            return [(value, depends) for value in (found if equation.primitive.multiple_results else [found])]
+            return [(value, depends) for value in bound(equation, *values)]
 
-        ((value, _),) = walk(program, [(x, True)], evaluate, _fixed, lambda atom: _fixed(atom.val))
+        ((value, _),) = walk(program, [(x, True)], evaluate, lambda value: (value, False), opened=CALLS)
         return value
 
     return jnp.abs(jax.jvp(changed, (jnp.zeros((), x.dtype),), (jnp.ones((), x.dtype),))[1])
-
-
-def _fixed(value: Any) -> tuple[Any, bool]:
-    """A number that does not depend on x."""
-    return value, False
 
 
 def _changed(value, share, draw):

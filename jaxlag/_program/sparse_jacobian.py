@@ -14,29 +14,32 @@ import numpy as np
 import scipy.sparse
 from jaxtyping import Array, Bool, Float
 
-from .array_dependence import dependence
-from .expressions import Algebra, Node, TooLong, UnknownPrimitive
-from .interpreter import Interpreter, traced
-from .sparse_matrix import Places, SparseMatrix, colors, picked
+from .expressions import TooLong
+from .sparse_matrix import SparseMatrix, SparsityPattern, colors, gather_static
+from .sparsity import MANY as MANY
+from .sparsity import dependence, sparsity_pattern
 from .structured_jacobian import structured_jacobian
 
 MAX_DENSE_COLUMNS = 3  # up to here a direction for each column costs less than looking for zeros
 MAX_SCALAR_COLUMNS = 5  # up to here most programs become scalar code, which is shortest with a direction for each column
-MAX_OPERATIONS = 20_000  # scalar operations that are searched, in a second or less
-MANY = 64  # columns, from which on programs are read as programs of arrays, and zeros may be left out
 SPARSE = 8  # times as many columns as directions, from which on they are
 
 
-def jacobian(function: Callable, x: Float[Array, " n"]) -> tuple[Float[Array, " m"], lx.AbstractLinearOperator | SparseMatrix]:
+def jacobian(
+    function: Callable, x: Float[Array, " n"], pattern_of: Callable[[], Bool[np.ndarray, "m n"]] | None = None
+) -> tuple[Float[Array, " m"], lx.AbstractLinearOperator | SparseMatrix]:
     """f(x) and ∂f/∂x, which is a `DiagonalLinearOperator` where its program shows that it is diagonal, and a `SparseMatrix` where it is
-    large and takes few directions.
+    large and takes few directions. `pattern_of()`: where it is not large, which numbers of it may differ from zero, if that is known.
     """
     y, push = jax.linearize(function, x)
     if x.size >= MANY and (found := _by_arrays(function, push, x)) is not None:
         return y, found
     if x.size >= MANY and y.size * SPARSE <= x.size:
         return y, lx.MatrixLinearOperator(jax.jacrev(function)(x))  # of a few full rows, as of what the last link of a chain is held by
-    pattern = np.ones((y.size, x.size), bool) if x.size <= MAX_DENSE_COLUMNS else sparsity_pattern(function, x)
+    if x.size <= MAX_DENSE_COLUMNS:
+        pattern = np.ones((y.size, x.size), bool)
+    else:
+        pattern = pattern_of() if pattern_of else sparsity_pattern(function, x)
     if pattern.shape[0] == pattern.shape[1] > MAX_DENSE_COLUMNS and np.array_equal(pattern, np.eye(x.size)):
         return y, lx.DiagonalLinearOperator(push(jnp.ones_like(x)))
     color = np.arange(x.size) if pattern.all() else colors(pattern)
@@ -63,23 +66,16 @@ def _by_arrays(function: Callable, push: Callable, x: Float[Array, " n"]) -> lx.
         return None
     by_row = colors(pattern.T)
     if 2 * (max(by_row) + 1) <= max(color) + 1:
-        return _entries_by_rows(jax.linear_transpose(push, x), by_row, pattern, x)
+        pull = jax.linear_transpose(push, x)
+        return entries(lambda y: pull(y)[0], by_row, pattern.T, x).T
     return entries(push, color, pattern, x)
 
 
 def entries(push: Callable, color: np.ndarray, pattern: Any, x: Float[Array, " n"]) -> SparseMatrix:
     """The entries of a Jacobian, by directions of one color each."""
-    places = Places.of(pattern)
+    places = SparsityPattern.of(pattern)
     directions = along(push, color, x).T  # as they are computed: this way around they are read faster, too
-    return SparseMatrix(picked(directions.ravel(), color[places.columns] * places.shape[0] + places.rows), places)
-
-
-def _entries_by_rows(pull: Callable, color: np.ndarray, pattern: Any, x: Float[Array, " n"]) -> SparseMatrix:
-    """The same by transposed directions, each the sum of the rows of one color."""
-    places = Places.of(pattern)
-    directions = jnp.asarray(np.arange(max(color) + 1)[:, None] == color, x.dtype)
-    (pulled,) = jax.vmap(pull)(directions)
-    return SparseMatrix(picked(pulled.ravel(), color[places.rows] * places.shape[1] + places.columns), places)
+    return SparseMatrix(gather_static(directions.ravel(), color[places.columns] * places.shape[0] + places.rows), places)
 
 
 def few_colors(pattern: Any) -> np.ndarray | None:
@@ -99,27 +95,9 @@ def along(push: Callable, color: np.ndarray, x: Float[Array, " n"]) -> Float[Arr
 def empty_rows(function: Callable, x: Float[Array, " n"]) -> np.ndarray:
     """The numbers of the elements of f(x) that depend on none of x."""
     try:
-        if x.size >= MANY:
-            return np.flatnonzero(np.diff(dependence(function, x).indptr) == 0)
+        return np.flatnonzero(np.diff(dependence(function, x).indptr) == 0)
     except TooLong:
-        pass
-    return np.flatnonzero(~np.any(sparsity_pattern(function, x), axis=1))
-
-
-def sparsity_pattern(function: Callable, x: Array) -> Bool[np.ndarray, "m n"]:
-    """Whether element i of f(x) depends on element j of x; where the program is too long to be searched, all do."""
-    closed, out = jax.make_jaxpr(function, return_shape=True)(x)
-    try:
-        interpreter = Interpreter(_Dependence(), MAX_OPERATIONS)
-        inputs, outputs = traced(closed, interpreter)
-    except (TooLong, UnknownPrimitive):
-        return np.ones((out.size, x.size), bool)
-    reached = {node: 1 << j for j, node in enumerate(inputs[-1].flat)}  # sets of j, as bits
-    for node in interpreter.nodes:
-        for operand in node.operands:
-            reached[node] = reached.get(node, 0) | reached.get(operand, 0)
-    rows = [reached.get(node, 0) if isinstance(node, Node) else 0 for node in outputs[0].flat]
-    return np.array([[row >> j & 1 for j in range(x.size)] for row in rows], bool).reshape(out.size, x.size)
+        return np.flatnonzero(~np.any(sparsity_pattern(function, x), axis=1))
 
 
 def underdetermined(pattern: Bool[np.ndarray, "m k"]) -> Bool[np.ndarray, " k"]:
@@ -141,13 +119,3 @@ def underdetermined(pattern: Bool[np.ndarray, "m k"]) -> Bool[np.ndarray, " k"]:
         front = np.setdiff1d(behind[~reached[behind]], -1)
         reached[front] = True
     return reached
-
-
-class _Dependence(Algebra):
-    """Operations without values: only what depends on what is of interest."""
-
-    def function(self, primitive, params, dtype):
-        return primitive.bind
-
-    def block(self, equation):
-        return equation.primitive.bind

@@ -1,4 +1,4 @@
-"""Matrices of which only the entries that are not zero by structure are kept: their places are known while tracing."""
+"""Matrices of which only the entries that are not zero by structure are kept: which these are is known while tracing."""
 
 import functools
 import itertools
@@ -19,7 +19,7 @@ FEW = 8  # entries of a row, up to which they are added up one by one: rods betw
 UNEVEN = 4  # rows are padded to the longest where that makes no more than so many times as many entries
 
 
-class Places:
+class SparsityPattern:
     """The rows and columns of the entries of a matrix, row by row; compared by them. `last`: the first of the rows that are eliminated
     only after all that they are coupled with, as those of multipliers are.
     """
@@ -30,26 +30,26 @@ class Places:
         self.hash = hash(self.key)
 
     @classmethod
-    def of(cls, pattern: Any, last: int | None = None) -> "Places":
-        """Those of a sparse matrix of SciPy."""
+    def of(cls, pattern: Any, last: int | None = None) -> "SparsityPattern":
+        """The pattern of a sparse matrix of SciPy."""
         pattern = scipy.sparse.csr_matrix(pattern)
         pattern.sort_indices()
         m, n = pattern.shape
         return cls(np.repeat(np.arange(m), np.diff(pattern.indptr)), np.asarray(pattern.indices, int), (m, n), last)
 
     def __eq__(self, other: object) -> bool:
-        return isinstance(other, Places) and self.key == other.key
+        return isinstance(other, SparsityPattern) and self.key == other.key
 
     def __hash__(self) -> int:
         return self.hash
 
-    def pattern(self) -> scipy.sparse.csr_matrix:
-        """As a sparse matrix of SciPy, with the numbers of the entries, from 1 on."""
+    def to_scipy(self) -> scipy.sparse.csr_matrix:
+        """The sparse matrix of SciPy, with the numbers of the entries, from 1 on."""
         return scipy.sparse.csr_matrix((np.arange(1, self.rows.size + 1), (self.rows, self.columns)), self.shape)
 
     @functools.cached_property
     def by_row(self) -> np.ndarray | None:
-        """For each row the numbers of its entries, padded by the number of entries; None where rows are too uneven."""
+        """The numbers of the entries of each row, padded by the number of entries; None where rows are too uneven."""
         m, size = self.shape[0], self.rows.size
         count = np.bincount(self.rows, minlength=m)
         width = int(count.max(initial=0))
@@ -59,97 +59,106 @@ class Places:
         padded[self.rows, np.arange(size) - np.repeat(np.cumsum(count) - count, count)] = np.arange(size)
         return padded
 
+    def pairs_in_a_column(self) -> tuple[np.ndarray, np.ndarray]:
+        """All pairs of entries that stand in one column, by their numbers."""
+        number = scipy.sparse.csc_matrix(self.to_scipy())
+        starts, entries = number.indptr, number.data - 1
+        count = np.repeat(np.diff(starts), np.diff(starts))
+        first = np.repeat(np.arange(entries.size), count)
+        within = np.arange(first.size) - np.repeat(np.cumsum(count) - count, count)
+        return entries[first], entries[np.repeat(np.repeat(starts[:-1], np.diff(starts)), count) + within]
+
     @functools.cached_property
-    def transposed(self) -> tuple["Places", np.ndarray]:
-        """Those of the transpose, and the numbers that its entries have here."""
+    def transposed(self) -> tuple["SparsityPattern", np.ndarray]:
+        """The pattern of the transpose, and the numbers that its entries have here."""
         order = np.lexsort((self.rows, self.columns))
-        return Places(self.columns[order], self.rows[order], self.shape[::-1], self.last), order
+        return SparsityPattern(self.columns[order], self.rows[order], self.shape[::-1], self.last), order
 
 
 class SparseMatrix(eqx.Module):
     """A matrix by its entries."""
 
     values: Float[Array, " e"]
-    places: Places = eqx.field(static=True)
+    pattern: SparsityPattern = eqx.field(static=True)
 
     @property
     def shape(self) -> tuple[int, int]:
         """Rows and columns."""
-        return self.places.shape
+        return self.pattern.shape
 
     @property
     def T(self) -> "SparseMatrix":
         """The transpose."""
-        places, order = self.places.transposed
-        return SparseMatrix(picked(self.values, order), places)
+        pattern, order = self.pattern.transposed
+        return SparseMatrix(gather_static(self.values, order), pattern)
 
     def __matmul__(self, x: Float[Array, "n *k"]) -> Float[Array, "m *k"]:  # noqa: F821
         """The product with a vector, or with a matrix column by column."""
         return _product(self, x)
 
     def __neg__(self) -> "SparseMatrix":
-        return SparseMatrix(-self.values, self.places)
+        return SparseMatrix(-self.values, self.pattern)
 
     def __abs__(self) -> "SparseMatrix":
-        return SparseMatrix(jnp.abs(self.values), self.places)
+        return SparseMatrix(jnp.abs(self.values), self.pattern)
 
     @property
     def diagonal(self) -> Float[Array, " m"]:
         """The numbers on the diagonal."""
-        return summed_by(self.places, jnp.where(self.places.rows == self.places.columns, self.values, 0))
+        return summed_by(self.pattern, jnp.where(self.pattern.rows == self.pattern.columns, self.values, 0))
 
     def plus_diagonal(self, x: Float[Array, " n"]) -> "SparseMatrix":
-        """With x added on the diagonal, all of which must be among the places."""
-        return SparseMatrix(self.values.at[np.flatnonzero(self.places.rows == self.places.columns)].add(x), self.places)
+        """Adds x on the diagonal, all of which must be in the pattern."""
+        return SparseMatrix(self.values.at[np.flatnonzero(self.pattern.rows == self.pattern.columns)].add(x), self.pattern)
 
     def columns(self, which: np.ndarray) -> "SparseMatrix":
-        """Some of its columns, in this order."""
+        """The matrix of some of its columns, in this order."""
         new = np.full(self.shape[1], -1)
         new[which] = np.arange(which.size)
-        kept = np.flatnonzero(new[self.places.columns] >= 0)
-        kept = kept[np.lexsort((new[self.places.columns[kept]], self.places.rows[kept]))]
-        places = Places(self.places.rows[kept], new[self.places.columns[kept]], (self.shape[0], which.size))
-        return SparseMatrix(self.values[kept], places)
+        kept = np.flatnonzero(new[self.pattern.columns] >= 0)
+        kept = kept[np.lexsort((new[self.pattern.columns[kept]], self.pattern.rows[kept]))]
+        pattern = SparsityPattern(self.pattern.rows[kept], new[self.pattern.columns[kept]], (self.shape[0], which.size))
+        return SparseMatrix(self.values[kept], pattern)
 
     def row_blocks(self, heights: tuple[int, ...]) -> list["SparseMatrix"]:
         """The matrices that it consists of, one below the other."""
         ends, parts = np.cumsum([0, *heights]), []
         for start, end in itertools.pairwise(ends):
-            kept = slice(*np.searchsorted(self.places.rows, [start, end]))
-            places = Places(self.places.rows[kept] - start, self.places.columns[kept], (int(end - start), self.shape[1]))
-            parts.append(SparseMatrix(self.values[kept], places))
+            kept = slice(*np.searchsorted(self.pattern.rows, [start, end]))
+            pattern = SparsityPattern(self.pattern.rows[kept] - start, self.pattern.columns[kept], (int(end - start), self.shape[1]))
+            parts.append(SparseMatrix(self.values[kept], pattern))
         return parts
 
     def as_matrix(self) -> Float[Array, "m n"]:
-        """With its zeros."""
-        return jnp.zeros(self.shape, self.values.dtype).at[self.places.rows, self.places.columns].set(self.values)
+        """The dense matrix."""
+        return jnp.zeros(self.shape, self.values.dtype).at[self.pattern.rows, self.pattern.columns].set(self.values)
 
 
 @jitted  # so that each of many products stands in a program as a call
 def _product(matrix: SparseMatrix, x: Array) -> Array:
-    places, values = matrix.places, matrix.values.reshape(-1, *[1] * (x.ndim - 1))
-    if places.by_row is None:
-        return _by_segments(places, values * picked(x, places.columns))
-    padded, columns = _with_zero(values), np.append(places.columns, 0)
-    return _row_by_row(places.by_row, lambda entry: picked(padded, entry) * picked(x, columns[entry]))
+    pattern, values = matrix.pattern, matrix.values.reshape(-1, *[1] * (x.ndim - 1))
+    if pattern.by_row is None:
+        return _by_segments(pattern, values * gather_static(x, pattern.columns))
+    padded, columns = _with_zero(values), np.append(pattern.columns, 0)
+    return _row_by_row(pattern.by_row, lambda entry: gather_static(padded, entry) * gather_static(x, columns[entry]))
 
 
 @jitted
-def summed_by(places: Places, values: Float[Array, "e *k"]) -> Float[Array, "m *k"]:  # noqa: F821
+def summed_by(pattern: SparsityPattern, values: Float[Array, "e *k"]) -> Float[Array, "m *k"]:  # noqa: F821
     """The sum of each row."""
-    if places.by_row is None:
-        return _by_segments(places, values)
+    if pattern.by_row is None:
+        return _by_segments(pattern, values)
     padded = _with_zero(values)
-    return _row_by_row(places.by_row, lambda entry: picked(padded, entry))
+    return _row_by_row(pattern.by_row, lambda entry: gather_static(padded, entry))
 
 
-def picked(x: Float[Array, "n *k"], index: np.ndarray) -> Array:  # noqa: F821
-    """x[index], of a known index within bounds: nothing of that stands in the program."""
+def gather_static(x: Float[Array, "n *k"], index: np.ndarray) -> Array:  # noqa: F821
+    """The elements x[index] of a known index within bounds: nothing of that stands in the program."""
     return x.at[index.astype(np.int32)].get(mode="promise_in_bounds", wrap_negative_indices=False)
 
 
-def _by_segments(places, values):
-    return jax.ops.segment_sum(values, places.rows, places.shape[0], indices_are_sorted=True)
+def _by_segments(pattern, values):
+    return jax.ops.segment_sum(values, pattern.rows, pattern.shape[0], indices_are_sorted=True)
 
 
 def _with_zero(values):
@@ -165,12 +174,39 @@ def _row_by_row(by_row: np.ndarray, term: Callable) -> Array:
 
 def row_sums(matrix: Any) -> Float[Array, " m"]:
     """Σⱼ |aᵢⱼ|."""
-    return summed_by(matrix.places, jnp.abs(matrix.values)) if isinstance(matrix, SparseMatrix) else jnp.sum(jnp.abs(matrix), axis=1)
+    return summed_by(matrix.pattern, jnp.abs(matrix.values)) if isinstance(matrix, SparseMatrix) else jnp.sum(jnp.abs(matrix), axis=1)
 
 
 def dense(matrix: Any) -> Float[Array, "m n"]:
-    """A matrix with its zeros, whether it is kept with them or not."""
+    """The dense matrix, of a sparse one too."""
     return matrix.as_matrix() if isinstance(matrix, SparseMatrix) else matrix
+
+
+def assembled(rows: np.ndarray, columns: np.ndarray, n: int, last: int | None = None) -> tuple[SparsityPattern, SparsityPattern]:
+    """The pattern of an n × n matrix whose entries are sums, and that by which their terms, at the given rows and columns, are added up:
+    its columns are the numbers of the terms in the order of its rows.
+    """
+    entry, number = np.unique(rows * n + columns, return_inverse=True)
+    sorting = np.argsort(number, kind="stable")
+    return SparsityPattern(entry // n, entry % n, (n, n), last), SparsityPattern(number[sorting], sorting, (entry.size, number.size))
+
+
+def elimination_order(pattern: Any, last: int | None = None) -> np.ndarray:
+    """The rows in an order of small bandwidth; those from `last` on behind all that they are coupled with: beside these alone, no pivot of
+    theirs is zero.
+
+    Source: Cuthill & McKee, Proc. 24th Nat. Conf. ACM (1969) 157; here reversed.
+    """
+    from scipy.sparse.csgraph import reverse_cuthill_mckee  # imported here because that takes a while
+
+    coupled = scipy.sparse.csr_matrix(pattern, dtype=bool).astype(np.int64)
+    order = np.asarray(reverse_cuthill_mckee((coupled + coupled.T).tocsr(), symmetric_mode=True), int)
+    if last is None:
+        return order
+    (rows, columns), rank, is_last = coupled.nonzero(), np.argsort(order), np.arange(order.size) >= last
+    place = np.where(is_last, -1, rank)
+    np.maximum.at(place, rows, np.where(is_last[rows], rank[columns], -1))
+    return np.lexsort((is_last, place))
 
 
 def colors(pattern: Any) -> np.ndarray:

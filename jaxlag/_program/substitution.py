@@ -14,9 +14,9 @@ from jax import lax
 from jax.extend.core import Jaxpr
 
 from .constants import as_function
-from .dependence import Path, Place
 from .expressions import Node
 from .polynomials import Modulus, Polynomial
+from .velocity_degrees import Path, Place
 from .walker import called_program, unrolled_scan, walk
 
 INPUTS: Path = (-1,)

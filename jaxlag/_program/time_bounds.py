@@ -10,9 +10,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from .constants import as_function, has_extended_dtype
-from .interval_arithmetic import DECREASING, INCREASING, INTERVAL_RULES, LOGICAL, MAY_OVERFLOW, Interval, anything, in_integers, without_nan
-from .walker import CALLS, called_program, parts_of_scan, walk
+from .constants import as_function, bound, has_extended_dtype
+from .interval_arithmetic import INTERVAL_RULES, Interval, anything, in_integers, without_nan
+from .primitives import ANY_CALL, CALLS, DECREASING, INCREASING, LOGICAL, OVERFLOWS
+from .walker import called_program, columns_of_branches, parts_of_scan, walk
 
 
 class TimeDependence(NamedTuple):
@@ -93,14 +94,9 @@ def inlined_steps(closed, calls=CALLS) -> tuple[list[Step], dict[int, Any], list
         return steps[-1].results
 
     def evaluate(equation, operands):
-        if equation.primitive.name in calls:
-            return inlined(called_program(equation), operands)
         return cached((equation.primitive, tuple(equation.params.items()), tuple(operands)), lambda: step(equation, operands))
 
-    def inlined(program, inputs):
-        return walk(program, inputs, evaluate, constant, literal=lambda atom: constant(np.asarray(atom.val, atom.aval.dtype)))
-
-    return steps, constants, inlined(closed, (T, Y))
+    return steps, constants, walk(closed, (T, Y), evaluate, constant, opened=calls)
 
 
 def dependents(steps: list[Step], start: int) -> set[int]:
@@ -143,14 +139,14 @@ def _evaluate_intervals(equation, operands: list[Interval]) -> list[Interval]:
     name, params = equation.primitive.name, equation.params
     if all(low is high for low, high in operands):
         return [(x, x) for x in as_function(equation)(*(low for low, _ in operands))]
-    if name in INLINED_CALLS:
+    if name in ANY_CALL:
         return _run_intervals(called_program(equation), operands)
-    if name in CONTROL_FLOW and params.get("length", 1) <= MAX_ITERATIONS:
-        return CONTROL_FLOW[name](params, operands)
-    if name in CONTROL_FLOW or not has_bounds(equation):
+    if name in LOOPS_AND_BRANCHES and params.get("length", 1) <= MAX_ITERATIONS:
+        return LOOPS_AND_BRANCHES[name](params, operands)
+    if name in LOOPS_AND_BRANCHES or not has_bounds(equation):
         return [anything(variable.aval) for variable in equation.outvars]
     kind = equation.outvars[0].aval.dtype
-    if name in MAY_OVERFLOW and jnp.issubdtype(kind, jnp.integer):
+    if name in OVERFLOWS and jnp.issubdtype(kind, jnp.integer):
         rule = (
             functools.partial(INTERVAL_RULES[name], params)
             if name in INTERVAL_RULES
@@ -168,8 +164,7 @@ def _at_ends(equation) -> Callable[..., list[Any]]:
     """The outputs at both ends of an operation that increases, or decreases, with all its operands."""
 
     def ends(*operands):
-        made = [equation.primitive.bind(*end, **equation.params) for end in zip(*operands, strict=True)]
-        made = made if equation.primitive.multiple_results else [[output] for output in made]
+        made = [bound(equation, *end) for end in zip(*operands, strict=True)]
         return made[::-1] if equation.primitive.name in DECREASING else made
 
     return ends
@@ -177,8 +172,7 @@ def _at_ends(equation) -> Callable[..., list[Any]]:
 
 def _run_intervals(closed, operands):
     """The outputs of a whole program over intervals."""
-    exact = lambda x: (x, x)
-    return walk(closed, operands, _evaluate_intervals, exact, literal=lambda atom: exact(np.asarray(atom.val, atom.aval.dtype)))
+    return walk(closed, operands, _evaluate_intervals, lambda x: (x, x))
 
 
 def _scan(params, operands):
@@ -197,17 +191,16 @@ def _scan(params, operands):
 def _cond(params, operands):
     """One of several branches."""
     which, *operands = operands
-    cases = [_run_intervals(branch, operands) for branch in params["branches"]]
-    which = tuple(jnp.clip(end, 0, len(cases) - 1) for end in which)
-    return [INTERVAL_RULES["select_n"](None, which, *column) for column in zip(*cases, strict=True)]
+    which = tuple(jnp.clip(end, 0, len(params["branches"]) - 1) for end in which)
+    return [INTERVAL_RULES["select_n"](None, which, *column) for column in columns_of_branches(params, operands, _run_intervals)]
 
 
 def has_bounds(equation) -> bool:
     """Whether there are useful bounds on its outputs."""
     name, params = equation.primitive.name, equation.params
-    if name in INLINED_CALLS:
+    if name in ANY_CALL:
         return all(map(has_bounds, called_program(equation).jaxpr.eqns))
-    if name in CONTROL_FLOW:
+    if name in LOOPS_AND_BRANCHES:
         return params.get("length", 1) <= MAX_ITERATIONS and all(
             has_bounds(step) for inner in params.get("branches", [params.get("jaxpr")]) for step in inner.jaxpr.eqns
         )
@@ -218,5 +211,4 @@ def has_bounds(equation) -> bool:
     return name in INCREASING | DECREASING | INTERVAL_RULES.keys()
 
 
-INLINED_CALLS = {*CALLS, "custom_jvp_call", "custom_vjp_call"}
-CONTROL_FLOW = {"scan": _scan, "cond": _cond}
+LOOPS_AND_BRANCHES = {"scan": _scan, "cond": _cond}

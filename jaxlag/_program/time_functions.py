@@ -8,8 +8,8 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from .interval_arithmetic import Interval
+from .primitives import ANY_CALL, LINEAR, LINEAR_ALGEBRA, LOOKUPS
 from .time_bounds import Step, T, Y, ancestors, bounds_of_steps, dependents, has_bounds, inlined_steps, run_steps
-from .walker import CALLS, CALLS_WITH_DERIVATIVE_RULE
 
 MAX_DEGREE = 4  # of a polynomial that hides nothing: a step is looked at in more places
 UNKNOWN, NO_FORM = -1, (None, 0)
@@ -37,7 +37,7 @@ def time_functions(function: Callable, t: Array, y: Array) -> TimeFunctions | No
     Of what comes by such polynomials of one other function, that one is among these, so that A f(t) is looked at for A = 0, too, where a
     derivative by A needs it. A sum of two is one more. Of what is made of tables, weights and neighbours, only what comes of it in the end.
     """
-    steps, constants, (output,) = inlined_steps(jax.make_jaxpr(function)(t, y), (*CALLS, *CALLS_WITH_DERIVATIVE_RULE))
+    steps, constants, (output,) = inlined_steps(jax.make_jaxpr(function)(t, y), ANY_CALL)
     of_t, of_y, needed = dependents(steps, T), dependents(steps, Y), ancestors(steps, [output])
     forms, of_table, are_known = {T: (T, 1)}, set[int](), True
     bounded, lookups, used = list[int](), list[tuple[set[int], list[int]]](), [output]
@@ -103,7 +103,7 @@ def _polynomial(step: Step, forms: list[tuple[Any, int]]) -> tuple[Any, int] | N
     if UNKNOWN in bases or (not has_bounds(step.equation) and (name in LINEAR_ALGEBRA or (T not in bases and _is_of_reals(step)))):
         return UNKNOWN, 1
     own = bases - {T}
-    if (name in LINEAR and _is_of_reals(step)) or (name in ("sin", "cos") and not own):
+    if ((name in LINEAR or name == "convert_element_type") and _is_of_reals(step)) or (name in ("sin", "cos") and not own):
         degree = max(degrees)
     elif name in ("mul", "dot_general") or (name == "div" and not degrees[1]):
         degree = sum(degrees)
@@ -120,21 +120,3 @@ def _is_of_reals(step):
 
 def _is_real(variable):
     return jnp.issubdtype(variable.aval.dtype, jnp.floating)
-
-
-LINEAR = {
-    "add", "add_any", "sub", "neg", "copy", "stop_gradient", "reshape", "squeeze", "expand_dims", "broadcast_in_dim", "transpose", "rev",
-    "slice", "reduce_sum", "convert_element_type", "optimization_barrier",
-}  # fmt: skip
-LOOKUPS = {"gather", "dynamic_slice"}
-LINEAR_ALGEBRA = {
-    "custom_linear_solve",
-    "triangular_solve",
-    "tridiagonal_solve",
-    "cholesky",
-    "lu",
-    "lu_pivots_to_permutation",
-    "qr",
-    "eigh",
-    "svd",
-}

@@ -1,12 +1,13 @@
 """What programs asked the user's functions for while they were traced, and what these answered: a program is known by the answers."""
 
-import weakref
 from collections.abc import Callable, Hashable
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+
+from .registry import Table
 
 MOST_NUMBERS = 64  # of an array whose numbers Python knows: a function may have looked at them
 MOST_CALLS = 64  # of different kinds, of one function; one that was called in more ways is not followed any longer
@@ -69,7 +70,7 @@ class Ledger:
 
     def __init__(self) -> None:
         self.digest: Callable[[Callable, Call], str | None] | None = None  # of an answer, while it is open; None where there is none
-        self._answers: weakref.WeakKeyDictionary[Callable, dict[Call, str] | None] = weakref.WeakKeyDictionary()
+        self._answers = Table(weak=True)  # of each function, by call
 
     def note(self, function: Callable, positional: list, by_name: dict[str, Any]) -> None:
         """Writes a call down that has succeeded."""

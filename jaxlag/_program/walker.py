@@ -4,15 +4,15 @@
 intervals, sums of matrix products, numbers of quantities) and what an equation does with them is left to the caller.
 """
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Container, Iterable, Iterator, Sequence
 from typing import Any
 
 import jax
+import numpy as np
 from jax.extend import core
 from jax.interpreters import partial_eval as pe
 
-CALLS = ("jit", "pjit", "closed_call", "core_call", "remat", "remat2", "checkpoint")  # equations that call a program and do nothing else
-CALLS_WITH_DERIVATIVE_RULE = ("custom_jvp_call", "custom_vjp_call", "custom_vjp_call_jaxpr")
+from .primitives import CALLS as CALLS
 
 
 def walk(
@@ -20,19 +20,27 @@ def walk(
     inputs: Iterable[Any],
     evaluate: Callable[[Any, list[Any]], Iterable[Any]],
     constant: Callable[[Any], Any] = lambda value: value,
-    literal: Callable[[Any], Any] = lambda atom: atom.val,
+    literal: Callable[[Any], Any] | None = None,
     stop: int | None = None,
+    opened: Container[str] = (),
 ) -> list[Any]:
     """The outputs of a jaxpr, closed or not, over values of any kind.
 
-    **Arguments:** `evaluate(equation, operands)` gives the outputs of one equation; `constant(value)` and `literal(atom)` turn what the
-    program has of its own into values. With `stop`, the equations from that number on are left out, and there are no outputs.
+    **Arguments:** `evaluate(equation, operands)` gives the outputs of one equation; `constant(value)` turns what the program has of its own
+    into values, and the numbers in its equations, unless `literal(atom)` does. The programs that `opened` primitives call are walked
+    through. With `stop`, the equations from that number on are left out, and there are no outputs.
     """
+    literal = literal or (lambda atom: constant(np.asarray(atom.val, atom.aval.dtype)))
     jaxpr, constants = getattr(program, "jaxpr", program), map(constant, getattr(program, "consts", ()))
     environment = dict(zip([*jaxpr.constvars, *jaxpr.invars], [*constants, *inputs], strict=True))
     read = lambda atom: literal(atom) if isinstance(atom, core.Literal) else environment[atom]  # type: ignore[attr-defined]
     for equation in jaxpr.eqns[:stop]:
-        environment.update(zip(equation.outvars, evaluate(equation, [read(atom) for atom in equation.invars]), strict=True))
+        operands = [read(atom) for atom in equation.invars]
+        if equation.primitive.name in opened:
+            outputs: Iterable[Any] = walk(called_program(equation), operands, evaluate, constant, literal, opened=opened)
+        else:
+            outputs = evaluate(equation, operands)
+        environment.update(zip(equation.outvars, outputs, strict=True))
     return [read(atom) for atom in jaxpr.outvars] if stop is None else []
 
 
@@ -48,9 +56,21 @@ def called_program(equation: Any) -> Any:
     return program if hasattr(program, "consts") else core.ClosedJaxpr(program, ())
 
 
+def is_call_of(equation: Any, function: Callable) -> bool:
+    """Whether a call is of this function of JAX, not of one of the user's with the same name."""
+    given = [jax.ShapeDtypeStruct(v.aval.shape, v.aval.dtype, weak_type=v.aval.weak_type) for v in equation.invars]
+    own = jax.make_jaxpr(function)(*given).jaxpr.eqns
+    return len(own) == 1 and str(own[0].params["jaxpr"]) == str(equation.params.get("jaxpr"))
+
+
 def branch_index(index: Any, params: dict) -> int:
     """The number of the branch that a `cond` takes."""
     return min(max(int(index), 0), len(params["branches"]) - 1)
+
+
+def columns_of_branches(params: dict, operands: Sequence[Any], run: Callable[[Any, Any], Any]) -> Iterator[tuple]:
+    """For each output of a `cond` what the branches make of it, by run(branch, operands)."""
+    return zip(*(run(branch, operands) for branch in params["branches"]), strict=True)
 
 
 def parts_of_scan(params: dict) -> tuple[int, int]:

@@ -14,11 +14,15 @@ import jax
 import jax.custom_batching
 import jax.numpy as jnp
 import numpy as np
-from jax.experimental.xla_metadata import set_xla_metadata
 from jax.extend import core
 from jaxtyping import Array, Float
 
 from .walker import called_program
+
+try:
+    from jax.experimental.xla_metadata import set_xla_metadata
+except ImportError:  # a version of JAX without it runs the loop kernel by kernel
+    set_xla_metadata = None  # type: ignore[assignment]
 
 ELEMENTWISE = (
     "abs acos acosh add add_any and asin asinh atan atan2 atanh bitcast_convert_type cbrt ceil clamp convert_element_type copy cos cosh "
@@ -47,7 +51,7 @@ def in_whole_kernel(function: Callable) -> Callable:
     def wrapped(given: Float[Array, " n"], result: Float[Array, " m"]) -> Float[Array, " m"]:
         program = jax.make_jaxpr(function)(given, result)
         run = lambda given, result: core.jaxpr_as_fun(program)(given, result)[0]
-        if jax.default_backend() != "cpu" or not _is_allowed(program):
+        if set_xla_metadata is None or jax.default_backend() != "cpu" or not _is_allowed(program):
             return run(given, result)
 
         def chosen(given, result):

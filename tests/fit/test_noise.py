@@ -1,5 +1,6 @@
 """Channels without a stated sigma: each has its own, the most likely one, whatever the units; against SciPy and NumPy."""
 
+import dataclasses
 import itertools
 
 import bench_coverage
@@ -9,6 +10,8 @@ import pytest
 from scipy import optimize
 
 import jaxlag as jl
+from jaxlag._fit import minimise
+from jaxlag._fit.problem import linearise, reweighted
 
 FREE = ("c", "b")
 SIZES = {"x": 0.02, "v": 0.3}
@@ -181,3 +184,23 @@ def test_intervals_hold_the_truth_at_times_at_random(rho):
     """400 recordings of 200 samples, whose noise is correlated in time."""
     held = bench_coverage.coverage(bench_coverage.in_the_corners(200, 1, True, rho))
     assert all(0.90 <= part <= 0.98 for part in held.values()), held
+
+
+def test_other_weights_take_no_motion(monkeypatch):
+    points = []
+    linearise = minimise.linearise
+    monkeypatch.setattr(minimise, "linearise", lambda problem, x: points.append(x) or linearise(problem, x))
+    found = fit(record(3))
+    assert found.converged and found.problem.batches[0].sigma["x"][0, 0] != 1  # sigmas were estimated, in rounds
+    assert len(points) == found.steps + 1
+
+
+@pytest.mark.parametrize("loss", [None, jl.Huber()])
+def test_residuals_of_other_weights_are_those_of_a_motion_with_them(loss):
+    found = fit(record(3, x=np.where(np.arange(len(osc.TIMES)) % 7 == 0, np.nan, values(3)["x"])), loss=loss)
+    heavier = [dataclasses.replace(b, sigma={"x": 3.0 * b.sigma["x"], "v": 0.1 * b.sigma["v"]}) for b in found.problem.batches]
+    anew = dataclasses.replace(found.problem, batches=tuple(heavier), scale=np.asarray(0.7))
+    before, after = reweighted(anew, found.x, linearise(found.problem, found.x)), linearise(anew, found.x)
+    np.testing.assert_allclose(before.residuals, after.residuals, rtol=1e-12)
+    np.testing.assert_allclose(before.jacobian, after.jacobian, rtol=1e-12)
+    assert not np.allclose(before.residuals, linearise(found.problem, found.x).residuals)

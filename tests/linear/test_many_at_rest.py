@@ -8,8 +8,8 @@ from program_size import largest_array_and_count
 from scipy.optimize import brentq
 
 import jaxlag as jl
-from jaxlag._program.block_tridiagonal_lu import factorised, positive_eigenvalues
-from jaxlag._program.sparse_matrix import Places, SparseMatrix
+from jaxlag._program.block_tridiagonal import factorised, positive_eigenvalues
+from jaxlag._program.sparse_matrix import SparseMatrix, SparsityPattern
 
 LINKS, GRAVITY = 100, 9.81
 
@@ -271,7 +271,7 @@ def test_signs_of_pivots_are_those_of_eigenvalues():
     for row in range(m):
         dense[[2 * row, 2 * row + 1, 2 * row + 3], n + row] = rng.normal(size=3)
     dense = dense + dense.T
-    places = Places.of(dense + np.eye(n + m) != 0, n)
+    places = SparsityPattern.of(dense + np.eye(n + m) != 0, n)
     A = SparseMatrix(jnp.asarray(dense[places.rows, places.columns]), places)
     count, sound = positive_eigenvalues(A, factorised(A))
     assert sound and count == np.sum(np.linalg.eigvalsh(dense) > 0)

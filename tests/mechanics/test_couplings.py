@@ -65,7 +65,7 @@ def test_few_coordinates_are_not_asked():
 
 
 def test_a_program_that_is_too_long_to_be_read(monkeypatch):
-    monkeypatch.setattr("jaxlag._program.array_dependence.MAX_ENTRIES", 2 * N)  # a diagonal is shorter, three of them are not
+    monkeypatch.setattr("jaxlag._program.sparsity.MAX_ENTRIES", 2 * N)  # a diagonal is shorter, three of them are not
     found = examined({"row": lambda q, qdot: moving(q, qdot)})
     assert found.couplings == {("∂²L/∂q̇²", "row"): (N, N**2), ("∂²L/∂q²", "row"): (None, N**2)}
     (sentence,) = found.findings

@@ -23,7 +23,7 @@ def read(D, v, params):
     def found(v, params):
         flat = bind(jl.System(T, dissipation=D), v, params)
         flat_v, rest = jnp.ravel(v), (jnp.zeros(()), jnp.zeros(v.size), jnp.zeros(v.size), jnp.zeros(0))
-        elements = find_elements(flat, *rest[:3])
+        elements = find_elements(flat)
         if elements is None:
             return None
         (lifted,) = elements.potentials.values()

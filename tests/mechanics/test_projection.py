@@ -525,7 +525,8 @@ def test_chain_slides_off_a_table():
     np.testing.assert_allclose(motion.q["x"], cosh, rtol=SHORT)
     # Of the equation of u: λ = −ρ u ẍ + ½ρẋ², the pull at the edge less the momentum that crosses it
     edge = -CHAIN["rho"] * ((CHAIN["L"] - cosh) * w**2 * cosh - 0.5 * (w * sinh) ** 2)
-    np.testing.assert_allclose(motion.multipliers["length"], edge, rtol=SHORT, atol=SHORT * np.max(np.abs(edge)))
+    off = SHORT * CHAIN["rho"] * (np.abs(CHAIN["L"] - 2 * cosh) * w**2 * cosh + (w * sinh) ** 2)  # what such errors of x and ẋ make of λ
+    assert np.all(np.abs(motion.multipliers["length"] - edge) <= off)
 
 
 @pytest.mark.slow

@@ -96,7 +96,7 @@ def test_a_structure_is_checked_anew_in_another_precision():
 
 
 def test_few_structures_are_remembered(monkeypatch):
-    monkeypatch.setattr(given, "MOST", 2)
+    monkeypatch.setattr(given._CHECKED, "most", 2)
     for extra in ("a", "b", "c"):
         jl.energy(OSCILLATOR, {"x": 1.0}, {"x": 0.0}, {"c": 4.0, extra: 1.0})
     assert len(given._CHECKED) <= 2

@@ -147,6 +147,28 @@ def test_a_new_folder_is_private(compilation_cache, tmp_path):
     assert jl.keep_compiled(tmp_path / "new").stat().st_mode & 0o077 == 0
 
 
+@pytest.mark.skipif(sys.platform == "win32", reason="Windows has other rights")
+@pytest.mark.parametrize("rights, is_set", [(0o777, False), (0o770, False), (0o777, True)])
+def test_a_folder_that_others_can_write_to_is_not_used(compilation_cache, tmp_path, rights, is_set):
+    """They could put a program of theirs there."""
+    folder = tmp_path / "shared"
+    folder.mkdir()
+    folder.chmod(rights)
+    before = jax.config.jax_compilation_cache_dir
+    if is_set:
+        jax.config.update("jax_compilation_cache_dir", str(folder))
+    with pytest.warns(UserWarning, match=r"^`folder` must be a folder that only you can write to, .* `chmod go-w`, or give another folder"):
+        assert jl.keep_compiled(None if is_set else folder) == folder
+    assert is_set or jax.config.jax_compilation_cache_dir == before
+    system = jl.System(lambda q, qdot: 0.5 * qdot**2 - 2.0 * q**2)
+    assert jl.acceleration(system, 1.0, 0.0).qddot == -4.0
+    assert not list(folder.glob("jaxlag-*"))
+    folder.chmod(0o700)
+    jl.keep_compiled(folder)
+    assert jl.acceleration(jl.System(lambda q, qdot: 0.5 * qdot**2 - 2.0 * q**2), 1.0, 0.0).qddot == -4.0
+    assert list(folder.glob("jaxlag-*"))
+
+
 @pytest.mark.parametrize("wrong", [{"folder": 3}, {"max_bytes": "1 GB"}, {"max_bytes": -1}])
 def test_arguments_of_the_wrong_kind(wrong):
     (name,) = wrong

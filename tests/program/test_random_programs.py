@@ -18,7 +18,7 @@ from jaxlag._program.interpreter import Interpreter, evaluate
 from jaxlag._program.scalar_graph import SIMPLIFICATIONS, ScalarGraph
 from jaxlag._program.scalarise import JAX_ALGEBRA, scalarised
 from jaxlag._program.signed_zeros import equations_with_signed_zeros
-from jaxlag._program.sparse_jacobian import sparsity_pattern
+from jaxlag._program.sparsity import sparsity_pattern
 from jaxlag._program.structured_jacobian import structured_jacobian
 
 SEEDS, BLOCKS = 320, 4

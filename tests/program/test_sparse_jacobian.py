@@ -9,8 +9,9 @@ import pytest
 import jaxlag as jl
 from jaxlag._mechanics.pseudo_inverse import everywhere
 from jaxlag._mechanics.saddle_point import saddle_point
-from jaxlag._program.sparse_jacobian import jacobian, sparsity_pattern
+from jaxlag._program.sparse_jacobian import jacobian
 from jaxlag._program.sparse_matrix import SparseMatrix, dense
+from jaxlag._program.sparsity import sparsity_pattern
 
 G = 9.81
 

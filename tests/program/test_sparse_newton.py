@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import scipy.sparse
 
-from jaxlag._program.sparse_newton import linear_solution, sparse_places
+from jaxlag._program.sparse_newton import linear_solution, square_pattern
 
 SIZE = 60
 
@@ -31,9 +31,9 @@ def saddle(kind, rng):
 def test_solution_and_its_transpose(kind):
     rng = np.random.default_rng(4)
     K = saddle(kind, rng)
-    places = sparse_places(scipy.sparse.csr_matrix(K != 0), last=SIZE, sparse=1)
+    pattern = square_pattern(scipy.sparse.csr_matrix(K != 0), last=SIZE, sparse=1)
     push = lambda x: jnp.asarray(K) @ x
-    solve = lambda b: linear_solution(push, places, b)
+    solve = lambda b: linear_solution(push, pattern, b)
     b, c = K @ rng.normal(size=len(K)), K.T @ rng.normal(size=len(K))
     found, pull = jax.vjp(solve, jnp.asarray(b))
     for x, matrix, right in ((found, K, b), (pull(jnp.asarray(c))[0], K.T, c)):
@@ -41,5 +41,5 @@ def test_solution_and_its_transpose(kind):
         np.testing.assert_allclose((matrix @ x - right) / size, 0, atol=1e-11)
         if kind != "units":
             np.testing.assert_allclose(x[:SIZE], np.linalg.lstsq(matrix, right)[0][:SIZE], atol=1e-7)
-    several = linear_solution(lambda X: jnp.asarray(K) @ X, places, jnp.stack([b, 2 * b], axis=1))
+    several = linear_solution(lambda X: jnp.asarray(K) @ X, pattern, jnp.stack([b, 2 * b], axis=1))
     np.testing.assert_allclose(several, np.stack([found, 2 * found], axis=1), rtol=1e-6, atol=1e-7 * np.abs(found).max())

@@ -5,8 +5,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxlag._program.array_dependence import dependence
 from jaxlag._program.expressions import TooLong
+from jaxlag._program.sparsity import array_by_array as dependence
 
 N = 12
 FIRST, SECOND = np.array([0, 3, 3, 7, 11]), np.array([1, 5, 4, 2, 0])
@@ -33,6 +33,9 @@ EXACT = {  # whose every dependence is one at a random point
     "padded": lambda x: jnp.pad(x[3:6], (2, 1)) * jnp.arange(6.0),
     "set": lambda x: x.at[np.array([1, 5])].set(x[:2] * x[2:4]),
     "added": lambda x: jnp.zeros(6).at[np.array([0, 2, 2, 5])].add(x[:4] ** 2),
+    "added at the nearest place": lambda x: jnp.zeros(4).at[np.array([0, 9])].add(x[:2] ** 2, mode="clip"),
+    "outside": lambda x: x.at[np.array([1, 99])].set(x[:2] * x[3], mode="drop") * x.at[2 * np.arange(N)].get(mode="fill", fill_value=1),
+    "along an axis": lambda x: (jnp.take_along_axis(x.reshape(3, 4), np.array([[1], [0], [3]]), axis=1) * x[:3, None]).ravel(),
     "rows added": lambda x: jnp.zeros((4, 3)).at[np.array([1, 3])].add(x[:6].reshape(2, 3) ** 2).ravel(),
     "selected": lambda x: jnp.where(np.arange(N) % 3 == 0, x, x[::-1] ** 2),
     "scan": lambda x: jax.lax.scan(lambda c, x: (c + x[0] ** 2, c * x[1]), x[0], x[1:11].reshape(5, 2))[1],

@@ -1,19 +1,19 @@
-"""Numbers and running sums of them in a line of blocks, each coupled with the one before it alone: found from the places of entries."""
+"""Numbers and running sums of them in a line of blocks, each coupled with the one before it alone: found from the pattern of entries."""
 
-import functools
 from typing import NamedTuple
 
 import numpy as np
 import scipy.sparse
 
+from .registry import remembered
 from .running_sums import RunningSum
-from .sparse_matrix import Places
+from .sparse_matrix import SparsityPattern, elimination_order
 
 MOST_IN_A_BLOCK = 40  # numbers and sums: beyond, a few hundred rows are solved faster as a full matrix
 
 
-class Line(NamedTuple):
-    """How a quadratic form of x and its running sums is taken apart: fixed while tracing, by the places of its entries alone.
+class ChainOrdering(NamedTuple):
+    """How a quadratic form of x and its running sums is taken apart: fixed while tracing, by the pattern of its entries alone.
 
     `entry` holds for each block, and for each number of its matrices that differs from block to block, which entry it is, the last but
     one a 0, the last a 1. `slots` holds the matrices by numbers of these, with a 0 and a 1 behind them: H of what is in a block, and
@@ -27,13 +27,13 @@ class Line(NamedTuple):
     slots: tuple[np.ndarray, ...]
 
 
-@functools.lru_cache(maxsize=64)
-def line(places: Places, sums: tuple[RunningSum, ...]) -> Line | None:
+@remembered
+def chain_ordering(pattern: SparsityPattern, sums: tuple[RunningSum, ...]) -> ChainOrdering | None:
     """The line of the slopes of a form in z = (x, w) and, below them, of the summands; None where blocks would be large, where a sum
     depends on what comes behind it, or where the form does not depend on an x at all.
     """
-    n = places.shape[1] - sum(s.size for s in sums)
-    rows, columns, number, of_sums = _entries(places, sums, n)
+    n = pattern.shape[1] - sum(s.size for s in sums)
+    rows, columns, number, of_sums = _entries(pattern, sums, n)
     squares = rows[~of_sums & (rows == columns)]
     if not np.all(np.isin(np.arange(n), np.append(squares, columns[of_sums]))):
         return None
@@ -46,7 +46,7 @@ def line(places: Places, sums: tuple[RunningSum, ...]) -> Line | None:
     a = at.shape[1]
     if width > MOST_IN_A_BLOCK:
         return None
-    zero, one = places.rows.size, places.rows.size + 1
+    zero, one = pattern.rows.size, pattern.rows.size + 1
     blocks = [np.full((len(at), height, width), zero) for height in (width, width, width - a, width - a)]
     blocks[0][:, range(a), range(a)] = np.where(at < n, zero, one)
     for kind in range(4):
@@ -57,24 +57,22 @@ def line(places: Places, sums: tuple[RunningSum, ...]) -> Line | None:
     blocks[1::2] = [x[:, :, handed] for x in blocks[1::2]]
     for x in blocks[1::2]:  # nothing comes before the first
         x[0] = x[-1] if np.all(x[-1] >= zero) else np.where(np.all(x[1:] == one, axis=0), one, zero)
-    return Line(at, np.flatnonzero(at.ravel() < n)[np.argsort(at[at < n])], handed, *_numbers(blocks, zero))
+    return ChainOrdering(at, np.flatnonzero(at.ravel() < n)[np.argsort(at[at < n])], handed, *_numbers(blocks, zero))
 
 
-def _entries(places: Places, sums: tuple[RunningSum, ...], n: int) -> tuple[np.ndarray, ...]:
+def _entries(pattern: SparsityPattern, sums: tuple[RunningSum, ...], n: int) -> tuple[np.ndarray, ...]:
     """Of each entry the z that it is about, the z by which, its number, and whether it is one of a sum; the sum before each with a 1."""
-    size, starts = places.shape[1], np.cumsum([n, *(s.size for s in sums)])
+    size, starts = pattern.shape[1], np.cumsum([n, *(s.size for s in sums)])
     before = np.concatenate([np.full(n, -1), *(np.where(s.before() < 0, -1, s.before() + k) for s, k in zip(sums, starts, strict=False))])
     carried = np.flatnonzero(before >= 0)
-    rows = np.append(np.where(places.rows < size, places.rows, places.rows - size + n), carried)
-    columns = np.append(places.columns, before[carried])
-    number = np.append(np.arange(places.rows.size), np.full(carried.size, places.rows.size + 1))
-    return rows, columns, number, np.append(places.rows >= size, np.ones(carried.size, bool))
+    rows = np.append(np.where(pattern.rows < size, pattern.rows, pattern.rows - size + n), carried)
+    columns = np.append(pattern.columns, before[carried])
+    number = np.append(np.arange(pattern.rows.size), np.full(carried.size, pattern.rows.size + 1))
+    return rows, columns, number, np.append(pattern.rows >= size, np.ones(carried.size, bool))
 
 
 def _places(rows, columns, of_sums, n: int, sums: tuple[RunningSum, ...]) -> np.ndarray:
-    """Of a sum how many are before it; of an x that of the first sum it is in, or of what it is beside; of others by Cuthill and McKee."""
-    from scipy.sparse.csgraph import reverse_cuthill_mckee  # imported here because that takes a while
-
+    """Of a sum how many are before it; of an x that of the first sum it is in, or of what it is beside; of others by elimination."""
     size = n + sum(s.size for s in sums)
     place = np.concatenate([np.full(n, size), *(s.along() for s in sums)])
     for of in (of_sums, ~of_sums):
@@ -84,7 +82,7 @@ def _places(rows, columns, of_sums, n: int, sums: tuple[RunningSum, ...]) -> np.
     rest = np.flatnonzero(place == size)
     if rest.size:
         coupled = scipy.sparse.csr_matrix((np.ones(rows.size), (rows, columns)), (size, size))[rest][:, rest]
-        place[rest[reverse_cuthill_mckee(scipy.sparse.csr_matrix(coupled), symmetric_mode=True)]] = np.arange(rest.size)
+        place[rest[elimination_order(coupled)]] = np.arange(rest.size)
     return place
 
 

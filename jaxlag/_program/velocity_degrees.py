@@ -6,20 +6,19 @@ import math
 from collections.abc import Iterable
 from typing import Any
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
 from .expressions import Algebra, Arrays, Node, filled, is_number, objects
 from .interpreter import Interpreter
-from .walker import CALLS, CALLS_WITH_DERIVATIVE_RULE, branch_index, primitive_names
+from .primitives import ANY_CALL, LINEAR, ORDER
+from .rules import map_elements
+from .walker import branch_index, columns_of_branches, is_call_of, primitive_names
 
 Path = tuple[int, ...]  # to an equation: its number in the program, that of the call within it, that of the equation in there, ...
 Place = tuple[Path, int, int, float]  # the equation, its output, the element of it, and the number to multiply it by
-INLINED = frozenset((*CALLS, *CALLS_WITH_DERIVATIVE_RULE, "scan", "cond"))
-LINEAR = frozenset(("add", "sub", "add_any", "neg", "copy", "stop_gradient"))
-ORDER = {"gt": 1, "ge": 1, "lt": -1, "le": -1}
+INLINED = ANY_CALL | {"scan", "cond"}
 NONLINEAR = 9
 MAX_MULTIPLICATIONS = 2_000  # a product of arrays with more of them is not taken apart
 
@@ -27,13 +26,13 @@ MAX_MULTIPLICATIONS = 2_000  # a product of arrays with more of them is not take
 class _Symbolic(Algebra):
     """Of a node only its operands are known: enough to ask what it becomes where others vanish."""
 
-    interpreter: "Structure"
+    interpreter: "VelocityDegrees"
 
     def function(self, primitive, params, dtype):
         return lambda *operands: self.interpreter.apply(primitive, params, dtype, *operands)
 
 
-class Structure(Interpreter):
+class VelocityDegrees(Interpreter):
     """Interprets programs for their structure: of each node its degree in the velocities, and its place in the program.
 
     It walks as every `Interpreter` does, and notes the path to each equation: `run` and `equation` wrap those of the interpreter.
@@ -105,9 +104,9 @@ class Structure(Interpreter):
         self.path.append(-1)
         special = {"cond": self._cond, "dot_general": self._dot_general}.get(name)
         results = special(equation, operands, here) if special else None
-        if results is None and name in ("jit", "pjit") and equation.params["name"] == "hypot" and is_hypot(equation):
+        if results is None and equation.params.get("name") == "hypot" and len(operands) == 2 and is_call_of(equation, jnp.hypot):
             root = lambda x, y: self.apply(lax.sqrt_p, {}, x.dtype, self.add(self.mul(x, x), self.mul(y, y)))
-            results, name = [np.asarray(np.frompyfunc(root, 2, 1)(*map(objects, operands)), object)], "sqrt"
+            results, name = [map_elements(root, *operands)], "sqrt"
         if results is None:
             self.opaque_depth += name not in INLINED
             results = super().equation(equation, operands)
@@ -163,14 +162,11 @@ class Structure(Interpreter):
     def _cond(self, equation, operands, here):
         """All branches where the index is not known: one of them is selected, as under `vmap`."""
         index, *operands = operands
-        branches = equation.params["branches"]
         if index.dtype != object:
             self.branches[here] = branch_index(index, equation.params)
-            return self.run(branches[self.branches[here]], operands)
-        cases = [[objects(x) for x in self.run(branch, operands)] for branch in branches]
-        which = index.item()
-        select = lambda *of: self.apply(lax.select_n_p, {}, of[0].dtype, which, *of)
-        return [np.asarray(np.frompyfunc(select, len(branches), 1)(*column), object) for column in zip(*cases, strict=True)]
+            return self.run(equation.params["branches"][self.branches[here]], operands)
+        select = lambda *of: self.apply(lax.select_n_p, {}, of[0].dtype, index.item(), *of)
+        return [map_elements(select, *column) for column in columns_of_branches(equation.params, operands, self.run)]
 
     def with_zeros(self, x: Any, zeros: Iterable[Node], positive: frozenset[Node]) -> Any:
         """What a node becomes where others are zero. In a power 0^p with unknown p, p > 0 is assumed; a node among `positive` that is
@@ -211,10 +207,3 @@ def split_coefficient(x: Any) -> tuple[Any, Any]:
         number, node = split_coefficient(x.operands[0])
         return -number, node
     return x.operands if x.name == "mul" and is_number(x.operands[0]) else (1.0, x)
-
-
-def is_hypot(equation: Any) -> bool:
-    """Whether a jitted function of this name is JAX's own, not the user's."""
-    given = [jax.ShapeDtypeStruct(v.aval.shape, v.aval.dtype, weak_type=v.aval.weak_type) for v in equation.invars]
-    own = jax.make_jaxpr(jnp.hypot)(*given).jaxpr.eqns
-    return len(given) == 2 and len(own) == 1 and str(own[0].params["jaxpr"]) == str(equation.params["jaxpr"])
