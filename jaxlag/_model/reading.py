@@ -1,4 +1,4 @@
-"""What is static about a system: read in its programs once, whatever its numbers."""
+"""What is static about a system: read in its programs once for each program that is traced, whatever the numbers."""
 
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple, TypeVar
@@ -8,7 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PyTree
 
-from .._program.registry import MOST, Table
+from .._program.jit import traced_program
+from .._program.registry import Table
 from .system import System
 
 T = TypeVar("T")
@@ -96,13 +97,14 @@ class Source(NamedTuple):
         leaves, structure = self._leaves()
         form = tuple(_shape(x) if hasattr(x, "dtype") else x for x in leaves)
         key = question, self.variants, structure, form, jax.tree.structure(self.like), tuple(jax.tree.leaves(self.like))
-        known = _READ.setdefault(self.system, {})
+        now, known = _READ.get(self.system, (None, {}))
+        if now != traced_program():
+            known = {}
+            _READ[self.system] = traced_program(), known
         if key in known:
             return known[key]
         found, holds = read(self)
         if holds:
-            if len(known) >= MOST:
-                known.clear()
             known[key] = found
         return found
 
@@ -114,4 +116,4 @@ def _shape(x):
     return jax.ShapeDtypeStruct(x.shape, x.dtype, weak_type=bool(getattr(x, "weak_type", False)))
 
 
-_READ = Table(weak=True)  # by system, and then by question and form
+_READ = Table(weak=True)  # by system, for the program that is traced; there by question and form

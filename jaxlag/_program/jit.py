@@ -6,6 +6,7 @@ choice is the user's: the environment variable XLA_FLAGS="--xla_cpu_use_fusion_e
 """
 
 import functools
+import threading
 from collections.abc import Callable, Iterable
 from typing import Any
 
@@ -54,6 +55,27 @@ def compiled(function: Callable) -> Callable:
     return call
 
 
+class _Traced(threading.local):
+    """Counts the programs that are traced, those within others not."""
+
+    depth, number = 0, 0
+
+    def __enter__(self) -> None:
+        self.number += not self.depth
+        self.depth += 1
+
+    def __exit__(self, *_: object) -> None:
+        self.depth -= 1
+
+
+_TRACED = _Traced()
+
+
+def traced_program() -> tuple[int, int]:
+    """Which program is being traced, or was last: what functions close over may have changed when the next one is."""
+    return threading.get_ident(), _TRACED.number
+
+
 def _program(function, **options):
     """The compiled `function(arrays, static)`."""
 
@@ -61,7 +83,8 @@ def _program(function, **options):
         leaves, structure = static
         merged = [array if leaf is None else leaf for array, leaf in zip(arrays, leaves, strict=True)]
         given, named = jax.tree.unflatten(structure, merged)
-        return function(*given, **named)
+        with _TRACED:
+            return function(*given, **named)
 
     on_leaves.__name__ = getattr(function, "__name__", "on_leaves")  # the name of the program
     return jax.jit(on_leaves, static_argnums=1, **options)

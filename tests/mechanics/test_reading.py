@@ -107,3 +107,16 @@ def test_what_was_read_goes_with_the_system():
     jax.clear_caches()
     gc.collect()
     assert gone() is None
+
+
+def test_what_functions_close_over_may_change_between_programs():
+    """A new program sees it everywhere: friction that was read before, and a coupling of masses that was zero."""
+    bound, coupling = [1.0], [0.0]
+    system = jl.System(
+        lambda qdot: 0.5 * qdot @ qdot + coupling[0] * qdot[0] * qdot[1], dissipation=lambda qdot: bound[0] * jnp.abs(qdot[3])
+    )
+    state = np.zeros(4), np.array([0.0, 0.0, 0.0, 1.0])
+    np.testing.assert_allclose(jl.acceleration(system, *state).qddot, [0, 0, 0, -1], rtol=1e-14)
+    bound[0], coupling[0] = 2.0, 0.5
+    assert jl.powers(system, *state)["dissipation"] == -2.0
+    np.testing.assert_array_equal(jl.mass_matrix(system, *state)[:2, :2], [[1.0, 0.5], [0.5, 1.0]])
