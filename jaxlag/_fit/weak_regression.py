@@ -235,6 +235,7 @@ NARROWEST = 2.0  # intervals between samples in half a window
 SPARE = 3  # windows that do not overlap, beyond those needed, from which on standard errors can be trusted
 SLIDING, REVERSING = 0.0, 0.4  # the largest part of a window near rest: where friction slides, and where it may reverse
 NEGLIGIBLE = 0.003  # of the size of an equation's terms: residuals below it count as that
+EQUAL = 0.999  # of the signal-to-noise ratio of the best: estimates that predict the same, among which standard errors decide
 ALIKE = 0.8  # of the signal-to-noise ratio of the best: estimates that predict as well, whose scatter is part of its error
 
 
@@ -245,8 +246,9 @@ def best_estimate(problem: WeakFormProblem, halves: np.ndarray) -> Estimate | No
     draws estimates towards zero. In windows of steady motion some terms do not vary. In those where friction sticks its force is
     unknown. Standard errors of one width know nothing of all that, but windows of other widths contradict it. So the best estimate is
     the one with the largest ratio of signal to noise on average over all widths: of the terms of the equations to what is left of them,
-    to which the error of the prediction is added. Where estimates that are as good scatter by more than their standard errors allow, as
-    they do where the model misses something, the error grows by that scatter.
+    to which the error of the prediction is added; of those that predict the same, the one with the smallest standard errors. Where
+    estimates that are as good scatter by more than their standard errors allow, as they do where the model misses something, the error
+    grows by that scatter.
 
     **Source:** Stone, J. R. Stat. Soc. B 36 (1974) 111 (choice by prediction); Hausman, Econometrica 46 (1978) 1251 (the variance of the
     difference of two estimates).
@@ -267,7 +269,8 @@ def best_estimate(problem: WeakFormProblem, halves: np.ndarray) -> Estimate | No
     sure = [found for found in sure if _undetermined(found) == fewest]
     windows = [(found.half, found.near_rest) for found in sure]
     ratios = np.array([_signal_to_noise(problem, found, windows) for found in sure])
-    best = sure[int(np.argmax(ratios))]
+    equal = [found for found, ratio in zip(sure, ratios, strict=True) if ratio >= EQUAL * np.max(ratios)]
+    best = min(equal, key=_volume)
     as_good = [found for found, ratio in zip(sure, ratios, strict=True) if ratio >= ALIKE * np.max(ratios)]
     return best._replace(errors=with_scatter(best.y, best.errors, [(one.y, one.errors) for one in as_good]), as_good=tuple(as_good))
 
@@ -278,6 +281,11 @@ def half_widths(records: Sequence[Record]) -> np.ndarray:
     shortest = NARROWEST * min(record.interval for record in records)
     count = max(int(np.log(WIDEST * longest / shortest) / np.log(GROWTH)) + 1, 1)
     return WIDEST * longest / GROWTH ** np.arange(count)
+
+
+def _volume(found):
+    """Of the errors of what is determined, as a logarithm: any unit does."""
+    return float(np.sum(np.log(np.maximum(found.errors[np.isfinite(found.errors)], np.finfo(float).tiny))))
 
 
 def _undetermined(found):
