@@ -121,8 +121,8 @@ def _left_singular_vectors(rows: Float[Array, "m n"]) -> tuple[Float[Array, "m m
     Source: Golub & Van Loan, Matrix Computations, 4th ed., section 8.6.3 (one-sided Jacobi).
     """
     if len(rows) != 2:
-        U, values, _ = jnp.linalg.svd(rows)
-        return U, jnp.zeros_like(rows[:, 0]).at[: values.size].set(values)
+        U, values, _ = jnp.linalg.svd(rows, full_matrices=False)  # no more rows than columns, with those that are absent
+        return U, values
     a, b = rows
     product = a @ b
     zeta = (b @ b - a @ a) / jnp.where(product == 0, 1, 2 * product)

@@ -46,30 +46,54 @@ def friction_and_direction(
 
     One program of `friction_in` serves all: it runs once, and once for each row where σ is to be changed.
     """
-    of, r, eps = elements.element_of_row, sigma.size, jnp.finfo(sigma.dtype).eps
-    given = jnp.where(freed[of], jnp.finfo(sigma.dtype).tiny ** 0.25, sigma)  # a σ of this length slips without a force
+    given, kinds = without_force(elements, sigma, freed), (freed, released, anew)
     if not np.any(elements.is_vector):
-        return friction_in(given), jnp.where((freed & anew)[of], 0, sigma), jnp.array(False)
-    begin = anew & jnp.any(freed & elements.is_vector)
-
-    def turning_in(found):
-        along = elements.sums(sigma * found.slip_rate)
-        across = elements.norms(found.slip_rate - along[of] * sigma)
-        off = across > ACROSS * along + 1e3 * eps * free_rate
-        off = off & (along > CLEAR * free_rate) | (found.bound == 0) & (off | (along < 0))  # without a bound, it goes where it goes
-        return released & ~freed & elements.is_vector & ~found.straight & off
+        return friction_in(given), *turned_by_rates(elements, None, sigma, None, kinds, breaks, free_rate)
+    r = sigma.size
 
     def evaluated(carry):
         i, found, rates = carry
-        other = friction_in(given + jnp.where(jnp.arange(1, r + 1) == i, CHANGE, jnp.zeros_like(sigma)))
+        other = friction_in(given + changed_row(i - 1, r, sigma.dtype))
         found = jax.tree.map(lambda new, old: jnp.where(i == 0, new, old), other, found)
         return i + 1, found, rates.at[i].set(other.slip_rate)
 
-    going_on = lambda carry: (carry[0] <= r) & (begin | jnp.any(turning_in(carry[1])))
+    going_on = lambda carry: (carry[0] <= r) & asks_for_rates(elements, carry[1], sigma, kinds, free_rate)
     nothing = jax.tree.map(lambda like: jnp.zeros(like.shape, like.dtype), jax.eval_shape(friction_in, given))
     _, found, rates = repeated(evaluated, (0, nothing, jnp.zeros((r + 1, r), sigma.dtype)), going_on)
+    return found, *turned_by_rates(elements, found, sigma, rates, kinds, breaks, free_rate)
 
-    w, turns = rates[0], turning_in(found)
+
+def changed_row(i, r: int, dtype: Any) -> Float[Array, " r"]:
+    """By what σ is changed in row i, for the derivative of the slip rate; of no row there is no change."""
+    return jnp.where(jnp.arange(r) == i, CHANGE, jnp.zeros(r, dtype))
+
+
+def asks_for_rates(elements: FrictionElements, found: Any, sigma, kinds, free_rate) -> Bool[Array, ""]:
+    """Whether slip rates with σ changed in each row are needed beside the friction that was `found`: where some of several rows turn."""
+    if not np.any(elements.is_vector):
+        return jnp.array(False)
+    freed, _, anew = kinds
+    begin = anew & jnp.any(freed & elements.is_vector)
+    return begin | jnp.any(_turning(elements, found, sigma, kinds, free_rate))
+
+
+def _turning(elements, found, sigma, kinds, free_rate):
+    freed, released, _ = kinds
+    along = elements.sums(sigma * found.slip_rate)
+    across = elements.norms(found.slip_rate - along[elements.element_of_row] * sigma)
+    off = across > ACROSS * along + 1e3 * jnp.finfo(sigma.dtype).eps * free_rate
+    off = off & (along > CLEAR * free_rate) | (found.bound == 0) & (off | (along < 0))  # without a bound, it goes where it goes
+    return released & ~freed & elements.is_vector & ~found.straight & off
+
+
+def turned_by_rates(
+    elements: FrictionElements, found: Any, sigma: Float[Array, " r"], rates, kinds: tuple, breaks: Bool[Array, ""], free_rate
+) -> tuple[Float[Array, " r"], Bool[Array, ""]]:
+    """σ turned, and whether any element that slips was, by the slip `rates` in σ and with each of its rows changed."""
+    (freed, _, anew), of = kinds, elements.element_of_row
+    if not np.any(elements.is_vector):
+        return jnp.where((freed & anew)[of], 0, sigma), jnp.array(False)
+    begin, w, turns = anew & jnp.any(freed & elements.is_vector), rates[0], _turning(elements, found, sigma, kinds, free_rate)
     slope = ((rates[1:] - w[None]) / CHANGE).T
     line = jnp.where(found.straight[of], jnp.abs(unit(elements, w)), 1)  # a change of σ across a line is turned along it
     slope = slope * line[None, :]
@@ -77,7 +101,12 @@ def friction_and_direction(
     turned = jnp.where(unbound, unit(elements, w), _turned(elements, sigma, w, slope, turns & (found.bound != 0)))
     begun = lambda: _begun(elements, w, slope, freed & ~found.driven & ~elements.is_quasistatic, found.bound, breaks)
     begun = jax.lax.cond(begin, begun, lambda: jnp.zeros_like(sigma))
-    return found, jnp.where((freed & anew)[of], begun, turned), jnp.any(turns)
+    return jnp.where((freed & anew)[of], begun, turned), jnp.any(turns)
+
+
+def without_force(elements: FrictionElements, sigma: Float[Array, " r"], freed: Bool[Array, " e"]) -> Float[Array, " r"]:
+    """σ where those `freed` slip without a force, as one of next to no length has it."""
+    return jnp.where(freed[elements.element_of_row], jnp.finfo(sigma.dtype).tiny ** 0.25, sigma)
 
 
 def turning(elements: FrictionElements, slip_rate_in: Callable, sigma: Float[Array, " r"], begin: Bool[Array, " e"]) -> Array:

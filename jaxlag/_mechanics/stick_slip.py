@@ -7,6 +7,7 @@ In each mode the system is an ordinary one, so the rest of the package need not 
 Source: Pfeiffer & Glocker, Multibody Dynamics with Unilateral Contacts, chapters 5 and 6.
 """
 
+import dataclasses
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -140,7 +141,7 @@ class Mode(NamedTuple):
     bound: Float[Array, " e"]
 
 
-class _Search(NamedTuple):
+class Search(NamedTuple):
     """The state of the search for a mode, and for the closed contacts; slip rates without friction, the scale for others."""
 
     stage: Any
@@ -170,26 +171,52 @@ class NoContact(NamedTuple):
         return self, False
 
 
-def select_mode(
-    flat: Flat, elements: FrictionElements, t, q, v, sigma, at_rest, breaking, contacts: Any = NoContact(), friction_in: Any = None
-) -> tuple[Mode, Any]:
+@dataclasses.dataclass(frozen=True)
+class ModeSelection:
     """Mode selection where the elements `at_rest` have no slip; the others continue to slip along σ.
 
     All at rest stick, except those `breaking` away at their bound; where some have several rows, they begin as they do together
     (`slip_direction`). One by one, the element farthest beyond its bound slips against its force, and one that would start backwards
     sticks again, until none is beyond its bound and none moves backwards. Of dependent elements some may be at their bound while others
-    hold them: one of the possible shares, with the same motion for all. Where one of the `contacts` pulls or goes deeper in this mode, it
-    changes and all begins anew. `friction_in(σ, contacts)` is the friction of this state in another mode, if there is a program of it.
+    hold them: one of the possible shares, with the same motion for all. Where one of the contacts pulls or goes deeper in this mode, it
+    changes and all begins anew.
     """
-    of, no, most = elements.element_of_row, jnp.zeros(elements.size, bool), 4 * elements.size + 6
-    friction_in = friction_in or _in_modes(flat, elements, t, q, v)
 
-    def turn(search):
+    flat: Flat
+    elements: FrictionElements
+    t: Any
+    q: Float[Array, " n"]
+    v: Float[Array, " n"]
+    sigma: Float[Array, " r"]
+    at_rest: Bool[Array, " e"]
+    breaking: Bool[Array, " e"]
+
+    @property
+    def most(self) -> int:
+        """Turns that a search takes at most, while no contact changes."""
+        return 4 * self.elements.size + 6
+
+    @property
+    def resting(self) -> Float[Array, " r"]:
+        """σ where all at rest stick."""
+        return jax.lax.stop_gradient(jnp.where(self.at_rest[self.elements.element_of_row], 0, self.sigma))
+
+    def start(self, contacts: Any = NoContact()) -> Search:
+        """Nothing is known yet."""
+        nothing, no = jnp.zeros(self.elements.size, self.v.dtype), jnp.zeros(self.elements.size, bool)
+        return Search(jnp.array(LOOSE), contacts, Mode(self.resting, no, jnp.array(False), nothing), jnp.array(0), no, nothing)
+
+    def kinds(self, search: Search) -> tuple[Any, Any, Any, Any]:
+        """Which elements are freed of their force, which slip that were at rest; whether all begins anew, and whether some break away."""
+        released = self.at_rest & ~sticking(self.elements, search.mode.sigma)
+        freed = jnp.where(search.stage == LOOSE, self.at_rest, released & (search.stage == HOLD))
+        return freed, released, search.stage == LOOSE, jnp.any(self.breaking)
+
+    def next(self, search: Search, found: Friction, turned: Float[Array, " r"], turns: Any) -> Search:
+        """Onward with the friction that was `found` in the mode of the search, and with σ `turned`, where it `turns`."""
+        elements, at_rest, breaking, of = self.elements, self.at_rest, self.breaking, self.elements.element_of_row
         mode, stage = search.mode, search.stage
-        released = at_rest & ~sticking(elements, mode.sigma)
-        freed = jnp.where(stage == LOOSE, at_rest, released & (stage == HOLD))
-        of_mode, kinds = lambda sigma: friction_in(sigma, search.contacts), (freed, released, stage == LOOSE, jnp.any(breaking))
-        found, turned, turns = friction_and_direction(elements, of_mode, mode.sigma, *kinds, search.free_rate)
+        _, released, *_ = self.kinds(search)
         rate = elements.norms(found.slip_rate)
 
         over = jnp.where((stuck := sticking(elements, mode.sigma)) & ~found.driven, -found.margin, -jnp.inf)
@@ -198,12 +225,13 @@ def select_mode(
         backwards = -elements.sums(found.slip_rate * mode.sigma)
         holds = released & ~idle & ~(elements.is_vector & (found.bound == 0))
         returning = _greatest(backwards, holds & (backwards > jnp.where(search.clearly, 0, 1e-6 * search.free_rate)))
-        torn = _torn(elements, t, q, v, found, search.free_rate, over > -jnp.inf) & ~jnp.any(beyond) | (stuck & found.driven)
+        there = elements, self.t, self.q, self.v
+        torn = _torn(*there, found, search.free_rate, over > -jnp.inf) & ~jnp.any(beyond) | (stuck & found.driven)
         along = (over > -1e-6 * jnp.abs(found.bound)) & elements.are_shared  # those of a share break away together
         leaving = jnp.where((stage == FIRST) & jnp.any(breaking), breaking | along, beyond | torn)
         leaving = (leaving & (stage != LOOSE)) | (idle & (over > -jnp.inf))
         returning = returning & ~jnp.any(leaving) & ~turns
-        onward = jnp.where((rate > 0)[of], found.slip_rate, elements.slip(t, q, v))
+        onward = jnp.where((rate > 0)[of], found.slip_rate, elements.slip(*there[1:]))
         way = jnp.where(((beyond | breaking | along) & ~found.driven)[of], -found.force, onward)
         away = jnp.where(idle[of], 1, unit(elements, way))
         sigma = jnp.where(leaving[of], away, jnp.where(returning[of], 0, turned))
@@ -215,15 +243,16 @@ def select_mode(
         all_slip = (stage == LOOSE) & ~jnp.any(at_rest)  # nothing to choose
         within = (stage == FIRST) | (stage == NEXT) | all_slip
         last = all_slip | ~jnp.any(at_rest & ~idle & ~sticking(elements, sigma))  # nothing that others may hold
-        contacts, changes = search.contacts.next(flat, t, q, v, found.qddot, found.multipliers, agrees, search.turns > most)
+        asked = self.flat, *there[1:], found.qddot, found.multipliers
+        contacts, changes = search.contacts.next(*asked, agrees, search.turns > self.most)
         following = jnp.where(within, jnp.where(in_current_mode, jnp.where(last, DONE, HOLD), NEXT), jnp.where(stage == LOOSE, FIRST, DONE))
         anew = within & changes
         contacts = jax.tree.map(lambda new, old: jnp.where(anew, new, old), contacts, search.contacts)
-        return _Search(
+        return Search(
             jnp.where(anew, LOOSE, following),
             contacts,
             Mode(
-                jnp.where(anew, resting, jnp.where(within | (stage == LOOSE), sigma, mode.sigma)),
+                jnp.where(anew, self.resting, jnp.where(within | (stage == LOOSE), sigma, mode.sigma)),
                 jnp.where(stage == HOLD, released & ~idle & ~elements.is_quasistatic & (rate <= 1e-6 * search.free_rate), mode.held),
                 jnp.where(within, agrees & ~anew, mode.consistent),
                 jnp.where(within, found.bound, mode.bound),
@@ -233,12 +262,27 @@ def select_mode(
             jnp.where(stage == LOOSE, rate, search.free_rate),
         )
 
-    nothing = jnp.zeros(elements.size, v.dtype)
-    resting = jax.lax.stop_gradient(jnp.where(at_rest[of], 0, sigma))
-    start = _Search(jnp.array(LOOSE), contacts, Mode(resting, no, jnp.array(False), nothing), jnp.array(0), no, nothing)
+
+def select_mode(
+    flat: Flat, elements: FrictionElements, t, q, v, sigma, at_rest, breaking, contacts: Any = NoContact(), friction_in: Any = None
+) -> tuple[Mode, Any]:
+    """The mode by a `ModeSelection`, and the closed contacts among `contacts`. `friction_in(σ, contacts)` is the friction of this state in
+    another mode, if there is a program of it.
+    """
+    friction_in, selection = (
+        friction_in or _in_modes(flat, elements, t, q, v),
+        ModeSelection(flat, elements, t, q, v, sigma, at_rest, breaking),
+    )
+
+    def turn(search):
+        in_mode = lambda sigma: friction_in(sigma, search.contacts)
+        found = friction_and_direction(elements, in_mode, search.mode.sigma, *selection.kinds(search), search.free_rate)
+        return selection.next(search, *found)
+
     # Nothing here is differentiated, so that the loop may end by itself: a motion behind many jumps of an input takes a tenth less.
-    going_on = lambda carry: (carry[0] < most * (1 + 4 * len(jax.tree.leaves(contacts)) * flat.rows)) & (carry[1].stage != DONE)
-    search = lambda: jax.lax.while_loop(going_on, lambda carry: (carry[0] + 1, turn(carry[1])), (0, start))
+    most = selection.most * (1 + 4 * len(jax.tree.leaves(contacts)) * flat.rows)
+    going_on = lambda carry: (carry[0] < most) & (carry[1].stage != DONE)
+    search = lambda: jax.lax.while_loop(going_on, lambda carry: (carry[0] + 1, turn(carry[1])), (0, selection.start(contacts)))
     done = undifferentiated(search)()[1]
     return done.mode, done.contacts
 

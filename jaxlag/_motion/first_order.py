@@ -16,6 +16,7 @@ from .._mechanics.constrained_slip import Left, left_by_constraints, on_constrai
 from .._mechanics.contact import free, in_contact
 from .._mechanics.friction_elements import FrictionElements, light_coordinates
 from .._mechanics.impact import check_impacts
+from .._mechanics.load_sharing import may_share
 from .._mechanics.massless import first_order, with_first_order_rates
 from .._mechanics.power import energy_exchange, listed_powers
 from .._mechanics.projection import Projection
@@ -52,6 +53,7 @@ class EquationsOfMotion:
     contacts: int = 0
     events: int = 0
     light: tuple[int, ...] = ()  # coordinates without inertia, whose velocities follow from the rest
+    entangled: bool = False  # whether elements of friction may share their forces in more than one way, or constraints drive their slips
     sided: bool = False  # whether functions choose by the position, perhaps across the surface of an event
     sees_time: bool = False  # whether functions ask for the time, beside signals at that time
 
@@ -76,7 +78,10 @@ class EquationsOfMotion:
         elements = formulation.friction.elements(alone.flat_at(params, at))
         if system.unilateral:
             check_impacts(alone.flat_at(params, at), elements, formulation.friction)
-        return alone if elements is None else dataclasses.replace(alone, rows=elements.element_of_row.size, elements=elements.size)
+        if elements is None:
+            return alone
+        found = dataclasses.replace(alone, rows=elements.element_of_row.size, elements=elements.size)
+        return dataclasses.replace(found, entangled=_are_entangled(found, alone.flat_at(params, at), elements, at))
 
     def flat(self, params: PyTree, at: StatesAt) -> Flat:
         """The system over flat vectors."""
@@ -218,6 +223,10 @@ class EquationsOfMotion:
         """ẏ."""
         return _rates(self, t, y, args)
 
+    def rates_and_friction(self, t, parts: Parts, args: Arguments) -> tuple[Array, Friction]:
+        """ẏ and the friction in the mode of `parts`, by one evaluation; where all has inertia, and nothing but friction changes modes."""
+        return _rates_and_friction(self, t, parts, self._without_scales(args))
+
     def projected(self, t, y, args):
         """y, put back on the constraints."""
         return _projected(self, t, y, args, False)
@@ -229,6 +238,13 @@ class EquationsOfMotion:
     def exhausted(self, y):
         """Whether there were more transitions than allowed."""
         return jnp.any(self.parts(y).transitions > self.formulation.friction.max_transitions)
+
+
+def _are_entangled(equations: EquationsOfMotion, flat: Flat, elements: FrictionElements, at: StatesAt) -> bool:
+    """Whether a share of friction is to be found beside its mode, or constraints may turn or drive a slip."""
+    constraints = lambda t: (flat.holonomic(t, at.q), flat.nonholonomic(t, at.q, at.v))
+    turned = bool(equations.system.constraints) and equations.rows != equations.elements
+    return bool(may_share(flat, elements)) or turned or bool(used_arguments(constraints, at.t)[0])
 
 
 @jitted  # so that diffrax's many calls trace it once
@@ -246,6 +262,18 @@ def _rates(equations: EquationsOfMotion, t, y, args):
     stuck = parts.time_stuck if elements is None else jnp.maximum(sticking(elements, sigma).astype(y.dtype), held)
     resting = Parts(*(jnp.zeros_like(part) for part in parts))
     return resting._replace(q=moving.v, v=qddot, z=rates, works=powers, time_stuck=stuck).y
+
+
+@jitted
+def _rates_and_friction(equations: EquationsOfMotion, t, parts: Parts, args) -> tuple[Array, Friction]:
+    q, v, found = parts.q, parts.v, equations.friction(t, parts, args)
+    flat, elements = equations.contents(t, parts, args)
+    assert elements is not None  # asked where there is friction
+    powers = listed_powers(in_mode(flat, elements, parts.sigma), t, q, v) if equations.works else parts.works
+    stuck = jnp.maximum(sticking(elements, parts.sigma).astype(q.dtype), parts.held)
+    resting = Parts(*(jnp.zeros_like(part) for part in parts))
+    z = ravelled(flat.state_rates(t, q, v), q.dtype)
+    return resting._replace(q=v, v=found.qddot, z=z, works=powers, time_stuck=stuck).y, found
 
 
 @jitted

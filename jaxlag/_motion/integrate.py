@@ -32,6 +32,7 @@ from .runge_kutta import Dop853, ExplicitRungeKutta, is_explicit
 from .scales import Scales
 from .search_for_start import Search
 from .sparse_implicit import in_structure
+from .step_machine import OneEvaluationSolver, has_one_evaluation
 from .step_size import StepControl, with_tolerances
 from .stick_slip_solver import StickSlipSolver
 from .variational import VariationalEquations, derived, varied_along, with_variations
@@ -204,7 +205,7 @@ def _variations(equations: FirstOrderSystem) -> int:
     return 1 + _variations(equations.equations) if isinstance(equations, VariationalEquations) else 0
 
 
-def _wrapped(options, equations, projected, adjoint, start):
+def _wrapped(options, equations, projected, adjoint, start, varied: bool = False):
     """The chosen solver, with what the equations ask for at the ends of its steps."""
     solver = in_structure(options.solver, equations, *start)
     if isinstance(adjoint, dfx.ForwardMode):
@@ -213,6 +214,8 @@ def _wrapped(options, equations, projected, adjoint, start):
         elif isinstance(solver, dfx.AbstractRungeKutta) and solver.scan_kind is None:
             solver = dataclasses.replace(solver, scan_kind="lax")  # as diffrax does for a solver that is not wrapped
     if isinstance(equations, EquationsOfMotion) and equations.modes:
+        if has_one_evaluation(equations, solver, not isinstance(adjoint, dfx.ForwardMode), varied):
+            return OneEvaluationSolver(solver, projected, equations, reverse=False)
         return StickSlipSolver(solver, projected, equations, reverse=not isinstance(adjoint, dfx.ForwardMode))
     return ProjectedSolver(solver, projected, equations)
 
@@ -231,7 +234,7 @@ def in_one_loop(
     adjoint = dfx.RecursiveCheckpointAdjoint() if reverse else dfx.ForwardMode()
     meter, dense = Meter() if options.progress else dfx.NoProgressMeter(), not has_nodes(equations, args.params)
     back = in_one_kernel(equations.projected) if dense else equations.projected
-    solver = _wrapped(options, equations, back if equations.projection else None, adjoint, (t0, y0, args))
+    solver = _wrapped(options, equations, back if equations.projection else None, adjoint, (t0, y0, args), bool(directions))
     args = told_of_loads(equations, t0, y0[(..., *[0] * len(directions))], args)
     numbers = y0, t0, args, ts, tolerances
     kind = {"variations": _variations(equations), "reverse": reverse, "dense": dense}

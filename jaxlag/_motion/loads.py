@@ -50,15 +50,17 @@ def _loads(equations: Any, t, y, args: Arguments) -> dict[str, Any] | None:
     rate = lambda pulls: pulls / jnp.where(mass > 0, mass, jnp.inf)
     terms = size_of_terms(lambda q: _forces(flat, t, q, parts.v), parts.q)
     held, given, driven = rate(jnp.where(jnp.isfinite(terms), terms, 0)), None, None
+    found = None if elements is None else equations.friction(t, parts, args)
     if equations.system.constraints:
         G = velocity_rows(flat, t, parts.q, parts.v)[1]
         G = SparseMatrix(jnp.abs(G.values), G.pattern) if isinstance(G, SparseMatrix) else jnp.abs(G)
-        held = held + rate(G.T @ jnp.abs(equations.accelerated(t, parts, args, False).multipliers[: flat.rows]))
+        multipliers = (found or equations.accelerated(t, parts, args, False)).multipliers
+        held = held + rate(G.T @ jnp.abs(multipliers[: flat.rows]))
         if equations.projection is not None:
             given = _prescribed(flat, t, parts.q, may_move=not equations.works)  # works are integrals along what moves
-    if elements is not None:
+    if elements is not None and found is not None:
         slopes = jnp.abs(jax.jacfwd(lambda v: elements.slip(t, parts.q, v))(parts.v))
-        bound = jnp.abs(equations.friction(t, parts, args).bound)[elements.element_of_row]
+        bound = jnp.abs(found.bound)[elements.element_of_row]
         in_plane = elements.is_vector[elements.element_of_row]
         held = held + rate(bound @ slopes)
         if np.any(in_plane):

@@ -172,15 +172,23 @@ def changed(equations: EquationsOfMotion, t, y, args: Arguments, ended: Bool[Arr
     of_friction, of_contact = jnp.split(ended[: equations.elements + equations.contacts], [equations.elements])
     if not equations.contacts:
         assert elements is not None
-        stuck, errors = sticking(elements, parts.sigma) | (parts.held > 0), args.scales.of_velocities(parts.v)
-        slow = _slow(elements, t, parts, errors, moved)
-        at_rest, there = stuck | of_friction | (slow & ~elements.driven), parts.without(errors)
-        given = parts.q, there.v, parts.sigma, at_rest, of_friction & stuck
+        at_rest, breaking, at_its_end = at_rest_within(elements, t, parts, args, of_friction, moved, elements.driven)
+        there = parts.without(args.scales.of_velocities(parts.v))
+        given = parts.q, there.v, parts.sigma, at_rest, breaking
         mode, _ = select_mode(flat, elements, t, *given, friction_in=in_other(equations, t, there, args))
         after = equations.in_new_mode(t, in_other_mode(elements, parts, mode).y, args)
-        return Change(after, mode.consistent, jnp.array(True), jnp.array(True), jnp.all(~of_friction | stuck | slow))
+        return Change(after, mode.consistent, jnp.array(True), jnp.array(True), at_its_end)
     errors = args.scales.of_positions(parts.q), args.scales.of_velocities(parts.v)
     return behind_contact(equations, t, parts, args, of_friction, of_contact, errors, moved=moved)
+
+
+def at_rest_within(elements: FrictionElements, t, parts: Parts, args: Arguments, ended, moved, driven):
+    """Where the modes of friction of those `ended` end: which elements are at rest, which of them break away, and whether all that slide
+    have come to rest, within the errors of the motion and by how much slip has `moved` within the rounding of the time.
+    """
+    stuck = sticking(elements, parts.sigma) | (parts.held > 0)
+    slow = _slow(elements, t, parts, args.scales.of_velocities(parts.v), moved)
+    return stuck | ended | (slow & ~driven), ended & stuck, jnp.all(~ended | stuck | slow)
 
 
 def _slow(elements: FrictionElements, t, parts: Parts, errors, moved):

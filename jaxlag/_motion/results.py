@@ -61,6 +61,10 @@ class RESULTS(dfx.RESULTS):  # pyright: ignore
     )
 
 
+# A motion that has not failed prints that; diffrax has no word for it.
+RESULTS._index_to_message[int(RESULTS.successful._value)] = "successful"  # type: ignore[attr-defined]
+
+
 def under_diffrax(reason: Any) -> dfx.RESULTS:
     """A reason of mechanics as diffrax carries it through its loop: a number beyond its own, and not `successful`."""
     successful: Any = dfx.RESULTS.successful
@@ -110,8 +114,10 @@ def _successful() -> int:
 
 
 def reason_of(result: Any) -> str:
-    """The sentence of a result; in a batch, that of `first_failure`."""
-    return RESULTS[RESULTS._name_to_item[first_failure(result)]]  # type: ignore[attr-defined,misc]
+    """The sentence of a failure, in a batch that of `first_failure`; none where nothing failed."""
+    if (name := first_failure(result)) == "successful":
+        return ""
+    return RESULTS[RESULTS._name_to_item[name]]  # type: ignore[attr-defined,misc]
 
 
 def first_failure(result: Any) -> str:

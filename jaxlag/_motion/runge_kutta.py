@@ -1,5 +1,6 @@
 """Explicit Runge–Kutta schemes for small systems: one short loop over the stages, and dense output of high order."""
 
+from collections.abc import Callable
 from typing import Any, ClassVar
 
 import diffrax as dfx
@@ -70,8 +71,7 @@ class ExplicitRungeKutta(dfx.AbstractAdaptiveSolver):
             return jax.tree.map(lambda f, new: with_row(f, new, i), f, new), None
 
         # One loop, so that the equations are compiled once. What is not there yet counts as nothing.
-        size, dtype = len(scheme.c), jnp.result_type(*jax.tree.leaves(y0))
-        rows = np.arange(size), np.array(scheme.c, dtype), as_rows([[], *scheme.a], size, dtype)
+        size, rows = len(scheme.c), self.stages(jnp.result_type(*jax.tree.leaves(y0)))
         if made_jump is not False and self.reverse:
             solver_state = jax.lax.cond(made_jump, lambda: terms.vf(t0, y0, args), lambda: solver_state)
         first = jax.tree.map(lambda x: jnp.concatenate([x[None], jnp.zeros((size - 1, *x.shape), x.dtype)]), solver_state)
@@ -80,15 +80,25 @@ class ExplicitRungeKutta(dfx.AbstractAdaptiveSolver):
         else:
             at = lambda i: jax.tree.map(lambda x: jnp.asarray(x)[i], rows)
             f = jax.lax.fori_loop(jnp.where(made_jump, 0, 1), size, lambda i, f: stage(f, at(i))[0], first)
+        return (*self.finished(y0, f, lambda change: terms.prod(change, h)), dfx.RESULTS.successful)
 
-        last = scheme.stages - 1
-        ends, estimates = np.eye(size)[[0, last]], len(scheme.errors)
-        every = changes(as_rows([*scheme.errors, scheme.a[last - 1], *ends, *scheme.dense], size, dtype), f)
+    def stages(self, dtype: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Of each stage its number, its time from 0 to 1, and the weights of the stages before it."""
+        scheme, size = self.tableau, len(self.tableau.c)
+        return np.arange(size), np.array(scheme.c, dtype), as_rows([[], *scheme.a], size, dtype)
+
+    def finished(self, y0: PyTree, f: PyTree, over_step: Callable) -> tuple[PyTree, PyTree, dict[str, Any], PyTree]:
+        """What a step has come to with the stages f, of rates which the step makes changes of: y1, its error, the dense output, ẏ1."""
+        scheme = self.tableau
+        size, last, estimates = len(scheme.c), scheme.stages - 1, len(scheme.errors)
+        rows = [*scheme.errors, scheme.a[last - 1], *np.eye(size)[[0, last]], *scheme.dense]
+        weights = as_rows(rows, size, jnp.result_type(*jax.tree.leaves(y0)))
+        every = jax.tree.map(lambda f: over_step(weighted(weights, f)), f)
         held = jax.lax.stop_gradient if self.reverse else lambda x: x  # its derivative is the error of a variation, in forward mode
         error = jax.tree.map(lambda every: combined(*held(every[:estimates])), every)
         y1 = jax.tree.map(lambda y0, every: y0 + every[estimates], y0, every)
         series = jax.tree.map(lambda every: every[estimates + 1 :], every)
-        return y1, error, {"y0": y0, "y1": y1, "k": series}, jax.tree.map(lambda f: f[last], f), dfx.RESULTS.successful
+        return y1, error, {"y0": y0, "y1": y1, "k": series}, jax.tree.map(lambda f: f[last], f)
 
 
 def is_explicit(solver: dfx.AbstractSolver) -> bool:

@@ -6,6 +6,7 @@ alone, such as a load that comes as a pulse, need not show at all: bounds of it 
 how much it may have changed there. Wherever a margin may have been used up, samples are closer.
 """
 
+import dataclasses
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -21,6 +22,9 @@ from .._program.time_bounds import TimeDependence, time_dependence
 from .pulses import BRIEF, UNBOUNDED
 
 LOOKS = 8  # parts of an interval, at whose ends it is looked at
+EVENLY = tuple(i / LOOKS for i in range(LOOKS + 1))
+CHEBYSHEV = tuple((1 - np.cos(np.pi * np.arange(LOOKS + 1) / LOOKS)) / 2)
+TO_SERIES = np.linalg.inv(np.polynomial.chebyshev.chebvander(2 * np.array(CHEBYSHEV) - 1, LOOKS))  # of Chebyshev polynomials
 NEARER = (1e-2, 1e-4, 1e-7)  # of an interval with an end in it, how close around the root of its chord it is looked at next
 SECTIONS = 60  # of an interval with an end in it; some four do where the margin is smooth, and each halves it where it jumps
 ROUNDS = 256  # of looks, after which the step is too long to be watched
@@ -45,7 +49,7 @@ class Looks(NamedTuple):
     change: Float[Array, "k-1 m"]
 
 
-class _Search(NamedTuple):
+class Search(NamedTuple):
     """The interval looked at; whether an end is in it; how often was looked, and how often since; what was seen at its ends."""
 
     low: Any
@@ -59,33 +63,49 @@ class _Search(NamedTuple):
     largest: Float[Array, " m"]
 
 
-def first_end(
-    margins: Callable, path: Callable, t0, t1, elements: int, scales: Any, exactly: Any = True, between: Callable | None = None
-) -> Seen:
-    """When the first of `margins(t, y, start)` turns negative along a `path`; the elements' bounds come after their margins, and count.
+@dataclasses.dataclass(frozen=True)
+class Monitor:
+    """The search for the first end of a mode along a path from t0 to t1, look by look: at some times each, of which it says the next.
 
-    `start` is y at the start, where what stays as it is along the path may be taken from. Not `exactly`: only whether there is an end.
-    `between(low, high)` are those of the elements' margins that may be negative between two times, for all that is known of them.
+    `hides(low, high)` are those of the margins that may be negative between two times, for all that is known of them; `bounded`: whether
+    there are bounds of all that follows the time alone. It is looked at `nodes` of an interval, from 0 to 1, until there is an end in it.
     """
-    of_time_alone = time_dependence(lambda t, y: margins(t, y, y), t0, path(t0))
-    look, near = _looking(margins, path, t0, t1, of_time_alone), NEAR * scales.grain
-    grain = 4 * scales.grain  # within which what follows the time has steps that are no jumps
-    brief = jnp.maximum(BRIEF * scales.duration, near)
-    none = np.zeros(elements, bool)
-    hides = lambda low, high: jnp.concatenate([none if between is None else between(low, high), none])
-    if of_time_alone is not None and not of_time_alone.is_bounded:
-        brief = jnp.maximum(brief, jnp.minimum(UNBOUNDED * scales.duration, scales.spacing))
 
-    def closer(search):
-        low, high, found, rounds, sections, *_, largest = search
-        evenly = lambda: low + (high - low) / LOOKS * np.arange(LOOKS + 1)
-        ts = jax.lax.cond(found, lambda: _around(low, high, *search[5:7]), evenly)
-        ts = jnp.where(np.arange(ts.size) == ts.size - 1, high, ts)
-        part = jnp.diff(ts)[:, None]
-        value, slope, change = look(ts)
-        hidden = jax.vmap(hides)(ts[:-1], ts[1:]) & (part > brief)
-        largest = jnp.maximum(largest, jnp.max(jnp.abs(value), axis=0))
-        value = value + jnp.where(np.arange(2 * elements) < elements, 0, 1e-9 * largest)[None]  # a bound of zero is none that is negative
+    elements: int
+    scales: Any
+    t0: Any
+    t1: Any
+    bounded: bool = True
+    hides: Callable | None = None
+    nodes: tuple[float, ...] = EVENLY
+
+    def start(self, dtype: Any) -> Search:
+        """Nothing is seen yet."""
+        nothing, time = jnp.zeros(2 * self.elements, dtype), jnp.asarray(self.t0, dtype)
+        return Search(time, jnp.asarray(self.t1, dtype), jnp.array(False), jnp.array(0), jnp.array(0), *[nothing] * 4)
+
+    def times(self, search: Search) -> Float[Array, " k"]:
+        """Where it is looked at next."""
+        low, high = search.low, search.high
+        evenly = lambda: low + (high - low) * np.array(self.nodes, low.dtype)
+        ts = jax.lax.cond(search.found, lambda: _around(low, high, search.before, search.behind), evenly)
+        return jnp.where(np.arange(ts.size) == ts.size - 1, high, ts)
+
+    def closer(self, search: Search, ts: Float[Array, " k"], looks: Looks) -> Search:
+        """With what was seen at these times."""
+        value, slope, change = looks
+        near = NEAR * self.scales.grain
+        brief = jnp.maximum(BRIEF * self.scales.duration, near)
+        if not self.bounded:
+            brief = jnp.maximum(brief, jnp.minimum(UNBOUNDED * self.scales.duration, self.scales.spacing))
+        found, part = search.found, jnp.diff(ts)[:, None]
+        hidden = jnp.zeros((len(ts) - 1, value.shape[1]), bool)
+        if (hides := self.hides) is not None:
+            none = np.zeros(self.elements, bool)
+            hidden = jax.vmap(lambda low, high: jnp.concatenate([hides(low, high), none]))(ts[:-1], ts[1:]) & (part > brief)
+        largest = jnp.maximum(search.largest, jnp.max(jnp.abs(value), axis=0))
+        is_bound = np.arange(2 * self.elements) >= self.elements  # a bound of zero is none that is negative
+        value = value + jnp.where(is_bound, 1e-9 * largest, 0)[None]
         beyond = jnp.any(value[1:] < 0, axis=1)
         doubtful = jnp.any(_dips(value, slope, part) & (part > near) | hidden | (value[:-1] + value[1:] < change) & (part > brief), axis=1)
         wanted = beyond | (doubtful & ~found)
@@ -93,31 +113,55 @@ def first_end(
         onward = ~found & ~jnp.any(wanted)
         hit = ~onward & beyond[i] & (found | ~jnp.any(hidden[i]))  # of several ends in it, the first
         new = lambda now, before: jnp.where(hit, now, before)
-        return _Search(
-            jnp.where(onward, high, ts[i]),
-            jnp.where(onward, t1, ts[i + 1]),
-            found | hit,
-            rounds + 1,
-            sections + (found | hit),
-            *(new(now, before) for now, before in zip((value[i], value[i + 1], slope[i + 1]), search[5:8], strict=True)),
-            largest,
+        return Search(
+            low=jnp.where(onward, search.high, ts[i]),
+            high=jnp.where(onward, self.t1, ts[i + 1]),
+            found=found | hit,
+            rounds=search.rounds + 1,
+            sections=search.sections + (found | hit),
+            before=new(value[i], search.before),
+            behind=new(value[i + 1], search.behind),
+            slope=new(slope[i + 1], search.slope),
+            largest=largest,
         )
 
-    def going_on(search):
-        middle, wide = (search.low + search.high) / 2, search.high - search.low > jnp.maximum(grain, 1e-13 * (t1 - t0))
-        wide |= jnp.any(_jumps(search)) & (search.low < middle) & (middle < search.high)  # to the very time at which it jumps
+    def going_on(self, search: Search, exactly: Any = True) -> Bool[Array, ""]:
+        """Whether to look once more; not `exactly`, only whether there is an end."""
+        grain = 4 * self.scales.grain  # within which what follows the time has steps that are no jumps
+        low, high = search.low, search.high
+        middle, wide = (low + high) / 2, high - low > jnp.maximum(grain, 1e-13 * (self.t1 - self.t0))
+        wide |= jnp.any(_jumps(search)) & (low < middle) & (middle < high)  # to the very time at which it jumps
         narrowing = exactly & wide & (search.sections < SECTIONS)
-        return jnp.where(search.found, narrowing, (search.low < t1) & (search.rounds < ROUNDS))
+        return jnp.where(search.found, narrowing, (low < self.t1) & (search.rounds < ROUNDS))
 
-    nothing, time = jnp.zeros(2 * elements, path(t0).dtype), jnp.asarray(t0, path(t0).dtype)
-    start = _Search(time, jnp.asarray(t1, time.dtype), jnp.array(False), 0, 0, *[nothing] * 4)
-    done = repeated(closer, start, going_on, start.low < t1)
-    slope = jnp.where(_jumps(done), -jnp.inf, done.slope)
-    is_margin = jnp.any(done.behind[:elements] < 0)
-    return Seen(done.found & is_margin, done.found & ~is_margin, ~done.found & (done.low < t1), done.high, slope[:elements])
+    def seen(self, search: Search) -> Seen:
+        """What was seen in the end."""
+        slope = jnp.where(_jumps(search), -jnp.inf, search.slope)
+        is_margin = jnp.any(search.behind[: self.elements] < 0)
+        unsure = ~search.found & (search.low < self.t1)
+        return Seen(search.found & is_margin, search.found & ~is_margin, unsure, search.high, slope[: self.elements])
 
 
-def _jumps(search: _Search) -> Bool[Array, " m"]:
+def first_end(
+    margins: Callable, path: Callable, t0, t1, elements: int, scales: Any, exactly: Any = True, between: Callable | None = None
+) -> Seen:
+    """When the first of `margins(t, y, start)` turns negative along a `path`; the elements' bounds come after their margins, and count.
+
+    `start` is y at the start, where what stays as it is along the path may be taken from. `exactly`, `between`: as of a `Monitor`.
+    """
+    of_time_alone = time_dependence(lambda t, y: margins(t, y, y), t0, path(t0))
+    bounded = of_time_alone is None or of_time_alone.is_bounded
+    monitor, look = Monitor(elements, scales, t0, t1, bounded, between), _looking(margins, path, t0, t1, of_time_alone)
+
+    def closer(search):
+        ts = monitor.times(search)
+        return monitor.closer(search, ts, look(ts))
+
+    start = monitor.start(path(t0).dtype)
+    return monitor.seen(repeated(closer, start, lambda search: monitor.going_on(search, exactly), start.low < t1))
+
+
+def _jumps(search: Search) -> Bool[Array, " m"]:
     """Which margins fall below zero within the interval, and more than smooth ones would."""
     steep = 10 * jnp.abs(search.slope) * (search.high - search.low) + 1e-9 * search.largest
     return (search.behind < 0) & (search.before - search.behind > steep)
@@ -155,17 +199,39 @@ def _looking(margins, path, t0, t1, of_time_alone: TimeDependence | None) -> Cal
         y, dy = jax.jvp(path, (t,), (jnp.ones_like(t),))
         return jax.jvp(lambda t, y: margins(t, y, start), (t, y), (jnp.ones_like(t), dy))
 
-    if of_time_alone is None:
-        changed = lambda ts: jnp.zeros(())
-    else:
-        reach = jnp.max(jax.lax.map(lambda t: _reach(of_time_alone, t, path(t)), jnp.linspace(t0, t1, 3)), axis=0)
-        changed = lambda ts: jax.vmap(lambda start, end: _change(of_time_alone, reach, start, end))(ts[:-1], ts[1:])
+    reach = None if of_time_alone is None else reach_of_time(of_time_alone, path, t0, t1)
 
     def looks(ts):
         value, slope = jax.vmap(along)(ts)
-        return Looks(value, slope, changed(ts))
+        return Looks(value, slope, changes_by_time(of_time_alone, reach, ts))
 
     return looks
+
+
+def reach_of_time(of_time_alone: TimeDependence, path: Callable, t0, t1) -> Float[Array, "m p"]:
+    """How steeply margins follow what follows the time alone, the most of three times along a path."""
+    return jnp.max(jax.lax.map(lambda t: _reach(of_time_alone, t, path(t)), jnp.linspace(t0, t1, 3)), axis=0)
+
+
+def changes_by_time(of_time_alone: TimeDependence | None, reach, ts: Float[Array, " k"]) -> Array:
+    """By how much the time alone may change margins from one time to the next, which they are so steep in as `reach` says."""
+    if of_time_alone is None:
+        return jnp.zeros(())
+    return jax.vmap(lambda start, end: _change(of_time_alone, reach, start, end))(ts[:-1], ts[1:])
+
+
+def slopes_of_interpolant(low, high, values: Float[Array, "k m"], ts: Float[Array, " j"]) -> Float[Array, "j m"]:
+    """The slopes at some times of the polynomial through `values` at `CHEBYSHEV` nodes from one time to another.
+
+    Source: Trefethen, Approximation Theory and Approximation Practice, chapters 3 and 21.
+    """
+    s = (2 * (ts - low) / (high - low) - 1).astype(values.dtype)
+    second = [jnp.ones_like(s), 2 * s]  # Chebyshev polynomials of the second kind, U; of the first, T'ₙ = n Uₙ₋₁
+    while len(second) < LOOKS:
+        second.append(2 * s * second[-1] - second[-2])
+    rates = [jnp.zeros_like(s), *(n * U for n, U in enumerate(second, 1))]
+    coefficients = jnp.sum(TO_SERIES.astype(values.dtype)[:, :, None] * values[None], axis=1)
+    return 2 / (high - low) * jnp.sum(jnp.stack(rates, axis=1)[:, :, None] * coefficients[None], axis=1)
 
 
 def _reach(of_time_alone: TimeDependence, t, y) -> Float[Array, "m p"]:

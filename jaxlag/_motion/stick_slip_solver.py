@@ -1,13 +1,11 @@
 """Steps that end a mode of dry friction where it ends."""
 
 import functools
-from typing import Any, NamedTuple
 
 import diffrax as dfx
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 
 from .._program.jit import jitted
 from .event_record import overflows
@@ -16,66 +14,11 @@ from .first_order import EquationsOfMotion
 from .mode_changes import approach, at_end, margins
 from .results import RESULTS, under_diffrax
 from .runge_kutta import ExplicitRungeKutta
+from .split import CHANGE, PHASES, REST, SEEN_LATE, WHOLE, Cut, Piece, Split, SplitInterpolation, next_estimate
 from .step_monitor import Seen, first_end
 from .wrapped_solver import ProjectedSolver
 
-# Phases of a step: the whole step, watched for the end of a mode; where one was seen, Newton's steps for its time, each of them the
-# step up to there (the first makes the time right and its derivative, the others its higher derivatives), after the last of which the
-# mode changes; and the rest of the step, watched for a second end.
-WHOLE, NEWTON, CHANGE, REST = range(4)
-PHASES = np.array([WHOLE, NEWTON, NEWTON, CHANGE, REST], np.int32)
-SEEN_LATE = np.array([WHOLE, NEWTON, NEWTON, NEWTON, CHANGE, REST], np.int32)  # as gaps and witnesses are, by their rounding
-SIMULTANEOUS = 1e3  # modes that end within this many roundings of time end together
 BARELY = 1e-6  # of the motion, the step that ends where a bound turns negative
-
-
-class SplitInterpolation(dfx.AbstractLocalInterpolation):
-    """Dense output of a step with a change of mode in it, at `cut`."""
-
-    t0: Any
-    t1: Any
-    cut: Any
-    first: Any
-    second: Any
-
-    def evaluate(self, t0, t1=None, left=True):
-        if t1 is not None:
-            return self.evaluate(t1) - self.evaluate(t0)
-        before = t0 < self.cut  # at the cut itself the next mode holds: where a bound jumps, the one before has ended there
-        return jnp.where(before, self.first.evaluate(t0), self.second.evaluate(t0))
-
-
-class Piece(NamedTuple):
-    """A step or a part of one: its end, error, dense output, the state of the solver, and whether it succeeded."""
-
-    y: Any
-    error: Any
-    dense: Any
-    state: Any
-    result: dfx.RESULTS
-
-
-class Cut(NamedTuple):
-    """Where a step is cut: the time, and Newton's next estimate of it; y there in the next mode, whether that mode is consistent, and
-    whether an impact there took energy and followed from impulses; whether the pieces on both sides can be used.
-    """
-
-    time: Any
-    estimate: Any
-    y: Any
-    consistent: Any
-    dissipates: Any
-    impulsive: Any
-    usable: Any
-
-
-class Split(NamedTuple):
-    """A step that may be cut: the pieces before and after the cut, the cut, and what was seen along the whole step."""
-
-    first: Piece
-    second: Piece
-    cut: Cut
-    seen: Seen
 
 
 class StickSlipSolver(ProjectedSolver):
@@ -152,16 +95,9 @@ class StickSlipSolver(ProjectedSolver):
 
     def _locate(self, split: Split, done: Piece, end, t0, t1, args, last) -> Split:
         """A Newton step for the time at which the mode ends, from the margins at the end of the piece; after the last, the next mode."""
-        value, slope, late = at_end(self.equations, end, done.y, args, split.seen.slope)
-        falling = slope < 0
-        until = jnp.where(falling, jnp.abs(value) / jnp.where(falling, -slope, 1), jnp.inf)
-        nearest = jax.lax.stop_gradient(jnp.argmin(until))
-        estimate = end - value[nearest] / jnp.where(falling[nearest], slope[nearest], -jnp.inf)
-        slack = jnp.maximum(late[nearest], args.scales.rounding)  # times near zero are finer than what happens at them
-        usable = jnp.any(falling) & (end >= t0 - slack) & (end <= t1)
-        located = split._replace(first=done, cut=split.cut._replace(time=end, estimate=estimate, usable=usable))
-        moved = jnp.where(falling, -slope, 0) * args.scales.rounding  # by the last digit of the time
-        ended = (jnp.arange(value.size) == nearest) | falling & (value <= SIMULTANEOUS * moved)
+        found = at_end(self.equations, end, done.y, args, split.seen.slope)
+        cut, ended, moved = next_estimate(split.cut, end, *found, (t0, t1), args)
+        located = split._replace(first=done, cut=cut)
         return jax.lax.cond(last, lambda: self._change(located, ended, moved, args), lambda: located)
 
     def _change(self, split: Split, ended, moved, args) -> Split:

@@ -47,6 +47,11 @@ def computed_first(tree: Any, number: Float[Array, ""]) -> Any:
     places, as slices of them do, each computes anew what both share, and what they share does likewise: a long chain of operations takes
     twice the time at each of its links. A branch ends a kernel; a barrier alone is gone before kernels are made.
     """
+    return computed_first_with_changes(tree, number)
+
+
+def computed_first_with_changes(tree: Any, number: Float[Array, ""]) -> Any:
+    """The same, with the derivatives of `tree`, which are computed before anything that uses them, too."""
     if jax.default_backend() != "cpu":
         return tree
     return jax.lax.cond(everywhere(number == number), lambda tree: tree, jax.lax.optimization_barrier, tree)

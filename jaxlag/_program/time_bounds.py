@@ -13,7 +13,7 @@ from jaxtyping import Array
 from .constants import as_function, bound, has_extended_dtype
 from .interval_arithmetic import INTERVAL_RULES, Interval, anything, in_integers, without_nan
 from .primitives import ANY_CALL, CALLS, DECREASING, INCREASING, LOGICAL, OVERFLOWS
-from .walker import called_program, columns_of_branches, parts_of_scan, walk
+from .walker import called_program, columns_of_branches, parts_of_scan, walk, without_unused
 
 
 class TimeDependence(NamedTuple):
@@ -27,7 +27,7 @@ class TimeDependence(NamedTuple):
 
 def time_dependence(function: Callable, t: Array, y: Array) -> TimeDependence | None:
     """How `function(t, y)`, an array, depends on t; None where it does not."""
-    steps, constants, (output,) = inlined_steps(jax.make_jaxpr(function)(t, y))
+    steps, constants, (output,) = inlined_steps(without_unused(jax.make_jaxpr(function)(t, y)))
     of_t, of_y = dependents(steps, T), dependents(steps, Y)
     before_y = [step for step in steps if not of_y.intersection(step.results)]
     with_y = [step for step in steps if of_y.intersection(step.results)]

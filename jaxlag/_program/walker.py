@@ -52,7 +52,7 @@ def constants_as_inputs(closed: Any) -> Any:
 def called_program(equation: Any) -> Any:
     """The program that an equation calls, closed."""
     p = equation.params
-    program = p["jaxprs"].solve if "jaxprs" in p else next(p[name] for name in ("jaxpr", "call_jaxpr", "fun_jaxpr") if name in p)
+    program = p["jaxprs"].solve if "jaxprs" in p else next(p[name] for name in ("jaxpr", "call_jaxpr", "fun_jaxpr", "call") if name in p)
     return program if hasattr(program, "consts") else core.ClosedJaxpr(program, ())
 
 
@@ -117,3 +117,9 @@ def used_arguments(function: Callable, *arguments: Any) -> Any:
     jaxpr = jax.make_jaxpr(function)(*arguments).jaxpr
     _, used = pe.dce_jaxpr(jaxpr, [True] * len(jaxpr.outvars))
     return jax.tree.unflatten(jax.tree.structure(arguments), used)
+
+
+def without_unused(closed: Any) -> Any:
+    """A closed program without the operations, and the operands of branches and loops, that no output depends on."""
+    jaxpr, _ = pe.dce_jaxpr(closed.jaxpr, [True] * len(closed.jaxpr.outvars), instantiate=True)
+    return closed.replace(jaxpr=jaxpr)

@@ -17,7 +17,8 @@ import numpy as np
 from jax.extend import core
 from jaxtyping import Array, Float
 
-from .walker import called_program
+from .walker import called_program, count_equations
+from .without_libraries import without_libraries
 
 try:
     from jax.experimental.xla_metadata import set_xla_metadata
@@ -33,11 +34,12 @@ ELEMENTWISE = (
 STRUCTURE = (
     "argmax argmin broadcast_in_dim concatenate dot_general dynamic_slice dynamic_update_slice gather iota nonbatchable "
     "optimization_barrier pad platform_index reduce_and reduce_max reduce_min reduce_or reduce_prod reduce_sum reshape rev slice split "
-    "squeeze stack transpose"
+    "squeeze stack transpose scatter scatter-add"
 )
-CALLS = "closed_call cond core_call custom_jvp_call custom_linear_solve jit pjit scan while"
+CALLS = "closed_call cond core_call custom_jvp_call custom_linear_solve custom_vmap_call jit pjit scan while"
 SUMS = frozenset(("dot_general", "reduce_and", "reduce_max", "reduce_min", "reduce_or", "reduce_prod", "reduce_sum"))
 MOST_TERMS = 4095  # of a sum: more of them XLA leaves to a library; products of matrices far later
+MOST_EQUATIONS = 12000  # one kernel of 6,000 takes 3 s to compile, one of 60,000 a minute, where many take 14 s
 ALLOWED = frozenset(f"{ELEMENTWISE} {STRUCTURE} {CALLS}".split())
 
 
@@ -50,13 +52,15 @@ def in_whole_kernel(function: Callable) -> Callable:
 
     def wrapped(given: Float[Array, " n"], result: Float[Array, " m"]) -> Float[Array, " m"]:
         program = jax.make_jaxpr(function)(given, result)
+        written_out = _without_libraries(program)
         run = lambda given, result: core.jaxpr_as_fun(program)(given, result)[0]
-        if set_xla_metadata is None or jax.default_backend() != "cpu" or not _is_allowed(program):
+        if set_xla_metadata is None or jax.default_backend() != "cpu" or not _is_allowed(written_out):
             return run(given, result)
 
         def chosen(given, result):
             is_number = given[0] == given[0]  # unless it is NaN
-            return jax.lax.cond(is_number, run, lambda given, result: jnp.full_like(result, jnp.nan), given, result)
+            inside = lambda given, result: core.jaxpr_as_fun(written_out)(given, result)[0]
+            return jax.lax.cond(is_number, inside, lambda given, result: jnp.full_like(result, jnp.nan), given, result)
 
         @jax.custom_jvp
         @jax.custom_batching.sequential_vmap
@@ -68,6 +72,11 @@ def in_whole_kernel(function: Callable) -> Callable:
         return call(given, result)
 
     return wrapped
+
+
+def _without_libraries(program):
+    """The program, with its small matrices written out where it is not so long that one kernel of it takes longer to compile than all."""
+    return without_libraries(program) if count_equations(program) <= MOST_EQUATIONS else program
 
 
 def _is_allowed(program) -> bool:

@@ -1,0 +1,155 @@
+"""Steps with dry friction in one loop: the same motions as by a loop for each purpose, from programs that hold the equations once."""
+
+import collections
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxlag as jl
+from jaxlag._motion import integrate
+from jaxlag._motion.step_monitor import CHEBYSHEV, slopes_of_interpolant
+from jaxlag._program.walker import primitive_names, programs_within
+
+TS = jnp.linspace(0, 4, 41)
+
+
+def driven(t, A, w):
+    return A * jnp.stack([jnp.cos(w * t), 0.7 * jnp.sin(2.3 * w * t)])
+
+
+def spring(q, qdot, c):
+    return 0.5 * qdot @ qdot - 0.5 * c * (q[0] ** 2 + (q[1] - q[0]) ** 2)
+
+
+SYSTEMS = {
+    "two elements": jl.System(spring, dissipation=lambda qdot, F: F * (jnp.abs(qdot[0]) + 0.5 * jnp.abs(qdot[1] - qdot[0])), force=driven),
+    "in a plane": jl.System(spring, dissipation=lambda qdot, F: F * jnp.hypot(qdot[0], qdot[1]), force=driven),
+    "on a rod": jl.System(
+        spring,
+        dissipation=lambda q, qdot, F: F * jnp.abs(q[0] * qdot[1] - q[1] * qdot[0]),
+        holonomic={"rod": lambda q: q @ q - 1},
+        force=driven,
+    ),
+    "on a wire": jl.System(
+        spring,
+        dissipation=lambda qdot, multipliers, F: 0.3 * F * jnp.abs(multipliers["wire"]) * jnp.abs(qdot[0]),
+        holonomic={"wire": lambda q: q[1] - 0.3 * q[0] ** 2},
+        force=driven,
+    ),
+}
+
+
+def state(name, rng):
+    q, v = rng.normal(size=2), rng.normal(size=2)
+    if name == "on a rod":
+        q /= np.linalg.norm(q)
+        v = v[0] * np.array([-q[1], q[0]])
+    if name == "on a wire":
+        q[1], v[1] = 0.3 * q[0] ** 2, 0.6 * q[0] * v[0]
+    return q, v * rng.integers(2)
+
+
+def motions(name, units, count):
+    """Of random numbers, in units of length and time that are not of order one."""
+    length, time = units
+    rng = np.random.default_rng(7)
+    scale = {"c": 1 / time**2, "F": length / time**2, "A": length / time**2, "w": 1 / time}
+    motion = jax.jit(lambda q, v, params: jl.simulate(SYSTEMS[name], q, v, TS * time, params, throw=False))
+    for _ in range(count):
+        (q, v), numbers = state(name, rng), dict(zip("cFAw", rng.uniform([0.5, 0.05, 0.1, 0.3], [20, 2, 4, 6]), strict=True))
+        params = {name: number * scale[name] for name, number in numbers.items()}
+        yield motion(length * q, length / time * v, params)
+
+
+@pytest.mark.parametrize(("name", "units"), [("two elements", (1e-6, 1e-3)), ("on a rod", (1.0, 1.0))])
+def test_motions_are_those_of_a_loop_for_each_purpose(name, units, monkeypatch):
+    _compare(name, units, monkeypatch, 12)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["in a plane", "on a wire", "two elements"])
+def test_more_motions_are_those_of_a_loop_for_each_purpose(name, monkeypatch):
+    _compare(name, (1.0, 1.0), monkeypatch, 60)
+
+
+def _compare(name, units, monkeypatch, count):
+    found = list(motions(name, units, count))
+    monkeypatch.setattr(integrate, "has_one_evaluation", lambda *given: False)
+    jax.clear_caches()
+    expected = list(motions(name, units, count))
+    jax.clear_caches()
+    sliding = 0
+    for one, other in zip(found, expected, strict=True):
+        assert one.result == other.result == jl.results.RESULTS.successful
+        scale = np.max(np.abs(other.q), initial=units[0] * 1e-3)
+        np.testing.assert_allclose(one.q, other.q, atol=1e-6 * scale)
+        sliding += int(np.sum(other.stats["transitions"][-1]))
+    ratios = [int(one.stats["num_steps"]) / int(other.stats["num_steps"]) for one, other in zip(found, expected, strict=True)]
+    assert np.median(ratios) <= 1.03
+    assert sliding > count / 4  # modes have changed
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("q", [(0.6, -0.8), (0.0, -1.0)], ids=["swings", "rests"])
+def test_derivatives_in_nanometres_and_gigaseconds(q):
+    """Of a pendulum on a rod with friction in its joint, beside differences; also without friction, on the side where there is some."""
+    length, time, h = 1e-9, 1e9, 1e-5
+    pendulum = jl.System(
+        lambda q, qdot, m, g: 0.5 * m * qdot @ qdot - m * g * q[1],
+        dissipation=lambda q, qdot, F, l: F * jnp.abs(q[0] * qdot[1] - q[1] * qdot[0]) / l,
+        holonomic={"rod": lambda q, l: jnp.hypot(q[0], q[1]) - l},
+    )
+    unit = length / time**2
+    params = lambda F: {"m": 2.0, "g": 9.81 * unit, "F": F * unit, "l": length}
+    last = jax.jit(lambda F: jl.simulate(pendulum, length * jnp.array(q), jnp.zeros(2), 3 * time * TS / TS[-1], params(F)).q[-1] / length)
+    slope = jax.jit(jax.jacfwd(last))
+    for F in (0.0, 0.4):
+        central = (last(F + h) - last(F - h)) / (2 * h) if F else (-3 * last(F) + 4 * last(F + h) - last(F + 2 * h)) / (2 * h)
+        np.testing.assert_allclose(slope(F), central, atol=1e-7)
+
+
+def loops(program):
+    """All loops in a program."""
+    for equation in getattr(program, "jaxpr", program).eqns:
+        if equation.primitive.name == "while":
+            yield equation
+        for part in programs_within(equation):
+            yield from loops(part)
+
+
+@pytest.mark.parametrize(("name", "most"), [("on a rod", 8), ("in a plane", 4)])
+def test_equations_stand_once_in_the_loop(name, most):
+    """Of an energy that holds erf, derivatives and the projection included; a loop for each purpose held 19 and 7 of them."""
+    system = SYSTEMS[name]
+    marked = jl.System(
+        lambda q, qdot, c: spring(q, qdot, c) + 1e-3 * jax.lax.erf(q[0]) * qdot[0] ** 2,
+        dissipation=dict(system.dissipation),
+        holonomic=dict(system.holonomic),
+        force=driven,
+    )
+    q, v = state(name, np.random.default_rng(0))
+    params = {"c": 1.0, "F": 0.2, "A": 1.0, "w": 2.0}
+    program = jax.make_jaxpr(lambda q, v: jl.simulate(marked, q, v, TS, params, throw=False).q)(q, v)
+    counts = [collections.Counter(primitive_names(loop.params["body_jaxpr"]))["erf"] for loop in loops(program)]
+    assert 0 < max(counts) <= most
+
+
+@pytest.mark.parametrize(("low", "high"), [(0.0, 1.0), (1e3, 1e3 + 3e-2), (-1e-9, 2e-9)])
+def test_slopes_of_an_interpolant_are_those_of_its_polynomial(low, high):
+    coefficients = np.random.default_rng(1).normal(size=(9, 3))
+    at = lambda s: np.polynomial.polynomial.polyval(s, coefficients).T
+    slope = lambda s: np.polynomial.polynomial.polyval(s, np.polynomial.polynomial.polyder(coefficients)).T
+    middle, half = (low + high) / 2, (high - low) / 2
+    s = np.linspace(-1, 1, 5)
+    found = slopes_of_interpolant(low, high, jnp.asarray(at(2 * np.array(CHEBYSHEV) - 1)), jnp.asarray(middle + half * s))
+    seen = (middle + half * s - middle) / half  # as times round
+    np.testing.assert_allclose(found, slope(seen) / half, rtol=1e-9, atol=1e-9 / half)
+
+
+def test_a_result_says_that_it_is_one():
+    fall = jl.System(lambda q, qdot: 0.5 * qdot**2 - 9.81 * q)
+    assert "successful" in repr(jl.simulate(fall, 0.0, 0.0, [0.0, 1.0]).result)
+    stopped = jl.simulate(fall, 0.0, 0.0, [0.0, 1e3], max_steps=2, throw=False).result
+    assert "max_steps" in repr(stopped) and "successful" not in repr(stopped)
