@@ -86,6 +86,7 @@ WINGS = {  # each imports only from those above it, and each file of a wing only
     "_mechanics": [
         "structured_inertia",
         "lagrange",
+        "sliders",
         "pseudo_inverse",
         "augmented_inertia",
         "sparse_saddle_point",

@@ -4,14 +4,15 @@ from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from .._model.flat import Flat
 from .._program.sparse_matrix import dense
-from .lagrange import applied_force, inertia, inertial_force, velocity_residual, velocity_rows
-from .massless import first_order, inertial_part, with_first_order_rates
+from .lagrange import applied_force, inertia, inertial_force, velocity_rows
+from .massless import inertial_part, with_first_order_rates, without_inertia
 from .pseudo_inverse import Constraints
-from .saddle_point import SaddlePoint, Sound, saddle_point
+from .saddle_point import SaddlePoint, Sound, saddle_point, saddle_point_beside
 from .self_consistent import others, self_consistent
 
 
@@ -22,25 +23,25 @@ def constrained_acceleration(flat: Flat, t, q, v, feedback=None) -> SaddlePoint:
 
 def constrained_motion(flat: Flat, t, q, v, feedback=None) -> tuple[Float[Array, " n"], SaddlePoint]:
     """q̇ with the velocities that D decides, and q̈ and λ."""
-    z, *_ = first_order(flat)
-    if not z.size:
-        return v, _by_inertia(flat, t, q, v, feedback)
-    (v, multipliers, sound), along = jax.linearize(lambda t, q, v: with_first_order_rates(flat, t, q, v), t, q, v)
-    _, pull = jax.vjp(lambda v: velocity_residual(flat, t, q, v), v)
-    found = _by_inertia(inertial_part(flat, t, q, v, pull(multipliers)[0]), t, q, v, feedback)
+    light = without_inertia(flat)
+    if not light.size:
+        return v, _by_inertia(flat, t, q, v, feedback, light)
+    (v, multipliers, reaction, sound), along = jax.linearize(lambda t, q, v: with_first_order_rates(flat, t, q, v), t, q, v)
+    found = _by_inertia(inertial_part(flat, t, q, v, reaction), t, q, v, feedback, light)
     rate = along(jnp.ones_like(t), v, found.x).v
     is_sound = Sound(*(a & b for a, b in zip(sound, found.sound, strict=True)))
-    return v, SaddlePoint(found.x.at[z].set(rate[z]), found.multipliers + multipliers, is_sound)
+    theirs = np.zeros(multipliers.size, bool) if flat.sliders is None else flat.sliders.among(multipliers.size)
+    return v, SaddlePoint(found.x.at[light].set(rate[light]), multipliers.at[np.flatnonzero(~theirs)].add(found.multipliers), is_sound)
 
 
-def _by_inertia(flat: Flat, t, q, v, feedback) -> SaddlePoint:
-    """q̈ and λ where everything has inertia, or is held by constraints."""
+def _by_inertia(flat: Flat, t, q, v, feedback, light: np.ndarray) -> SaddlePoint:
+    """q̈ and λ where everything has inertia, or is held by constraints; those `light` have that of another part."""
     M, inertial = inertia(flat, t, q, v), inertial_force(flat, t, q, v)
     _, G, gamma = velocity_rows(flat, t, q, v)
     c = -gamma if feedback is None else -gamma - feedback(flat, t, q, v)
     force = lambda multipliers: applied_force(flat, t, q, v, multipliers)
     if not flat.needs_multipliers:
-        found = saddle_point(M, G, inertial + force(jnp.zeros_like(c)), c, near=_near(flat, t, q, v, c.size))
+        found = saddle_point_beside(light, M, G, inertial + force(jnp.zeros_like(c)), c, near=_near(flat, t, q, v, c.size))
         return found._replace(multipliers=_pushing(flat, found.multipliers))
     columns, reaction, unit = _by_force(flat, M, G, inertial, c, force, _near(flat, t, q, v, c.size))
     multipliers = _pushing(flat, self_consistent(reaction, unit))

@@ -10,18 +10,13 @@ from jaxtyping import Array, Float
 from .._model.flat import Flat
 from .._program.scalarise import scalarised
 from .constrained_root import Linear, root_of
-from .lagrange import applied_force, inertial_force, velocity_residual
+from .lagrange import smooth_force, velocity_residual
 from .saddle_point import Sound, is_determined, saddle_point
 
 ITERATIONS = 100  # of Newton's method; from rest, a few more than from a motion
 HALVINGS = 1100  # of a step, from the largest number to the least
 NEAR = 0.1875  # exponent of eps (1.2e-3 in double precision), at which distance a D is flat that does not decide velocities
 LEAST = 0.125  # exponent of the least number (3e-39), at which velocity a D is looked at where nothing moves: its square is one too
-
-
-def smooth_force(flat: Flat, t, q, v):
-    """∂L/∂q − … − ∂D/∂q̇ + Q: all but constraints."""
-    return inertial_force(flat, t, q, v) + applied_force(flat, t, q, v, jnp.zeros(flat.rows, v.dtype))
 
 
 def by_newton(flat: Flat, z, rows, equations: Callable, t, q, v) -> tuple[Array, Array, Sound]:

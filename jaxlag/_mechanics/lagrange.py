@@ -73,15 +73,19 @@ def applied_force(flat: Flat, t, q, v, multipliers) -> Float[Array, " n"]:
     return Q - jax.grad(D)(v)
 
 
+def smooth_force(flat: Flat, t, q, v) -> Float[Array, " n"]:
+    """f, of all but constraints and the forces that depend on their multipliers."""
+    return inertial_force(flat, t, q, v) + applied_force(flat, t, q, v, jnp.zeros(flat.rows, v.dtype))
+
+
 def rows_of(G: lx.AbstractLinearOperator | SparseMatrix) -> Float[Array, "m n"] | SparseMatrix:
     """A Jacobian as an array, but where it is sparse."""
     return G if isinstance(G, SparseMatrix) else G.as_matrix()
 
 
 def position_rows(flat: Flat, t, q) -> tuple[Float[Array, " h"], Float[Array, "h n"] | SparseMatrix]:
-    """g and its Jacobian ∂g/∂q, sparse where it is large; and of what slips without inertia, the force that is left beside its friction."""
-    terms = [flat.holonomic] if flat.yielding is None else [flat.holonomic, flat.yielding]
-    g, G = jacobian(lambda q: jnp.concatenate([term(t, q) for term in terms]), q)
+    """g and its Jacobian ∂g/∂q, sparse where it is large."""
+    g, G = jacobian(lambda q: flat.holonomic(t, q), q)
     return g, rows_of(G)
 
 

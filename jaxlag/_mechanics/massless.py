@@ -15,12 +15,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from .._model.flat import Flat, read_once
+from .._model.flat import Flat, read_once, variant
 from .._program.sparse_jacobian import jacobian, underdetermined
 from .._program.sparsity import sparsity_pattern
-from .convex_dissipation import by_newton, smooth_force
-from .lagrange import applied_force, constraint_rows, inertia, inertial_force, pattern_of_rows, velocity_residual
-from .saddle_point import Sound, reach_of, saddle_point
+from .convex_dissipation import by_newton
+from .lagrange import applied_force, inertial_force, pattern_of_rows, smooth_force, velocity_residual
+from .saddle_point import Sound, saddle_point
+from .sliders import motion_of_sliders
 
 RECIPROCAL = (
     "`lagrangian` and `force` must not couple the velocities of coordinates without inertia among each other, but do. "
@@ -139,59 +140,89 @@ def _stated_rows(flat: Flat, t, q) -> tuple[np.ndarray, slice]:
 
 
 class FirstOrderRates(NamedTuple):
-    """q̇ with the velocities that D decides; λ of the rows that these are in; and whether both are sound."""
+    """q̇ with the velocities that D decides; λ of the rows that these are in, and the forces Gᵀλ; and whether both are sound."""
 
     v: Float[Array, " n"]
     multipliers: Float[Array, " m"]
+    reaction: Float[Array, " n"]
     sound: Sound
 
 
 def with_first_order_rates(flat: Flat, t, q, v) -> FirstOrderRates:
-    """q̇ with the velocities that D decides, whatever they were before."""
-    z, rows, is_affine = first_order(flat)
-    multipliers, yes = jnp.zeros(rows.size, v.dtype), jnp.array(True)
+    """q̇ with the velocities that D decides, whatever they were before; in a mode of dry friction, those of sliders with them."""
+    z, rows, _ = first_order(flat)
+    yes, sliders = jnp.array(True), flat.sliders
+    found = FirstOrderRates(v, jnp.zeros(rows.size, v.dtype), jnp.zeros_like(v), Sound(yes, yes))
+    if sliders is None:
+        return _with_decided(flat, t, q, found) if z.size else found
+    if z.size:
+        holds = motion_of_sliders(flat, t, q, v)  # of no velocity
+        of_sliders = found._replace(multipliers=found.multipliers.at[sliders.rows].set(holds.multipliers), reaction=holds.reaction)
+        found = _with_decided(flat, t, q, of_sliders)
+    rates, multipliers, reaction = motion_of_sliders(flat, t, q, found.v)
     if not z.size:
-        return FirstOrderRates(v, multipliers, Sound(yes, yes))
-    of = lambda v, w: v.at[z].set(w)
+        found = found._replace(multipliers=found.multipliers.at[sliders.rows].set(multipliers), reaction=reaction)
+    return found._replace(v=found.v.at[sliders.coordinates].set(rates))
+
+
+def _with_decided(flat: Flat, t, q, found: FirstOrderRates) -> FirstOrderRates:
+    """With the velocities that smooth dissipation decides, beside the reaction that was found of the rest."""
+    z, rows, is_affine = first_order(flat)
+    if flat.sliders is not None:
+        rows = rows & ~flat.sliders.among(rows.size)
+    v, of = found.v, lambda v, w: v.at[z].set(w)
+    beside = flat if flat.sliders is None else flat._replace(forces=flat.forces | {"": lambda *_: found.reaction})
 
     def equations(t, q, v, w):
         """−∂(force)/∂ż, the force at rates w, ∂ψ/∂ż and −ψ."""
-        F, slope = jacobian(lambda w: -smooth_force(flat, t, q, of(v, w))[z], w)
+        F, slope = jacobian(lambda w: -smooth_force(beside, t, q, of(v, w))[z], w)
         psi, G = jacobian(lambda w: velocity_residual(flat, t, q, of(v, w))[rows], w)
         return slope, G.as_matrix(), -F, -psi
 
     if is_affine:  # not even by a comparison, as that of unlike dampers is not
         w, of_rows, sound = saddle_point(*equations(t, q, v, jnp.zeros(z.size, v.dtype)))
     else:
-        w, of_rows, sound = by_newton(flat, z, rows, equations, t, q, v)
-    return FirstOrderRates(of(v, w), multipliers.at[np.flatnonzero(rows)].set(of_rows), sound)
+        w, of_rows, sound = by_newton(beside, z, rows, equations, t, q, v)
+    multipliers = jnp.zeros_like(found.multipliers).at[np.flatnonzero(rows)].set(of_rows)
+    there = of(v, w)
+    reaction = jax.vjp(lambda v: velocity_residual(flat, t, q, v), there)[1](multipliers)[0] if np.any(rows) else jnp.zeros_like(v)
+    return FirstOrderRates(there, found.multipliers + multipliers, found.reaction + reaction, sound)
+
+
+def without_inertia(flat: Flat) -> Int[np.ndarray, " k"]:
+    """Coordinates whose velocities D decides: in a mode of dry friction, those that slide or stick without inertia, too."""
+    z = first_order(flat).coordinates
+    return z if flat.sliders is None else np.union1d(z, flat.sliders.coordinates)
 
 
 def inertial_part(flat: Flat, t, q, v, reaction: Float[Array, " n"] | None = None) -> Flat:
-    """The system of what has inertia: a mass, which nothing feels, stands in for each one that is missing, and the rows of ψ that ż is in
-    are left out, with the forces of their λ as a `reaction`.
+    """The system of what has inertia: a mass, which nothing feels, stands in for each one that is missing. The rows of ψ that ż is in are
+    zero, and those of sliders left out, with the forces of their λ as a `reaction`.
     """
-    z, rows, _ = first_order(flat)
-    if not z.size:
+    (_, rows, _), light = first_order(flat), without_inertia(flat)
+    if not light.size:
         return flat
     size = flat.holonomic(t, q).size
-    without = lambda function, rows: lambda *given: jnp.where(rows, 0, function(*given))
-    forces = flat.forces if reaction is None else flat.forces | {"": lambda *_: reaction}
-    return with_masses(flat, z)._replace(
-        forces=forces,
-        holonomic=without(flat.holonomic, rows[:size]),
-        bilateral=without(flat.bilateral, rows[: flat.rows_of_bilateral]),
-        nonholonomic=without(flat.nonholonomic, rows[size:]),
+    theirs = np.zeros(rows.size, bool) if flat.sliders is None else flat.sliders.among(rows.size)
+    zero_in = lambda function, rows: (lambda *given: jnp.where(rows, 0, function(*given))) if np.any(rows) else function
+    others = flat.nonholonomic if flat.sliders is None else flat.sliders.beside
+    return variant(
+        with_masses(flat, light),
+        _some_inertial_part,
+        forces=flat.forces if reaction is None else flat.forces | {"": lambda *_: reaction},
+        holonomic=zero_in(flat.holonomic, rows[:size]),
+        bilateral=zero_in(flat.bilateral, rows[: flat.rows_of_bilateral]),
+        nonholonomic=zero_in(others, rows[size:][~theirs[size:]]),
         massless=(),
+        sliders=None,
     )
+
+
+def _some_inertial_part(flat: Flat, t, q, v) -> Flat:
+    """That of which nothing is known."""
+    return inertial_part(flat, t, q, v, v)
 
 
 def with_masses(flat: Flat, coordinates: Int[np.ndarray, " k"]) -> Flat:
     """The system with masses, as large as those of the other coordinates on average, on `coordinates`: for M alone, nothing feels them."""
     return flat._replace(stand_ins=tuple(sorted({*flat.stand_ins, *map(int, coordinates)})))
-
-
-def nearest_velocity(flat: Flat, t, q, v) -> Float[Array, " n"]:
-    """q̇ on the constraints, nearest in the metric of M."""
-    psi, G, _ = constraint_rows(flat, t, q, v)
-    return v + saddle_point(inertia(flat, t, q, v), G, jnp.zeros_like(v), -psi, reach_of(v)).x

@@ -15,8 +15,9 @@ from .._program.scalarise import scalarised
 from .._program.sparse_jacobian import jacobian
 from .augmented_inertia import augmented
 from .lagrange import inertia, position_rows, velocity_residual, velocity_rows
-from .massless import inertial_part, with_first_order_rates
-from .saddle_point import reach_of, saddle_point
+from .massless import inertial_part, with_first_order_rates, without_inertia
+from .saddle_point import reach_of, saddle_point_beside
+from .sliders import with_sliders_returned
 
 
 @dataclasses.dataclass(frozen=True)
@@ -54,21 +55,24 @@ class Projection:
         self, flat: Flat, t: Any, q: Float[Array, " n"], v: Float[Array, " n"], *, found: bool = False
     ) -> tuple[Float[Array, " n"], Float[Array, " n"]]:
         """The state on the constraints that is nearest to this one, which is near already; or has its positions `found` on them."""
-        part = inertial_part(flat, t, q, v)
+        part, light = inertial_part(flat, t, q, v), without_inertia(flat)
         M = inertia(part, t, q, v)  # at the start serves throughout: corrections are small
 
         @scalarised
         def newton(t, q, M):
-            g, G = position_rows(flat, t, q)
-            return q + saddle_point(M, G, jnp.zeros_like(q), -g, reach_of(q)).x
+            if flat.holonomic_names:
+                g, G = position_rows(flat, t, q)
+                q = q + saddle_point_beside(light, M, G, jnp.zeros_like(q), -g, reach_of(q)).x
+            return q if flat.sliders is None else with_sliders_returned(flat, t, q)
 
         @scalarised
         def on_velocities(t, q, v, M):
             psi, G, _ = velocity_rows(part, t, q, v)
-            return with_first_order_rates(flat, t, q, _corrected(v, saddle_point(M, G, jnp.zeros_like(v), -psi, reach_of(v)).x)).v
+            dv = saddle_point_beside(light, M, G, jnp.zeros_like(v), -psi, reach_of(v)).x
+            return with_first_order_rates(flat, t, q, _corrected(v, dv)).v
 
-        if (flat.holonomic_names or flat.yielding) and not found:
-            metric = metric_of_positions(flat, M, t, q, v)
+        if (flat.holonomic_names or flat.sliders is not None) and not found:
+            metric = metric_of_positions(part, M, t, q, v) if flat.holonomic_names else M
             q, _ = jax.lax.scan(lambda q, _: (newton(t, q, metric), None), q, length=self.iterations)
         return q, on_velocities(t, q, v, M)
 

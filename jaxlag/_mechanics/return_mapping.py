@@ -11,7 +11,7 @@ from jaxtyping import Array, Float
 
 from .._model.flat import Flat
 from .friction_elements import FrictionElements
-from .massless import smooth_force
+from .lagrange import smooth_force
 from .projection import Projection
 from .stick_slip import bounds, in_mode
 

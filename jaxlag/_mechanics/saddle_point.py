@@ -6,6 +6,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import lineax as lx
+import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from .._program.conditions import everywhere
@@ -121,6 +122,21 @@ def _sparse_saddle_point(M, G, f, c) -> SaddlePoint:
 def _way(M):
     """How sparse rows are solved with."""
     return sparse_saddle_point if isinstance(M, lx.DiagonalLinearOperator) else block_saddle_point
+
+
+def saddle_point_beside(
+    apart: np.ndarray, M: lx.AbstractLinearOperator, G: Rows, f, c, reach: Float[Array, " n"] | None = None, near: Constraints | None = None
+) -> SaddlePoint:
+    """`saddle_point` where few coordinates stand `apart`, which M and G couple with none: x is zero there, and no time goes into them."""
+    kept = np.setdiff1d(np.arange(f.size), apart)
+    if not 0 < kept.size < f.size < MANY or isinstance(G, SparseMatrix):
+        return saddle_point(M, G, f, c, reach, near)
+    if near is not None:
+        near = Constraints(near.off, lambda change, rows=near.rows: rows(jnp.zeros_like(f).at[kept].set(change))[:, kept])
+    is_diagonal = isinstance(M, lx.DiagonalLinearOperator)
+    part = lx.DiagonalLinearOperator(M.diagonal[kept]) if is_diagonal else lx.MatrixLinearOperator(M.as_matrix()[np.ix_(kept, kept)])
+    found = saddle_point(part, G[:, kept], f[kept], c, None if reach is None else reach[kept], near)
+    return found._replace(x=jnp.zeros_like(f).at[kept].set(found.x))
 
 
 def saddle_solver(M: lx.AbstractLinearOperator, G: Rows, f, c, reach: Float[Array, " n"] | None = None) -> Callable:

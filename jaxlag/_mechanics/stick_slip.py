@@ -23,7 +23,7 @@ from .constrained_acceleration import constrained_motion
 from .constrained_slip import directed, extent_of, freely, on_constraints
 from .friction_elements import FrictionElements, find_elements
 from .load_sharing import may_share, shared
-from .massless import nearest_velocity, smooth_force
+from .sliders import Sliders, rates_of_forces, rounding_of_multipliers
 from .slip_direction import friction_and_direction, turning, unit
 
 
@@ -36,15 +36,20 @@ def in_mode(flat: Flat, elements: FrictionElements, sigma: Float[Array, " r"]) -
     def slipping(D):
         return lambda t, q, v, multipliers: D(t, q, v, multipliers, extent(t, q, v))
 
-    def with_rows(t, q, v, otherwise):
-        return jnp.concatenate([flat.nonholonomic(t, q, v), jnp.where(stuck, held_slip(t, q, v), otherwise)])
+    def with_rows(rows, otherwise=lambda t, q, v: 0):
+        at = lambda t, q, v: jnp.where(stuck[rows], held_slip(t, q, v)[rows], otherwise(t, q, v))
+        return lambda t, q, v: jnp.concatenate([flat.nonholonomic(t, q, v), at(t, q, v)])
 
     held = {name: flat.rows + rows for name, rows in elements.own_rows.items()}
     mode = variant(flat, _in_some_mode, dissipations={name: slipping(D) for name, D in elements.potentials.items()}, held=held)
-    if not np.any(elements.massless >= 0):
-        return mode._replace(nonholonomic=lambda t, q, v: with_rows(t, q, v, 0))
-    yielding, rates = _yielding(mode, elements, stuck)
-    return mode._replace(nonholonomic=lambda t, q, v: with_rows(t, q, v, rates(t, q, v)), yielding=yielding)
+    every = np.arange(stuck.size)
+    light = every[elements.massless >= 0] if np.ndim(elements.massless) else every[:0]
+    if not light.size:
+        return mode._replace(nonholonomic=with_rows(every))
+    slip, beside = lambda t, q, v: elements.slip(t, q, v)[light], with_rows(np.setdiff1d(every, light))
+    mode = mode._replace(sliders=Sliders(elements.massless[light], flat.rows + light, stuck[light], slip, beside))
+    rates = lambda t, q, v: jnp.zeros(stuck.size, v.dtype).at[light].set(rates_of_forces(mode, t, q, v))
+    return mode._replace(nonholonomic=with_rows(every, rates))
 
 
 def _in_some_mode(flat: Flat, t, q, v) -> Flat:
@@ -54,32 +59,18 @@ def _in_some_mode(flat: Flat, t, q, v) -> Flat:
     return in_mode(flat, elements, jnp.broadcast_to(t, elements.element_of_row.size))
 
 
-def _yielding(mode: Flat, elements: FrictionElements, stuck: Bool[Array, " r"]) -> tuple[Callable, Callable]:
-    """Of each row that slips without inertia, h(t, q), the force that is left beside friction; and dh/dt of all rows: zero while it slips.
-
-    So ż follows from dh/dt = 0: with h = c (x − z) ∓ F this is a Jenkin element. The force of such a constraint is zero.
-    """
-    rows = np.flatnonzero(elements.massless >= 0)
-
-    def left(t, q):
-        return jnp.where(stuck[rows], 0, smooth_force(mode, t, q, jnp.zeros_like(q))[elements.massless[rows]])
-
-    def rates(t, q, v):
-        return jnp.zeros(elements.massless.size, v.dtype).at[rows].set(jax.jvp(left, (t, q), (jnp.ones_like(t), v))[1])
-
-    return left, rates
-
-
 def sticking(elements: FrictionElements, sigma: Float[Array, " r"]) -> Bool[Array, " e"]:
     """Which elements stick."""
     return elements.norms(sigma) == 0
 
 
 class Friction(NamedTuple):
-    """At one state in one mode: acceleration and multipliers; per row, friction force and rate of the slip; per element, its bound, the
-    margin of its mode, negative where that has ended, whether constraints drive its slip, and whether that is along a line.
+    """At one state in one mode: velocities, with those that D decides, accelerations and multipliers; per row, friction force and rate of
+    the slip; per element, its bound, the margin of its mode, negative where that has ended, whether constraints drive its slip, and whether
+    that is along a line.
     """
 
+    qdot: Float[Array, " n"]
     qddot: Float[Array, " n"]
     multipliers: Float[Array, " m"]
     force: Float[Array, " r"]
@@ -107,12 +98,8 @@ def _friction(flat, elements, sigma, t, q, v, feedback):
     v, (qddot, multipliers, _) = constrained_motion(mode, t, q, v, feedback)
     slip, slip_rate = jax.jvp(elements.slip, (t, q, v), (jnp.ones_like(t), v, qddot))
     if np.any(elements.is_quasistatic):  # what has no inertia slips at once
-        there = v if mode.yielding is None else nearest_velocity(mode, t, q, v)
-        at_once = elements.slip(t, q, there)
-        moves = elements.is_quasistatic & (
-            elements.norms(at_once) > slip_of(elements, t, q, there, 1e2 * jnp.finfo(v.dtype).eps * jnp.abs(there))
-        )
-        slip_rate = jnp.where(moves[of], at_once, slip_rate)
+        still = slip_of(elements, t, q, v, 1e2 * jnp.finfo(v.dtype).eps * jnp.abs(v))
+        slip_rate = jnp.where((elements.is_quasistatic & (elements.norms(slip) > still))[of], slip, slip_rate)
     pull = jax.vjp(lambda slip: extent_of(elements, sigma, slip), slip)[1]
     bound_of = lambda multipliers: bounds(elements, sigma, t, q, v, multipliers)
     left = bound_of(multipliers) - elements.norms(freely(elements, multipliers[flat.rows :]))
@@ -122,8 +109,11 @@ def _friction(flat, elements, sigma, t, q, v, feedback):
     force = jnp.where(stuck[of], freely(elements, multipliers[flat.rows :]), -pull(bound)[0])
     going = elements.sums(directed(elements, sigma) * slip) + jnp.where(elements.straight, 0, 1e-6 * elements.near_rest)
     driven, straight = (jnp.broadcast_to(x, stuck.shape) for x in (elements.driven, elements.straight))
-    resting = jnp.where(driven, -jnp.abs(bound), left + 1e2 * jnp.finfo(v.dtype).eps * jnp.abs(bound))
-    return Friction(qddot, multipliers, force, slip_rate, bound, jnp.where(stuck, resting, going), driven, straight)
+    rounding = 1e2 * jnp.finfo(v.dtype).eps * jnp.abs(bound)
+    if mode.sliders is not None:
+        rounding = rounding.at[of[mode.sliders.rows - flat.rows]].add(rounding_of_multipliers(mode, t, q, v))
+    resting = jnp.where(driven, -jnp.abs(bound), left + rounding)
+    return Friction(v, qddot, multipliers, force, slip_rate, bound, jnp.where(stuck, resting, going), driven, straight)
 
 
 def bounds(elements: FrictionElements, sigma, t, q, v, multipliers) -> Float[Array, " e"]:

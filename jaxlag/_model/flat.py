@@ -52,7 +52,7 @@ class Flat(NamedTuple):
     source: Source  # what it was bound from
     closed: Bool[Array, " c"] | None = None  # those of the contacts, where it was chosen
     held: dict[str, np.ndarray] = {}  # noqa: RUF012 - rows of G beyond those, with which a dissipation term sticks
-    yielding: Callable[..., Float[Array, " p"]] | None = None  # h(t, q) = 0 of what slips without inertia
+    sliders: Any = None  # in a mode of friction, what it alone resists and has no inertia
     stand_ins: tuple[int, ...] = ()  # coordinates of which M has a mass, as large as those of others, that nothing feels
 
 

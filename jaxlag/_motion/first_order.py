@@ -17,7 +17,7 @@ from .._mechanics.contact import free, in_contact
 from .._mechanics.friction_elements import FrictionElements, light_coordinates
 from .._mechanics.impact import check_impacts
 from .._mechanics.load_sharing import may_share
-from .._mechanics.massless import first_order, with_first_order_rates
+from .._mechanics.massless import with_first_order_rates
 from .._mechanics.power import energy_exchange, listed_powers
 from .._mechanics.projection import Projection
 from .._mechanics.saddle_point import SaddlePoint
@@ -224,7 +224,7 @@ class EquationsOfMotion:
         return _rates(self, t, y, args)
 
     def rates_and_friction(self, t, parts: Parts, args: Arguments) -> tuple[Array, Friction]:
-        """ẏ and the friction in the mode of `parts`, by one evaluation; where all has inertia, and nothing but friction changes modes."""
+        """ẏ and the friction in the mode of `parts`, by one evaluation, where nothing but friction changes modes."""
         return _rates_and_friction(self, t, parts, self._without_scales(args))
 
     def projected(self, t, y, args):
@@ -256,7 +256,7 @@ def _rates(equations: EquationsOfMotion, t, y, args):
     of = lambda is_free: lambda: equations.accelerated(t, parts, args, is_free).x
     qddot = equations.where_closed(parts, of(False), of(True))
     if equations.light:  # what follows from the rest has no rate of its own
-        qddot = qddot.at[first_order(mode).coordinates].set(0)
+        qddot = qddot.at[np.array(equations.light, int)].set(0)
     rates = ravelled(flat.state_rates(t, q, v), y.dtype)
     powers = listed_powers(mode, t, q, v) if equations.works else works
     stuck = parts.time_stuck if elements is None else jnp.maximum(sticking(elements, sigma).astype(y.dtype), held)
@@ -266,14 +266,15 @@ def _rates(equations: EquationsOfMotion, t, y, args):
 
 @jitted
 def _rates_and_friction(equations: EquationsOfMotion, t, parts: Parts, args) -> tuple[Array, Friction]:
-    q, v, found = parts.q, parts.v, equations.friction(t, parts, args)
+    q, found = parts.q, equations.friction(t, parts, args)
+    v, qddot = found.qdot, found.qddot.at[np.array(equations.light, int)].set(0)
     flat, elements = equations.contents(t, parts, args)
     assert elements is not None  # asked where there is friction
     powers = listed_powers(in_mode(flat, elements, parts.sigma), t, q, v) if equations.works else parts.works
     stuck = jnp.maximum(sticking(elements, parts.sigma).astype(q.dtype), parts.held)
     resting = Parts(*(jnp.zeros_like(part) for part in parts))
     z = ravelled(flat.state_rates(t, q, v), q.dtype)
-    return resting._replace(q=v, v=found.qddot, z=z, works=powers, time_stuck=stuck).y, found
+    return resting._replace(q=v, v=qddot, z=z, works=powers, time_stuck=stuck).y, found
 
 
 @jitted

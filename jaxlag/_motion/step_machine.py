@@ -48,7 +48,7 @@ def has_one_evaluation(equations: EquationsOfMotion, solver: Any, reverse: bool,
     """
     if varied and not equations.system.constraints and equations.rows == equations.elements:
         return False
-    other = equations.contacts or equations.events or equations.light or equations.sided
+    other = equations.contacts or equations.events or equations.sided
     plain = equations.formulation.stabilisation.feedback() is None and not equations.entangled
     return bool(isinstance(solver, ExplicitRungeKutta) and equations.elements and plain and not other and not reverse)
 
@@ -309,7 +309,7 @@ class _Step:
         parts, found = self.equations.parts(turn.piece.y), point.friction
         value, last = self._margins(parts, found)[: self.equations.elements], jnp.asarray(PHASES)[turn.phase] == CHANGE
         (_, elements), seen = self._contents(turn.end, parts), turn.split.seen.slope
-        slides = (elements.norms(parts.sigma) > 0) & (parts.held == 0) & jnp.isfinite(seen)
+        slides = (elements.norms(parts.sigma) > 0) & (parts.held == 0) & jnp.isfinite(seen) & ~elements.is_quasistatic
         slope = jnp.where(slides, jax.lax.stop_gradient(elements.sums(parts.sigma * found.slip_rate)), seen)  # of a slip, its rate
         given = turn.end, value, slope, jnp.zeros_like(value)
         cut, ended, moved = next_estimate(turn.split.cut, *given, (self.t0, self.t1), self.args)

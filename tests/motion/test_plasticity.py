@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy.integrate import solve_ivp
 from scipy.optimize import brentq
 
 import jaxlag as jl
@@ -120,3 +121,57 @@ def test_a_slider_is_identified_from_a_measured_loop():
     off = np.array([fit.params[name] - exact[name] for name in fit.names])
     assert fit.converged and off @ np.linalg.solve(fit.covariance, off) < 16  # χ² of three: one in a thousand is above
     assert all(fit.standard_errors[name] < 0.02 for name in exact)
+
+
+IWAN = jl.System(
+    lambda q, qdot, m, k, c: 0.5 * m * qdot["x"] ** 2 - 0.5 * k * q["x"] ** 2 - 0.5 * jnp.sum(c * (q["x"] - q["z"]) ** 2),
+    dissipation=lambda qdot, F: jnp.sum(F * jnp.abs(qdot["z"])),
+)
+
+
+def by_phases(x, z, m, k, c, F, ts):
+    """x(t) of a mass on a spring beside Jenkin elements, from rest, by SciPy from one change of its elements to the next."""
+    v, side, t, found = 0.0, np.zeros(c.size), 0.0, []
+    while t < ts[-1]:
+        force = lambda x, side=side, z=z: -k * x - np.where(side == 0, c * (x - z), side * F).sum()
+        stuck = np.flatnonzero(side == 0)
+        yields = [lambda _, y, i=i, z=z: F[i] - np.sign(y[0] - z[i]) * c[i] * (y[0] - z[i]) for i in stuck]
+        events = [lambda _, y: y[1], *yields]
+        for event, direction in zip(events, [-np.sign(v or force(x)), *[-1] * len(yields)], strict=True):
+            event.terminal, event.direction = True, direction
+        within = np.unique(np.r_[ts[(ts >= t) & (ts <= ts[-1])], t])
+        rates = lambda _, y, force=force: [y[1], force(y[0]) / m]
+        run = solve_ivp(rates, (t, ts[-1]), [x, v], "DOP853", within, events=events, rtol=1e-12, atol=1e-14 * abs(F[0] / c[0]))
+        found += [(t, x) for t, x in zip(run.t, run.y[0], strict=True) if t in ts]
+        if run.status == 0:
+            break
+        hit = next(i for i, times in enumerate(run.t_events) if times.size)
+        t, (x, v) = run.t_events[hit][0], run.y_events[hit][0]
+        z = np.where(side == 0, z, x - side * F / c)
+        if hit:
+            side = np.where(np.arange(c.size) == stuck[hit - 1], np.sign(v), side)
+        else:
+            v, side = 0.0, np.zeros(c.size)
+    return np.array([dict(found)[t] for t in ts])
+
+
+@pytest.mark.parametrize(
+    ("length", "mass", "time"),
+    [
+        pytest.param(1, 1, 1, id="one", marks=pytest.mark.slow),
+        pytest.param(1e-9, 1e-15, 1e-6, id="nm"),
+        pytest.param(1e3, 1e6, 1e9, id="km", marks=pytest.mark.slow),
+    ],
+)
+def test_ten_jenkin_elements_against_phases_by_hand(length, mass, time):
+    """Iwan's parallel model of a joint rings down, in some units, as does its derivative by all bounds."""
+    c, F, ts, unit = np.linspace(0.5, 1.4, 10), np.linspace(0.05, 0.5, 10), np.linspace(0, 6, 13), mass / time**2
+    back = lambda F: 0.8 - np.clip(c * 0.8, -F, F) / c  # friction lets a start return to its bound
+    exact = lambda F: by_phases(0.8, back(F), 1.0, 2.0, c, F, ts)
+    start, p = {"x": 0.8 * length, "z": np.zeros(10)}, {"m": mass, "k": 2 * unit, "c": unit * c}
+    run = lambda F: jl.simulate(IWAN, start, {"x": 0.0, "z": np.zeros(10)}, time * ts, p | {"F": unit * length * F}).q["x"] / length
+    np.testing.assert_allclose(run(F), exact(F), rtol=0, atol=1e-7)
+    slope, h = jax.jit(jax.grad(lambda F: run(F)[-1]))(F), 1e-5
+    for i in (0, 4, 9):
+        ends = [exact(F + s * h * np.eye(10)[i])[-1] for s in (1, -1)]
+        np.testing.assert_allclose(slope[i], (ends[0] - ends[1]) / (2 * h), rtol=1e-4, atol=1e-5)

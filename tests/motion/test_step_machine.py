@@ -32,6 +32,11 @@ SYSTEMS = {
         holonomic={"rod": lambda q: q @ q - 1},
         force=driven,
     ),
+    "beside a slider": jl.System(
+        lambda q, qdot, c: spring(q, qdot, c) - 0.5 * qdot[1] ** 2,
+        dissipation=lambda qdot, F: F * jnp.abs(qdot[1]) + 0.3 * F * jnp.abs(qdot[0]),
+        force=lambda t, A, w: driven(t, A, w) * jnp.array([2, 0.3]),
+    ),
     "on a wire": jl.System(
         spring,
         dissipation=lambda qdot, multipliers, F: 0.3 * F * jnp.abs(multipliers["wire"]) * jnp.abs(qdot[0]),
@@ -63,13 +68,13 @@ def motions(name, units, count):
         yield motion(length * q, length / time * v, params)
 
 
-@pytest.mark.parametrize(("name", "units"), [("two elements", (1e-6, 1e-3)), ("on a rod", (1.0, 1.0))])
+@pytest.mark.parametrize(("name", "units"), [("two elements", (1e-6, 1e-3)), ("beside a slider", (1e3, 1e-6)), ("on a rod", (1.0, 1.0))])
 def test_motions_are_those_of_a_loop_for_each_purpose(name, units, monkeypatch):
     _compare(name, units, monkeypatch, 12)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["in a plane", "on a wire", "two elements"])
+@pytest.mark.parametrize("name", ["in a plane", "on a wire", "two elements", "beside a slider"])
 def test_more_motions_are_those_of_a_loop_for_each_purpose(name, monkeypatch):
     _compare(name, (1.0, 1.0), monkeypatch, 60)
 

@@ -181,7 +181,7 @@ def test_rouse_modes_of_an_overdamped_chain():
     chain = jl.System(lambda q, k: -0.5 * k * jnp.sum(jnp.diff(q) ** 2), dissipation=lambda qdot, zeta: 0.5 * zeta * jnp.sum(qdot**2))
     modes = [np.cos(np.pi * p * (np.arange(n) + 0.5) / n) for p in (1, 3, 40)]
     ts = np.linspace(0, 2, 5)
-    motion = jl.simulate(chain, sum(modes), np.zeros(n), ts, {"k": k, "zeta": zeta}, rtol=1e-10, atol=1e-12)
+    motion = jl.simulate(chain, sum(modes), np.zeros(n), ts, {"k": k, "zeta": zeta}, rtol=1e-11, atol=1e-13)
     decays = [np.exp(-4 * k / zeta * np.sin(p * np.pi / (2 * n)) ** 2 * ts) for p in (1, 3, 40)]
     np.testing.assert_allclose(motion.q, sum(map(np.outer, decays, modes)), rtol=0, atol=1e-9)
     assert chain and motion.multipliers == {}
