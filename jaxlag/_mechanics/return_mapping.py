@@ -13,6 +13,7 @@ from .._model.flat import Flat
 from .friction_elements import FrictionElements
 from .lagrange import smooth_force
 from .projection import Projection
+from .sliders import are_apart
 from .stick_slip import bounds, in_mode
 
 
@@ -36,5 +37,7 @@ def returned(flat: Flat, elements: FrictionElements, t, q, v) -> Float[Array, " 
         sigma = sigma.at[rows].set(jnp.where(beyond & (sigma[rows] == 0), jnp.sign(force), sigma[rows]))
         return Projection(iterations=4).project(in_mode(flat, elements, sigma), t, q, v)[0], sigma
 
-    q, sigma = jax.lax.fori_loop(0, rows.size + 1, turn, (q, jnp.zeros(elements.massless.size, v.dtype)))
-    return q
+    carry = q, jnp.zeros(elements.massless.size, v.dtype)
+    if are_apart(in_mode(flat, elements, carry[1])):
+        return turn(0, carry)[0]
+    return jax.lax.fori_loop(0, rows.size + 1, turn, carry)[0]

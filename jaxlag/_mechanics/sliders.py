@@ -87,13 +87,17 @@ def with_sliders_returned(flat: Flat, t, q) -> Float[Array, " n"]:
 def _solved(flat: Flat, change: Callable, slope: Float[Array, " k"], off: Float[Array, " k"]) -> Float[Array, " k"]:
     """Of each slider what takes `off` to zero: by its own `slope` where it sticks, and together by the `change` of h where they slip."""
     stuck, one = flat.sliders.stuck, jnp.ones_like(off)
-    if read_once(flat, _are_apart):
+    if are_apart(flat):
         return -off / jnp.where(stuck, slope, change(one))
     return -jnp.linalg.solve(jnp.where(stuck[:, None], jnp.diag(slope), jax.vmap(change, 0, 1)(jnp.diag(one))), off)
 
 
+def are_apart(flat: Flat) -> bool:
+    """Whether the force on a slider depends on no other one, as is seen in the programs."""
+    return read_once(flat, _are_apart)
+
+
 def _are_apart(flat: Flat, t, q, v) -> bool:
-    """Whether the force on a slider depends on no other one."""
     z = flat.sliders.coordinates
     pattern = sparsity_pattern(lambda x: force_on_sliders(flat, t, q.at[z].set(x)), q[z])
     return not np.any(pattern & ~np.eye(z.size, dtype=bool))

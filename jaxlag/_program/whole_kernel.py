@@ -18,7 +18,7 @@ from jax.extend import core
 from jaxtyping import Array, Float
 
 from .walker import called_program, count_equations
-from .without_libraries import without_libraries
+from .without_libraries import is_scattered, without_libraries, without_scatters
 
 try:
     from jax.experimental.xla_metadata import set_xla_metadata
@@ -76,13 +76,13 @@ def in_whole_kernel(function: Callable) -> Callable:
 
 def _without_libraries(program):
     """The program, with its small matrices written out where it is not so long that one kernel of it takes longer to compile than all."""
-    return without_libraries(program) if count_equations(program) <= MOST_EQUATIONS else program
+    return (without_libraries if count_equations(program) <= MOST_EQUATIONS else without_scatters)(program)
 
 
 def _is_allowed(program) -> bool:
     """Whether such a kernel can hold it; closed-over arrays would be further arguments."""
     closed_over = any(isinstance(x, jax.core.Tracer) for x in program.consts)
-    fits = lambda e: e.primitive.name in ALLOWED and _terms(e) <= MOST_TERMS and not _is_product_of_matrices(e)
+    fits = lambda e: e.primitive.name in ALLOWED and _terms(e) <= MOST_TERMS and not (_is_product_of_matrices(e) or is_scattered(e))
     return not closed_over and all(map(fits, _lowered(program)))
 
 

@@ -1,4 +1,6 @@
-"""Programs whose small factorisations, solves and products of matrices are written out, so that they call no library."""
+"""Programs whose small factorisations, solves and products of matrices are written out, so that they call no library, and whose entries
+are put in place one after the other, for which the kernels of XLA have no code.
+"""
 
 import functools
 import math
@@ -18,14 +20,19 @@ SWEEPS = 30  # of rotations: some six do
 
 def without_libraries(program: Any) -> Any:
     """A closed program that computes the same without a library where its matrices are small. It has no derivative and no batch."""
-    return _Rewriting().closed(program)
+    return _Rewriting(RULES | SCATTERS).closed(program)
+
+
+def without_scatters(program: Any) -> Any:
+    """The same program, with but its entries put in place one after the other."""
+    return _Rewriting(SCATTERS).closed(program)
 
 
 class _Rewriting:
     """Each program that is called is rewritten once."""
 
-    def __init__(self):
-        self.done = {}
+    def __init__(self, rules):
+        self.done, self.rules = {}, rules
 
     def closed(self, program):
         jaxpr = self.jaxpr(program.jaxpr)
@@ -40,7 +47,7 @@ class _Rewriting:
 
     def equation(self, e):
         name = e.primitive.name
-        rule = RULES[name](e) if name in RULES else None
+        rule = self.rules[name](e) if name in self.rules else None
         if rule is not None:
             return _called(rule, e)
         params = {key: self.part(value) for key, value in e.params.items()}
@@ -227,6 +234,47 @@ def _sum(e) -> Callable | None:
     return sum_
 
 
+def is_scattered(e) -> bool:
+    """Whether an equation puts several parts in their places; of a single one XLA makes an update of a slice."""
+    return e.primitive.name in SCATTERS and math.prod(e.invars[1].aval.shape[:-1]) > 1
+
+
+def _scatter(combine: Callable) -> Callable:
+    """Of an equation, its parts put in place one after the other; those that lie outside are left out, or moved inside, as it has them."""
+
+    def rule(e):
+        if not is_scattered(e):
+            return None
+        of, clips = e.params["dimension_numbers"], e.params["mode"] == jax.lax.GatherScatterMode.CLIP
+
+        def scattered(x, places, parts):
+            batch = [i for i in range(parts.ndim) if i not in of.update_window_dims]
+            within = [i for i in range(x.ndim) if i not in (*of.inserted_window_dims, *of.operand_batching_dims)]
+            window = np.ones(x.ndim, int)
+            window[within] = [parts.shape[i] for i in of.update_window_dims]
+            shape, room = places.shape[:-1], np.array(x.shape) - window
+            parts = jnp.transpose(parts, (*batch, *of.update_window_dims)).reshape(-1, *window)
+            places = places.reshape(-1, places.shape[-1]).astype(np.int32)
+            of_batch = np.indices(shape, np.int32).reshape(len(shape), -1)
+
+            def turn(k, x):
+                start = [jnp.zeros((), np.int32)] * x.ndim
+                for column, axis in enumerate(of.scatter_dims_to_operand_dims):
+                    start[axis] = jnp.asarray(places)[k, column]
+                for axis, along in zip(of.operand_batching_dims, of.scatter_indices_batching_dims, strict=True):
+                    start[axis] = jnp.asarray(of_batch)[along, k]
+                is_inside = functools.reduce(jnp.logical_and, [(i >= 0) & (i <= most) for i, most in zip(start, room, strict=True)])
+                old = jax.lax.dynamic_slice(x, start, tuple(window))  # moved inside
+                new = combine(old, jnp.asarray(parts)[k])
+                return jax.lax.dynamic_update_slice(x, new if clips else jnp.where(is_inside, new, old), start)
+
+            return _repeated(len(parts), turn, x)
+
+        return scattered
+
+    return rule
+
+
 def _is_wide(e) -> bool:
     m, n = e.invars[0].aval.shape[-2:]
     return m == n or (m < n and not e.params["full_matrices"])
@@ -246,3 +294,4 @@ RULES: dict[str, Callable[[Any], Callable | None]] = {
     "dot_general": _product,
     "reduce_sum": _sum,
 }
+SCATTERS = {"scatter": _scatter(lambda old, new: new), "scatter-add": _scatter(lambda old, new: old + new)}

@@ -5,7 +5,8 @@ optimistix in their default settings (gradient in reverse mode; only the fit req
 motion called from Python beside the compiled one within `jax.jit`, and one acceleration. The pendulum of README's first
 example, a point on a rod with the constraint |r| = l: its first motion, gradient and Hessian, its first motion with dry friction in the
 joint and the gradient of that; by hand from its equations with the multiplier eliminated. The whole of that example with `keep_compiled`,
-in a first process and in a second one. "import" is that of the libraries named.
+in a first process and in a second one. Models that change their modes, alone: motion and gradient, first and again. "import" is that of
+the libraries named.
 Run: python tests/benchmarks/bench_first_use.py [processes]
 """
 
@@ -148,6 +149,55 @@ ACTIONS = {  # by jaxlag, and by hand; what both are asked to do
 }
 
 
+MODELS = {
+    "a block with friction": """
+system = jl.System(lambda q, qdot, c: 0.5 * qdot**2 - 0.5 * c * q**2, dissipation=lambda qdot, F: F * jnp.abs(qdot))
+start, params, varied = (1.0, 0.0), {"c": 10.0, "F": 1.2}, "F"
+""",
+    "two blocks with friction": """
+system = jl.System(
+    lambda q, qdot, c: 0.5 * qdot @ qdot - 0.5 * c * (q[0] ** 2 + (q[1] - q[0]) ** 2),
+    dissipation=lambda qdot, F: F * (jnp.abs(qdot[0]) + 0.5 * jnp.abs(qdot[1] - qdot[0])),
+)
+start, params, varied = (jnp.array([1.0, 0.5]), jnp.zeros(2)), {"c": 10.0, "F": 0.6}, "F"
+""",
+    "a bouncing ball": """
+system = jl.System(lambda q, qdot, g: 0.5 * qdot**2 - g * q, unilateral={"floor": jl.Contact(lambda q: q, 0.8)})
+start, params, varied = (1.0, 0.0), {"g": 9.81}, "g"
+""",
+    "two contacts with friction": """
+def corner(side):
+    return lambda q: q["y"] + side * 0.5 * jnp.sin(q["a"]) - 0.1 * jnp.cos(q["a"])
+def along(q, qdot):
+    return jnp.abs(qdot["x"])
+system = jl.System(
+    lambda q, qdot, g: 0.5 * (qdot["x"] ** 2 + qdot["y"] ** 2 + 0.1 * qdot["a"] ** 2) - g * q["y"],
+    dissipation={
+        "rub left": lambda q, qdot, multipliers, mu: mu * multipliers["left"] * along(q, qdot),
+        "rub right": lambda q, qdot, multipliers, mu: mu * multipliers["right"] * along(q, qdot),
+    },
+    unilateral={"left": jl.Contact(corner(-1), 0.5), "right": jl.Contact(corner(1), 0.5)},
+)
+start = {"x": 0.0, "y": 0.5, "a": 0.3}, {"x": 2.0, "y": 0.0, "a": 0.0}
+params, varied = {"g": 9.81, "mu": 0.3}, "mu"
+""",
+    "ten Jenkin elements": """
+system = jl.System(
+    lambda q, qdot, k, c: 0.5 * qdot["x"] ** 2 - 0.5 * k * q["x"] ** 2 - 0.5 * jnp.sum(c * (q["x"] - q["z"]) ** 2),
+    dissipation=lambda qdot, F: jnp.sum(F * jnp.abs(qdot["z"])),
+)
+start = {"x": 1.0, "z": jnp.zeros(10)}, {"x": 0.0, "z": jnp.zeros(10)}
+params, varied = {"k": 1.0, "c": jnp.ones(10), "F": jnp.linspace(0.1, 0.3, 10)}, "k"
+""",
+}
+OF_MODEL = """
+ts = jnp.linspace(0, 3, 101)
+moved = lambda value: jax.tree.leaves(jl.simulate(system, *start, ts, params | {varied: value}).q)[0]
+slope = jax.jit(jax.grad(lambda value: jnp.sum(moved(value)[-1])))
+motion, gradient, fit = lambda: moved(params[varied]), lambda: slope(params[varied]), lambda: 0.0
+"""
+
+
 def codes_of(task):
     """The programs that are compared at one task of the pendulum."""
     ours, by_hand = ACTIONS[task]
@@ -191,6 +241,17 @@ def vehicle(processes):
         yield f"vehicle: {task}", table({name: [run[task] for run in of_name] for name, of_name in runs.items()})
 
 
+def models(processes):
+    """Tables of models that change their modes."""
+    for name, model in MODELS.items():
+        code = TIMED.format(imports="import jaxlag as jl", actions=model + OF_MODEL)
+        runs = []
+        for _ in range(processes):
+            with tempfile.TemporaryDirectory() as cache:
+                runs.append(fresh(code, cache))
+        yield name, table({task: [run[task] for run in runs] for task in runs[0] if "fit" not in task})
+
+
 def called(processes):
     """Table of the vehicle's motion when everything is compiled: what Python adds to it, and one acceleration."""
     with tempfile.TemporaryDirectory() as cache:
@@ -231,7 +292,7 @@ def table(taken):
 
 
 def main(processes=5):
-    for tables in (example, pendulum, vehicle, called):
+    for tables in (example, pendulum, vehicle, models, called):
         record("first use", tables(processes))
 
 

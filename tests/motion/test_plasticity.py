@@ -34,6 +34,12 @@ def plays(p):
     return np.array(forces)
 
 
+def test_forces_of_sliders_in_series():
+    """Against the play operators, where what one slider takes another feels."""
+    motion = jl.simulate(HARDENING, {"x": 0.0, "u": np.zeros(2)}, {"x": 2.0, "u": np.zeros(2)}, TS, SERIES)
+    np.testing.assert_allclose(motion.multipliers["drive"], plays(SERIES), rtol=0, atol=1e-10)
+
+
 @pytest.mark.slow
 def test_sliders_in_series():
     """Against the play operators, with the derivatives of the force by all parameters."""
