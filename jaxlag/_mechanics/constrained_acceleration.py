@@ -14,6 +14,7 @@ from .massless import inertial_part, with_first_order_rates, without_inertia
 from .pseudo_inverse import Constraints
 from .saddle_point import SaddlePoint, Sound, saddle_point, saddle_point_beside
 from .self_consistent import others, self_consistent
+from .sliders import are_of_sliders
 
 
 def constrained_acceleration(flat: Flat, t, q, v, feedback=None) -> SaddlePoint:
@@ -30,8 +31,8 @@ def constrained_motion(flat: Flat, t, q, v, feedback=None) -> tuple[Float[Array,
     found = _by_inertia(inertial_part(flat, t, q, v, reaction), t, q, v, feedback, light)
     rate = along(jnp.ones_like(t), v, found.x).v
     is_sound = Sound(*(a & b for a, b in zip(sound, found.sound, strict=True)))
-    theirs = np.zeros(multipliers.size, bool) if flat.sliders is None else flat.sliders.among(multipliers.size)
-    return v, SaddlePoint(found.x.at[light].set(rate[light]), multipliers.at[np.flatnonzero(~theirs)].add(found.multipliers), is_sound)
+    kept = np.flatnonzero(~are_of_sliders(flat, multipliers.size))
+    return v, SaddlePoint(found.x.at[light].set(rate[light]), multipliers.at[kept].add(found.multipliers), is_sound)
 
 
 def _by_inertia(flat: Flat, t, q, v, feedback, light: np.ndarray) -> SaddlePoint:

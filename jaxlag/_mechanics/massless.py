@@ -21,7 +21,7 @@ from .._program.sparsity import sparsity_pattern
 from .convex_dissipation import by_newton
 from .lagrange import applied_force, inertial_force, pattern_of_rows, smooth_force, velocity_residual
 from .saddle_point import Sound, saddle_point
-from .sliders import motion_of_sliders
+from .sliders import are_of_sliders, motion_of_sliders
 
 RECIPROCAL = (
     "`lagrangian` and `force` must not couple the velocities of coordinates without inertia among each other, but do. "
@@ -155,21 +155,18 @@ def with_first_order_rates(flat: Flat, t, q, v) -> FirstOrderRates:
     found = FirstOrderRates(v, jnp.zeros(rows.size, v.dtype), jnp.zeros_like(v), Sound(yes, yes))
     if sliders is None:
         return _with_decided(flat, t, q, found) if z.size else found
+    moves = motion_of_sliders(flat, t, q, v)  # what they hold depends on no velocity
+    found = found._replace(multipliers=found.multipliers.at[sliders.rows].set(moves.multipliers), reaction=moves.reaction)
     if z.size:
-        holds = motion_of_sliders(flat, t, q, v)  # of no velocity
-        of_sliders = found._replace(multipliers=found.multipliers.at[sliders.rows].set(holds.multipliers), reaction=holds.reaction)
-        found = _with_decided(flat, t, q, of_sliders)
-    rates, multipliers, reaction = motion_of_sliders(flat, t, q, found.v)
-    if not z.size:
-        found = found._replace(multipliers=found.multipliers.at[sliders.rows].set(multipliers), reaction=reaction)
-    return found._replace(v=found.v.at[sliders.coordinates].set(rates))
+        found = _with_decided(flat, t, q, found)
+        moves = motion_of_sliders(flat, t, q, found.v)
+    return found._replace(v=found.v.at[sliders.coordinates].set(moves.v))
 
 
 def _with_decided(flat: Flat, t, q, found: FirstOrderRates) -> FirstOrderRates:
     """With the velocities that smooth dissipation decides, beside the reaction that was found of the rest."""
     z, rows, is_affine = first_order(flat)
-    if flat.sliders is not None:
-        rows = rows & ~flat.sliders.among(rows.size)
+    rows = rows & ~are_of_sliders(flat, rows.size)
     v, of = found.v, lambda v, w: v.at[z].set(w)
     beside = flat if flat.sliders is None else flat._replace(forces=flat.forces | {"": lambda *_: found.reaction})
 
@@ -202,8 +199,7 @@ def inertial_part(flat: Flat, t, q, v, reaction: Float[Array, " n"] | None = Non
     (_, rows, _), light = first_order(flat), without_inertia(flat)
     if not light.size:
         return flat
-    size = flat.holonomic(t, q).size
-    theirs = np.zeros(rows.size, bool) if flat.sliders is None else flat.sliders.among(rows.size)
+    size, theirs = flat.holonomic(t, q).size, are_of_sliders(flat, rows.size)
     zero_in = lambda function, rows: (lambda *given: jnp.where(rows, 0, function(*given))) if np.any(rows) else function
     others = flat.nonholonomic if flat.sliders is None else flat.sliders.beside
     return variant(

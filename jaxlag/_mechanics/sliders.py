@@ -33,9 +33,10 @@ class Sliders(NamedTuple):
     slip: Callable[..., Float[Array, " k"]]  # s(t, q, v)
     beside: Callable[..., Float[Array, " o"]]  # (t, q, v)
 
-    def among(self, rows: int) -> Bool[np.ndarray, " m"]:
-        """Which of the rows of ψ are theirs."""
-        return np.isin(np.arange(rows), self.rows)
+
+def are_of_sliders(flat: Flat, rows: int) -> Bool[np.ndarray, " m"]:
+    """Which of the rows of ψ are those of sliders."""
+    return np.zeros(rows, bool) if flat.sliders is None else np.isin(np.arange(rows), flat.sliders.rows)
 
 
 class SlidersMotion(NamedTuple):
