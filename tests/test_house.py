@@ -149,6 +149,8 @@ WINGS = {  # each imports only from those above it, and each file of a wing only
         "wrapped_solver",
         "stick_slip_solver",
         "step_machine",
+        "contact_phases",
+        "one_evaluation_solver",
         "progress",
         "export",
         "provenance",

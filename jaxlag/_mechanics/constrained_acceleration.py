@@ -1,15 +1,17 @@
 """Acceleration and multipliers of a state: Lagrange's equations of the first kind, solved."""
 
 from collections.abc import Callable
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import lineax as lx
 import numpy as np
 from jaxtyping import Array, Float
 
 from .._model.flat import Flat
 from .._program.sparse_matrix import dense
-from .lagrange import applied_force, inertia, inertial_force, velocity_rows
+from .lagrange import applied_force, inertia, inertial_force, velocity_residual, velocity_rows
 from .massless import inertial_part, with_first_order_rates, without_inertia
 from .pseudo_inverse import Constraints
 from .saddle_point import SaddlePoint, Sound, saddle_point, saddle_point_beside
@@ -17,16 +19,59 @@ from .self_consistent import others, self_consistent
 from .sliders import are_of_sliders
 
 
-def constrained_acceleration(flat: Flat, t, q, v, feedback=None) -> SaddlePoint:
-    """q̈ and λ of  M q̈ = f + Gᵀλ,  G q̈ = −γ − feedback(t, q, v); of coordinates without inertia, the rate of the velocity that D decides."""
-    return constrained_motion(flat, t, q, v, feedback)[1]
+class Impulse(NamedTuple):
+    """An impact:  M (q̇⁺ − q̇) = Gᵀ(Λ + given) + force(Λ),  ψ(q̇⁺) = −returned  of closed contacts, zero of other constraints.
+
+    Its equations are those of motion, with q̇⁺ for q̈ and Λ for λ; it is the motion itself where `happens` is not true.
+    """
+
+    returned: Float[Array, " c"]
+    given: Float[Array, " c"]
+    happens: Any = True
+
+    def instead(self, of_impact: Callable, of_motion: Callable) -> Any:
+        """What is of the impact, or, where there is none, of the motion."""
+        if self.happens is True:
+            return of_impact()
+        return jax.tree.map(lambda new, old: jnp.where(self.happens, new, old), of_impact(), of_motion())
+
+    def among_rows(self, flat: Flat) -> Float[Array, " m"]:
+        """The impulses given, among those of all rows of constraints."""
+        return _at_contacts(flat, self.given, flat.rows)
+
+    def asked(self, flat: Flat, M: lx.AbstractLinearOperator, t, q, v, of_motion: Callable) -> tuple[Array, Array]:
+        """The momentum in the place of forces, and what is asked of G q̇⁺ in that of G q̈."""
+
+        def of_impact():
+            none = jnp.zeros_like(v)
+            c = -velocity_residual(flat, t, q, none)
+            if flat.closed is not None:
+                c = c - _at_contacts(flat, jnp.where(flat.closed, self.returned, 0), c.size)
+            given = jax.vjp(lambda v: jax.jvp(flat.gaps, (t, q), (jnp.zeros_like(t), v))[1], none)[1](self.given)[0]
+            return M.mv(v) + given, c
+
+        return self.instead(of_impact, of_motion)
 
 
-def constrained_motion(flat: Flat, t, q, v, feedback=None) -> tuple[Float[Array, " n"], SaddlePoint]:
-    """q̇ with the velocities that D decides, and q̈ and λ."""
+def _at_contacts(flat: Flat, numbers: Float[Array, " c"], rows: int) -> Float[Array, " m"]:
+    """Numbers of contacts among those of so many rows."""
+    before = flat.rows_of_bilateral
+    return jnp.pad(numbers, (before, rows - before - numbers.size))
+
+
+def constrained_acceleration(flat: Flat, t, q, v, feedback=None, impulse: Impulse | None = None) -> SaddlePoint:
+    """q̈ and λ of  M q̈ = f + Gᵀλ,  G q̈ = −γ − feedback(t, q, v); of coordinates without inertia, the rate of the velocity that D decides.
+
+    Of an `impulse`, q̇⁺ and Λ.
+    """
+    return constrained_motion(flat, t, q, v, feedback, impulse)[1]
+
+
+def constrained_motion(flat: Flat, t, q, v, feedback=None, impulse: Impulse | None = None) -> tuple[Float[Array, " n"], SaddlePoint]:
+    """q̇ with the velocities that D decides, and q̈ and λ; of an impact, q̇⁺ and Λ."""
     light = without_inertia(flat)
     if not light.size:
-        return v, _by_inertia(flat, t, q, v, feedback, light)
+        return v, _by_inertia(flat, t, q, v, feedback, light, impulse)
     (v, multipliers, reaction, sound), along = jax.linearize(lambda t, q, v: with_first_order_rates(flat, t, q, v), t, q, v)
     found = _by_inertia(inertial_part(flat, t, q, v, reaction), t, q, v, feedback, light)
     rate = along(jnp.ones_like(t), v, found.x).v
@@ -35,16 +80,25 @@ def constrained_motion(flat: Flat, t, q, v, feedback=None) -> tuple[Float[Array,
     return v, SaddlePoint(found.x.at[light].set(rate[light]), multipliers.at[kept].add(found.multipliers), is_sound)
 
 
-def _by_inertia(flat: Flat, t, q, v, feedback, light: np.ndarray) -> SaddlePoint:
+def _by_inertia(flat: Flat, t, q, v, feedback, light: np.ndarray, impulse: Impulse | None = None) -> SaddlePoint:
     """q̈ and λ where everything has inertia, or is held by constraints; those `light` have that of another part."""
-    M, inertial = inertia(flat, t, q, v), inertial_force(flat, t, q, v)
+    M = inertia(flat, t, q, v)
     _, G, gamma = velocity_rows(flat, t, q, v)
-    c = -gamma if feedback is None else -gamma - feedback(flat, t, q, v)
     force = lambda multipliers: applied_force(flat, t, q, v, multipliers)
+    c = -gamma if feedback is None else -gamma - feedback(flat, t, q, v)
+    near = _near(flat, t, q, v, c.size)
+    if impulse is None:
+        return _solved(flat, M, G, inertial_force(flat, t, q, v), c, force, light, near)
+    f, c = impulse.asked(flat, M, t, q, v, lambda: (inertial_force(flat, t, q, v), c))
+    return _solved(flat, M, G, f, c, force, light, near)
+
+
+def _solved(flat: Flat, M, G, f, c, force: Callable, light: np.ndarray = np.zeros(0, int), near=None) -> SaddlePoint:
+    """x and λ of  M x = f + force(λ) + Gᵀλ,  G x = c,  where λ of what is open is zero."""
     if not flat.needs_multipliers:
-        found = saddle_point_beside(light, M, G, inertial + force(jnp.zeros_like(c)), c, near=_near(flat, t, q, v, c.size))
+        found = saddle_point_beside(light, M, G, f + force(jnp.zeros_like(c)), c, near=near)
         return found._replace(multipliers=_pushing(flat, found.multipliers))
-    columns, reaction, unit = _by_force(flat, M, G, inertial, c, force, _near(flat, t, q, v, c.size))
+    columns, reaction, unit = _by_force(flat, M, G, f, c, force, near)
     multipliers = _pushing(flat, self_consistent(reaction, unit))
     return SaddlePoint(_affine(columns.x, force(multipliers)), multipliers, columns.sound)
 

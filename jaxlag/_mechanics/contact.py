@@ -15,12 +15,12 @@ from jaxtyping import Array, Bool, Float
 
 from .._model.flat import Flat, variant
 from .._program.scalarise import scalarised
-from .constrained_acceleration import constrained_acceleration
+from .constrained_acceleration import Impulse, constrained_acceleration
 from .constrained_slip import on_constraints
 from .friction_elements import FrictionElements, find_elements, with_all_masses
 from .lagrange import inertia, position_residual
 from .saddle_point import SaddlePoint, reach_of, saddle_point
-from .stick_slip import Mode, first_mode, in_mode, sticking
+from .stick_slip import first_mode, in_mode, sticking
 
 OUTWARDS = 6  # Newton steps that put a start on its obstacle
 ROUNDING = 0.75  # power of eps, what counts as rounding of a gap, its rate, its acceleration and its force
@@ -141,6 +141,7 @@ class Contacts(NamedTuple):
     turn: Any
     force: Float[Array, " c"]
     acceleration: Float[Array, " c"]
+    impulse: Impulse | None = None  # of an impact: for accelerations it has velocities, for forces impulses
 
     @classmethod
     def of(
@@ -152,13 +153,16 @@ class Contacts(NamedTuple):
         candidates: Bool[Array, " c"],
         loose: Float[Array, " c"] | None = None,
         least: Float[Array, " c"] | None = None,
+        impulse: Impulse | None = None,
     ) -> "Contacts":
         """All candidates closed; those that are `loose` open where no more than that presses them, at an acceleration of no less than
         the `least`.
         """
-        force, acceleration = jax.lax.stop_gradient(scalarised(lambda t, q, v: _scales(flat, t, q, v))(t, q, v))
+        of_state = lambda t, q, v, impulse: _scales(flat, t, q, v, impulse)
+        force, acceleration = jax.lax.stop_gradient(scalarised(of_state)(t, q, v, impulse))
         force = force if loose is None else jnp.where(loose > 0, -force - loose, force)
-        return cls(candidates, candidates, jnp.array(0), force, acceleration if least is None else jnp.maximum(acceleration, least))
+        acceleration = acceleration if least is None else jnp.maximum(acceleration, least)
+        return cls(candidates, candidates, jnp.array(0), force, acceleration, impulse)
 
     def applied_to(self, flat: Flat) -> Flat:
         """The system with those that are closed."""
@@ -176,23 +180,29 @@ class Contacts(NamedTuple):
         """
         size = len(flat.contacts)
         pull = jnp.where(self.closed & (agreed | hopeless), -contact_rows(flat, multipliers) - self.force, -jnp.inf)
-        deeper = jnp.where(agreed & self.candidates & ~self.closed, -gap_accelerations(flat, t, q, v, qddot) - self.acceleration, -jnp.inf)
+        departs = departures(flat, t, q, v, qddot, self.impulse)
+        deeper = jnp.where(agreed & self.candidates & ~self.closed, -departs - self.acceleration, -jnp.inf)
         in_order = jnp.where((pull > 0) | (deeper > 0), size - jnp.arange(size, dtype=v.dtype), 0)
         excess = jnp.where(self.turn > 2 * size, in_order, jnp.where(jnp.any(pull > 0), pull, deeper))
         flips = (jnp.arange(size) == jnp.argmax(excess)) & (excess > 0)
         return self._replace(closed=self.closed ^ flips, turn=self.turn + 1), jnp.any(flips)
 
 
-def accelerated(flat: Flat, t, q, v) -> SaddlePoint:
-    """q̈ and λ, in scalars where there are few."""
-    return scalarised(lambda t, q, v: constrained_acceleration(flat, t, q, v))(t, q, v)
+def accelerated(flat: Flat, t, q, v, impulse: Impulse | None = None) -> SaddlePoint:
+    """q̈ and λ, or q̇⁺ and Λ of an impact, in scalars where there are few."""
+    return scalarised(lambda t, q, v, impulse: constrained_acceleration(flat, t, q, v, impulse=impulse))(t, q, v, impulse)
+
+
+def departures(flat: Flat, t, q, v, x, impulse: Impulse | None) -> Float[Array, " c"]:
+    """g̈ of all contacts, where x is q̈; of an impact, where it is q̇⁺, ġ⁺ beyond the rate at which they return."""
+    of_motion = lambda: gap_accelerations(flat, t, q, v, x)
+    return of_motion() if impulse is None else impulse.instead(lambda: gap_rates(flat, t, q, x) + impulse.returned, of_motion)
 
 
 class Chosen(NamedTuple):
-    """Which contacts are closed; the mode of friction with them, where there is any; whether forces and accelerations are consistent."""
+    """Which contacts are closed; whether forces and accelerations are consistent."""
 
     closed: Bool[Array, " c"]
-    mode: Mode | None
     consistent: Bool[Array, ""]
 
 
@@ -204,29 +214,34 @@ def select_closed(
     candidates: Bool[Array, " c"],
     loose: Float[Array, " c"] | None = None,
     least: Float[Array, " c"] | None = None,
+    impulse: Impulse | None = None,
 ) -> Chosen:
     """Which of the candidates are closed, without friction."""
-    t, q, v = jax.lax.stop_gradient((t, q, v))
+    t, q, v, impulse = jax.lax.stop_gradient((t, q, v, impulse))
 
     def turn(carry):
         contacts, _ = carry
-        qddot, multipliers, _ = accelerated(contacts.applied_to(flat), t, q, v)
+        qddot, multipliers, _ = accelerated(contacts.applied_to(flat), t, q, v, impulse)
         return contacts.next(flat, t, q, v, qddot, multipliers)
 
     most = 4 * len(flat.contacts) + 2 ** min(len(flat.contacts), 10)
-    start = Contacts.of(flat, t, q, v, candidates, loose, least), jnp.any(candidates)
+    start = Contacts.of(flat, t, q, v, candidates, loose, least, impulse), jnp.any(candidates)
     contacts, changes = jax.lax.while_loop(lambda carry: carry[1] & (carry[0].turn < most), turn, start)
-    return Chosen(contacts.closed, None, ~changes)
+    return Chosen(contacts.closed, ~changes)
 
 
-def _scales(flat, t, q, v):
-    """Of each contact, the force and the acceleration that count as rounding, relative to those of the motion without contact."""
-    free = constrained_acceleration(flat, t, q, v).x
+def _scales(flat, t, q, v, impulse):
+    """Those of the motion without contact."""
+    return scales_of(flat, t, q, v, constrained_acceleration(free(flat), t, q, v, impulse=impulse).x, impulse)
+
+
+def scales_of(flat: Flat, t, q, v, alone: Float[Array, " n"], impulse: Impulse | None) -> tuple[Float[Array, " c"], Float[Array, " c"]]:
+    """Of each contact, the force and the acceleration that count as rounding, relative to those of the motion `alone`, without contact."""
     G = jnp.abs(jax.jacfwd(flat.gaps, argnums=1)(t, q))
-    drift = jnp.abs(gap_accelerations(flat, t, q, v, jnp.zeros_like(v)))
-    force, size = jnp.abs(inertia(flat, t, q, v).mv(free)), jnp.sum(G**2, axis=1)
+    drift = jnp.abs(departures(flat, t, q, v, jnp.zeros_like(v), impulse))
+    force, size = jnp.abs(inertia(flat, t, q, v).mv(alone)), jnp.sum(G**2, axis=1)
     little = jnp.finfo(v.dtype).eps ** ROUNDING
-    return little * _times(G, force) / jnp.where(size > 0, size, 1), little * (_times(G, jnp.abs(free)) + drift)
+    return little * _times(G, force) / jnp.where(size > 0, size, 1), little * (_times(G, jnp.abs(alone)) + drift)
 
 
 def _times(G, x):

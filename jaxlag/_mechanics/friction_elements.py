@@ -123,6 +123,17 @@ def find_elements(flat: Flat) -> FrictionElements | None:
     return elements._replace(massless=massless, is_quasistatic=quasistatic)
 
 
+def without_friction(flat: Flat) -> FrictionElements:
+    """No elements: of a system whose D is smooth."""
+
+    def smooth(D):
+        return lambda t, q, v, multipliers, u: D(t, q, v, multipliers[: flat.rows])
+
+    none = np.zeros(0, int)
+    potentials = {name: smooth(D) for name, D in flat.dissipations.items()}
+    return FrictionElements(lambda t, q, v: jnp.zeros(0, v.dtype), potentials, none, {}, massless=none - 1, is_quasistatic=none > 0)
+
+
 def _recognised(source: Source) -> tuple[_Recognised, bool]:
     """What is found in D; and whether its programs hold for all numbers, and not for those that functions close over while they change."""
     numbers, (t, q, v) = source.shapes

@@ -4,12 +4,11 @@
                                      ġ⁺ = 0 and a⁺ = 0                                     of all other constraints
 
 By Poisson's law there are two such impacts, both without e: the compression, with the impulses Λᶜ, and the expansion, with Λ ≥ e Λᶜ.
-Friction takes the impulses for the forces it follows: D is homogeneous in them. So an impact is the acceleration of a system at rest in a
-time of its own, in which q̇⁺ stands for q̈ and Λ for λ, and the laws of contact and friction are those of `contact` and `stick_slip`.
+Friction takes the impulses for the forces it follows: D is homogeneous in them. So the equations of an impact are those of motion, in which
+q̇⁺ stands for q̈ and Λ for λ, and the laws of contact and friction are those of `contact` and `stick_slip`.
 Source: Glocker, Set-Valued Force Laws, chapter 10; Pfeiffer & Glocker, Multibody Dynamics with Unilateral Contacts, chapter 8.
 """
 
-import functools
 from typing import NamedTuple
 
 import jax
@@ -18,13 +17,14 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from .._model.flat import Flat, rows_by_name
+from .constrained_acceleration import Impulse
 from .constrained_slip import on_constraints
 from .contact import ROUNDING, Contacts, accelerated, contact_rows, gap_rates, in_contact, select_closed
 from .friction_elements import FrictionElements, with_all_masses
 from .friction_treatment import Regularised, StickSlip
-from .lagrange import constraint_rows, inertia
+from .lagrange import constraint_rows
 from .massless import inertial_part
-from .stick_slip import bounds, friction, friction_by_term, select_mode
+from .stick_slip import Friction, bounds, friction, friction_by_term, select_mode
 
 RISE = 1e-9  # of the energy exchanged, by which an impact may raise it by rounding
 
@@ -55,66 +55,93 @@ class Phase(NamedTuple):
     gained: Float[Array, ""]
     exchanged: Float[Array, ""]
 
+    @property
+    def found(self) -> Impact:
+        """Of all that is known of it, what matters behind."""
+        dissipates, impulsive = jax.lax.stop_gradient((self.gained <= RISE * self.exchanged, self.impulsive))
+        return Impact(self.v, self.impulses, self.works, self.consistent, dissipates, impulsive)
+
 
 def impact(flat: Flat, elements: FrictionElements | None, t, q, v, near: Bool[Array, " c"], e: Float[Array, " c"]) -> Impact:
     """The impact of the contacts that are `near`, some of which approach; `e`: their restitution.
 
     By Poisson's law compression, as without restitution, and then expansion, in which e of the impulses is given.
     """
-    of_poisson = np.array(flat.poisson, bool)
+    phase = of_compression(flat, t, q, v, e)
+    total = _phase(flat, elements, t, q, v, near, phase)
+    if any(flat.poisson):
+        expansion, loose = of_expansion(flat, phase, e, total.impulses, gap_rates(flat, t, q, v))
+        total = together(total, _phase(flat, elements, t, q, total.v, near, expansion, *loose))
+    return total.found
+
+
+def of_compression(flat: Flat, t, q, v, e: Float[Array, " c"]) -> Impulse:
+    """The first phase, by Newton's law the only one: that of contacts which return with e times the rate of their approach."""
     rates = gap_rates(flat, t, q, v)
-    returned = jnp.where((rates < 0) & ~of_poisson, e * rates, 0)
-    phases = [_phase(flat, elements, t, q, v, near, returned)]
-    if of_poisson.any():
-        (compression,) = phases
-        given = jnp.where(of_poisson, e * compression.impulses, 0)
-        little = jnp.finfo(v.dtype).eps ** ROUNDING  # what compression leaves of rates closes no contact that departs as e grows
-        loose = little * jax.lax.stop_gradient(jnp.where(of_poisson, jnp.stack([compression.impulses, jnp.abs(rates)]), 0))
-        phases.append(_phase(flat, elements, t, q, compression.v, near, returned, given, tuple(loose)))
-    total = functools.partial(functools.reduce, jnp.add)
-    impulses, gained, exchanged = (total([getattr(phase, name) for phase in phases]) for name in ("impulses", "gained", "exchanged"))
-    works = {name: total([phase.works[name] for phase in phases]) for name in phases[0].works}
-    consistent, impulsive = (jnp.all(jnp.stack([getattr(phase, name) for phase in phases])) for name in ("consistent", "impulsive"))
-    return Impact(phases[-1].v, impulses, works, consistent, *jax.lax.stop_gradient((gained <= RISE * exchanged, impulsive)))
+    returned = jnp.where((rates < 0) & ~np.array(flat.poisson, bool), e * rates, 0)
+    return Impulse(returned, jnp.zeros_like(returned))
 
 
-def _phase(flat, elements, t, q, v, near, returned, given=None, loose=()) -> Phase:
-    """An impact in which ġ⁺ + `returned` ≥ 0 and impulses are at least those `given`; `loose`: what more of impulses and what rates are
-    rounding.
+def of_expansion(flat: Flat, compression: Impulse, e, impulses: Float[Array, " c"], rates: Float[Array, " c"]) -> tuple[Impulse, Array]:
+    """The second phase by Poisson's law; and how much of impulses and of rates is rounding: what compression leaves of rates closes no
+    contact that departs as e grows.
     """
-    approach = gap_rates(flat, t, q, v)
-    fast, of_impact = _in_fast_time(flat, elements, t, q, v, returned, given)
-    zero, origin = jnp.zeros_like(t), jnp.zeros_like(q)
-    if elements is None or of_impact is None:
-        chosen = select_closed(fast, zero, origin, origin, near, *loose)
-        after, multipliers, _ = accelerated(in_contact(fast, chosen.closed), zero, origin, origin)
-        lost, rubbed, consistent, impulsive = jnp.zeros((), v.dtype), {}, chosen.consistent, jnp.array(True)
-    else:
-        everywhere, still = jnp.ones(of_impact.size, bool), jnp.zeros(of_impact.element_of_row.size, v.dtype)
-        contacts = Contacts.of(fast, zero, origin, origin, near, *loose)
-        mode, contacts = select_mode(fast, of_impact, zero, origin, origin, still, everywhere, ~everywhere, contacts)
-        sigma, held, consistent = mode.sigma, mode.held, mode.consistent
-        fast = contacts.applied_to(fast)
-        found = friction(fast, on_constraints(fast, of_impact, zero, origin, origin), sigma, zero, origin, origin)
-        after, multipliers = found.qddot, found.multipliers
+    of_poisson = np.array(flat.poisson, bool)
+    little = jnp.finfo(impulses.dtype).eps ** ROUNDING
+    loose = little * jax.lax.stop_gradient(jnp.where(of_poisson, jnp.stack([impulses, jnp.abs(rates)]), 0))
+    return compression._replace(given=jnp.where(of_poisson, e * impulses, 0)), loose
+
+
+def together(first: Phase, second: Phase) -> Phase:
+    """Two phases of an impact, one after the other."""
+    works = {name: first.works[name] + second.works[name] for name in first.works}
+    sums = (getattr(first, name) + getattr(second, name) for name in ("gained", "exchanged"))
+    both = first.consistent & second.consistent, first.impulsive & second.impulsive
+    return Phase(second.v, first.impulses + second.impulses, works, *both, *sums)
+
+
+def _phase(flat, elements, t, q, v, near, impulse: Impulse, loose=None, least=None) -> Phase:
+    """An impact with the contacts that are `near`; what more of impulses is rounding, and what rates are at least."""
+    momentum, of_impact = of_impulses(flat, elements, t, q, v, impulse)
+    if of_impact is None:
+        chosen = select_closed(momentum, t, q, v, near, loose, least, impulse)
+        after, multipliers, _ = accelerated(in_contact(momentum, chosen.closed), t, q, v, impulse)
+        return phase_behind(flat, None, t, q, v, impulse, (after, multipliers), chosen.consistent)
+    everywhere, still = jnp.ones(of_impact.size, bool), jnp.zeros(of_impact.element_of_row.size, v.dtype)
+    contacts = Contacts.of(momentum, t, q, v, near, loose, least, impulse)
+    mode, contacts = select_mode(momentum, of_impact, t, q, v, still, everywhere, ~everywhere, contacts, impulse=impulse)
+    closed = contacts.applied_to(momentum)
+    found = friction(closed, on_constraints(closed, of_impact, t, q, v), mode.sigma, t, q, v, impulse=impulse)
+    rubbing = Rubbing(elements, of_impact, mode.sigma, mode.held, found)
+    return phase_behind(flat, rubbing, t, q, v, impulse, (found.qddot, found.multipliers), mode.consistent)
+
+
+class Rubbing(NamedTuple):
+    """Friction in an impact: its elements, those of impulses, and how it was found."""
+
+    elements: FrictionElements
+    of_impact: FrictionElements
+    sigma: Float[Array, " r"]
+    held: Bool[Array, " e"]
+    found: Friction
+
+
+def phase_behind(flat: Flat, rubbing: Rubbing | None, t, q, v, impulse: Impulse, solution: tuple, consistent) -> Phase:
+    """What follows of q̇⁺ and Λ."""
+    (after, multipliers), approach = solution, gap_rates(flat, t, q, v)
+    lost, rubbed, impulsive = jnp.zeros((), v.dtype), {}, jnp.array(True)
+    if rubbing is not None:
+        elements, of_impact, sigma, held, found = rubbing
         lost = found.force @ (elements.slip(t, q, v) + elements.slip(t, q, after))
-        rubbed = friction_by_term(of_impact, sigma, held, zero, origin, origin, found)
-        twice = bounds(of_impact, sigma, zero, origin, origin, 2 * multipliers + _at_contacts(flat, given))
+        rubbed = friction_by_term(of_impact, sigma, held, t, q, v, found)
+        twice = bounds(of_impact, sigma, t, q, v, 2 * multipliers[: flat.rows] + impulse.among_rows(flat))
         impulsive = jnp.all(jnp.abs(twice - 2 * found.bound) <= RISE * (jnp.abs(twice) + jnp.abs(found.bound)))
-    multipliers = multipliers + _at_contacts(flat, given)
-    impulses, departure = contact_rows(flat, multipliers), gap_rates(flat, t, q, after)
+    impulses, departure = contact_rows(flat, multipliers) + impulse.given, gap_rates(flat, t, q, after)
     gained = impulses @ (approach + departure) + lost
     exchanged = jnp.abs(impulses) @ (jnp.abs(approach) + jnp.abs(departure))
-    works = _works(flat, elements, t, q, (v + after) / 2, multipliers, rubbed)
+    multipliers = multipliers[: flat.rows] + impulse.among_rows(flat)
+    works = _works(flat, None if rubbing is None else rubbing.elements, t, q, (v + after) / 2, multipliers, rubbed)
     return Phase(after, impulses, works, consistent, impulsive, gained, exchanged)
-
-
-def _at_contacts(flat, given):
-    """Impulses of the contacts among those of all rows."""
-    if given is None:
-        return 0
-    before, behind = flat.rows_of_bilateral, flat.rows - flat.rows_of_bilateral - given.size
-    return jnp.concatenate([jnp.zeros(before, given.dtype), given, jnp.zeros(behind, given.dtype)])
 
 
 def _works(flat, elements, t, q, mean, multipliers, rubbed):
@@ -150,37 +177,27 @@ def check_impacts(flat: Flat, elements: FrictionElements | None, treatment: Stic
         )
 
 
-def _in_fast_time(flat, elements, t, q, v, returned, given):
-    """The system of an impact: x stands for a change of q, its acceleration from rest for q̇⁺."""
-    flat = inertial_part(with_all_masses(flat), t, q, v)
-    M = inertia(flat, t, q, v)
-    momentum = M.mv(v)
-    if given is not None:
-        momentum = momentum + jax.vjp(lambda v: gap_rates(flat, t, q, v), v)[1](given)[0]
-    rates = lambda v: (jax.jvp(flat.bilateral, (t, q), (jnp.ones_like(t), v))[1], gap_rates(flat, t, q, v), flat.nonholonomic(t, q, v))
-    drift = rates(jnp.zeros_like(v))
-    along = lambda x: jax.jvp(rates, (jnp.zeros_like(v),), (x,))[1]  # affine in q̇
-    fast = flat._replace(
-        lagrangian=lambda s, x, w: w @ M.mv(w) / 2 + momentum @ x,
-        bilateral=lambda s, x: along(x)[0] + s**2 / 2 * drift[0],
-        gaps=lambda s, x: along(x)[1] + s**2 / 2 * (drift[1] + returned),
-        nonholonomic=lambda s, x, w: along(w)[2] + s * drift[2],
-        dissipations={},
-        forces={},
-        massless=(),
-        stand_ins=(),
-    )
-    fast = fast._replace(holonomic=lambda s, x: jnp.concatenate([fast.bilateral(s, x), jnp.zeros_like(drift[1])]))
+def of_impulses(flat: Flat, elements: FrictionElements | None, t, q, v, impulse: Impulse) -> tuple[Flat, FrictionElements | None]:
+    """The system of an impact, in which no finite force has a part; and its friction, whose bounds follow impulses, and no slip."""
+    if flat.massless:
+        flat = inertial_part(with_all_masses(flat), t, q, v)._replace(massless=())
+        elements = None if elements is None else elements._replace(massless=np.array(-1))
     if elements is None:
-        return fast._replace(needs_multipliers=False), None
-    at_rest, all_given = elements.slip(t, q, jnp.zeros_like(v)), _at_contacts(flat, given)
-
-    def slip(s, x, w):
-        return jax.jvp(lambda v: elements.slip(t, q, v), (jnp.zeros_like(v),), (w,))[1] + s * at_rest
+        return flat._replace(dissipations={}, forces={}, needs_multipliers=False), None
+    given, still, nothing = impulse.among_rows(flat), jnp.zeros(elements.size, v.dtype), jnp.zeros_like(v)
 
     def impulsive(D):
         """D of the impulses: what does not follow them is finite, and has no part in an impact."""
-        return lambda s, x, w, impulses, u: D(t, q, v, impulses + all_given, u) - D(t, q, v, jnp.zeros_like(impulses), u)
+        bound = lambda impulses: jax.grad(lambda u: D(t, q, v, impulses, u))(still)
+        of_impact = lambda t, q, v, impulses, u: u @ (bound(impulses[: given.size] + given) - bound(jnp.zeros_like(given)))
+        return _either(impulse, of_impact, D)
 
     potentials = {name: impulsive(D) for name, D in elements.potentials.items()}
-    return fast, elements._replace(slip=slip, potentials=potentials, near_rest=0.0)
+    forces = {name: _either(impulse, lambda *_: nothing, Q) for name, Q in flat.forces.items()}
+    near_rest = impulse.instead(lambda: jnp.zeros_like(elements.near_rest), lambda: elements.near_rest)
+    return flat._replace(dissipations={}, forces=forces), elements._replace(potentials=potentials, near_rest=near_rest)
+
+
+def _either(impulse: Impulse, of_impact, of_motion):
+    """One function or the other."""
+    return lambda *state: impulse.instead(lambda: of_impact(*state), lambda: of_motion(*state))

@@ -138,8 +138,8 @@ def _improved(elements, rows, multipliers, room, there, turn, found: _Found) -> 
 def _without_effect(unit):
     """A basis of {x : rowsᵀx = 0} among rows that are not zero, in some of its columns, the others zero."""
     none = jnp.all(unit == 0, axis=1)
-    values, U = jnp.linalg.eigh(unit @ unit.T + jnp.diag(none.astype(unit.dtype)))
-    left_out = none[:, None] | (values > jnp.finfo(unit.dtype).eps ** 0.75 * values[-1])[None, :]
+    U, values, _ = jnp.linalg.svd(jnp.append(unit, jnp.diag(none.astype(unit.dtype)), axis=1), full_matrices=False)
+    left_out = none[:, None] | (values > jnp.finfo(unit.dtype).eps ** 0.375 * values[0])[None, :]
     return jnp.where(left_out, 0, U)
 
 

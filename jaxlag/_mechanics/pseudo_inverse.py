@@ -163,12 +163,15 @@ def applied(S: Float[Array, "m m"], inverse: Inverse, R: Float[Array, "m k"]) ->
     solve = lambda _, R: D[:, None] * jax.scipy.linalg.cho_solve((factor, True), D[:, None] * R)
     # A forward pass over a reverse one differentiates this body, not its rule: S⁺ is a solve with S that moves, or, where S is singular,
     # has terms that change nothing but the derivative by S.
-    by_factor = jax.lax.custom_linear_solve(lambda X: S @ X, R, solve, symmetric=True)
-    fixed = jax.lax.stop_gradient(S)
-    P = lambda X: root @ (root.T @ X)  # by parts: the product has lost the smaller values
-    N, change, X = lambda X: X - fixed @ P(X), S - fixed, P(R)
-    by_root = X - P(change @ X) + N(change @ P(X)) + P(P(change @ N(R)))
-    return jnp.where(regular, by_factor, by_root)
+    by_factor = lambda S, R: jax.lax.custom_linear_solve(lambda X: S @ X, R, solve, symmetric=True)
+
+    def by_root(S, R):
+        fixed = jax.lax.stop_gradient(S)
+        P = lambda X: root @ (root.T @ X)  # by parts: the product has lost the smaller values
+        N, change, X = lambda X: X - fixed @ P(X), S - fixed, P(R)
+        return X - P(change @ X) + N(change @ P(X)) + P(P(change @ N(R)))
+
+    return jnp.where(regular, by_factor(S, R), by_root(S, R))
 
 
 @applied.defjvp

@@ -19,7 +19,7 @@ from jaxtyping import Array, Bool, Float
 from .._model.flat import Flat, variant
 from .._program.implicit import undifferentiated
 from .._program.scalarise import scalarised
-from .constrained_acceleration import constrained_motion
+from .constrained_acceleration import Impulse, constrained_motion
 from .constrained_slip import directed, extent_of, freely, on_constraints
 from .friction_elements import FrictionElements, find_elements
 from .load_sharing import may_share, shared
@@ -41,7 +41,10 @@ def in_mode(flat: Flat, elements: FrictionElements, sigma: Float[Array, " r"]) -
         return lambda t, q, v: jnp.concatenate([flat.nonholonomic(t, q, v), at(t, q, v)])
 
     held = {name: flat.rows + rows for name, rows in elements.own_rows.items()}
-    mode = variant(flat, _in_some_mode, dissipations={name: slipping(D) for name, D in elements.potentials.items()}, held=held)
+    dissipations = {name: slipping(D) for name, D in elements.potentials.items()}
+    if not elements.size:
+        return flat._replace(dissipations=dissipations)
+    mode = variant(flat, _in_some_mode, dissipations=dissipations, held=held)
     every = np.arange(stuck.size)
     light = every[elements.massless >= 0] if np.ndim(elements.massless) else every[:0]
     if not light.size:
@@ -86,25 +89,32 @@ class Friction(NamedTuple):
 MOST_OPERATIONS = 1200
 
 
-def friction(flat: Flat, elements: FrictionElements, sigma, t, q, v, feedback=None) -> Friction:
-    """Friction forces of elements on the constraints; `margin` < 0 where a mode has ended: the slip reverses, or a bound is exceeded."""
-    of_state = lambda sigma, t, q, v: _friction(flat, elements, sigma, t, q, v, feedback)
-    return scalarised(of_state, limit=MOST_OPERATIONS, apart=True)(sigma, t, q, v)
+def friction(
+    flat: Flat, elements: FrictionElements, sigma, t, q, v, feedback=None, impulse: Impulse | None = None, shares: Any = True
+) -> Friction:
+    """Friction forces of elements on the constraints; `margin` < 0 where a mode has ended: the slip reverses, or a bound is exceeded.
+
+    Of an impact, friction begins from rest, and q̇⁺, Λ and the slip behind stand in the place of q̈, λ and the slip rate. Where nothing but
+    accelerations is asked for, no admissible share of loads is looked for, which have the same motion: not unless it `shares`.
+    """
+    of_state = lambda sigma, t, q, v, impulse: _friction(flat, elements, sigma, t, q, v, feedback, impulse, shares)
+    return scalarised(of_state, limit=MOST_OPERATIONS, apart=True)(sigma, t, q, v, impulse)
 
 
-def _friction(flat, elements, sigma, t, q, v, feedback):
+def _friction(flat, elements, sigma, t, q, v, feedback, impulse, shares):
     stuck, of = sticking(elements, sigma), elements.element_of_row
     mode = in_mode(flat, elements, sigma)
-    v, (qddot, multipliers, _) = constrained_motion(mode, t, q, v, feedback)
-    slip, slip_rate = jax.jvp(elements.slip, (t, q, v), (jnp.ones_like(t), v, qddot))
+    v, (qddot, multipliers, _) = constrained_motion(mode, t, q, v, feedback, impulse)
+    slip, slip_rate = _slip_and_rate(elements, t, q, v, qddot, impulse)
     if np.any(elements.is_quasistatic):  # what has no inertia slips at once
         still = slip_of(elements, t, q, v, 1e2 * jnp.finfo(v.dtype).eps * jnp.abs(v))
         slip_rate = jnp.where((elements.is_quasistatic & (elements.norms(slip) > still))[of], slip, slip_rate)
-    pull = jax.vjp(lambda slip: extent_of(elements, sigma, slip), slip)[1]
-    bound_of = lambda multipliers: bounds(elements, sigma, t, q, v, multipliers)
+    extent, pull = jax.vjp(lambda slip: extent_of(elements, sigma, slip), slip)
+    bound_of = lambda multipliers: _bounds(elements, extent, t, q, v, multipliers)
     left = bound_of(multipliers) - elements.norms(freely(elements, multipliers[flat.rows :]))
     if may_share(flat, elements):
-        multipliers, left = shared(mode, elements, t, q, v, multipliers, bound_of, stuck)
+        share = lambda: tuple(shared(mode, elements, t, q, v, multipliers, bound_of, stuck))
+        multipliers, left = share() if shares is True else jax.lax.cond(shares, share, lambda: (multipliers, left))
     bound = bound_of(multipliers)
     force = jnp.where(stuck[of], freely(elements, multipliers[flat.rows :]), -pull(bound)[0])
     going = elements.sums(directed(elements, sigma) * slip) + jnp.where(elements.straight, 0, 1e-6 * elements.near_rest)
@@ -116,10 +126,23 @@ def _friction(flat, elements, sigma, t, q, v, feedback):
     return Friction(v, qddot, multipliers, force, slip_rate, bound, jnp.where(stuck, resting, going), driven, straight)
 
 
+def _slip_and_rate(elements: FrictionElements, t, q, v, qddot, impulse: Impulse | None):
+    """s and its rate; of an impact, which begins from rest, nothing and s behind it."""
+    of_motion = lambda: jax.jvp(elements.slip, (t, q, v), (jnp.ones_like(t), v, qddot))
+    if impulse is None:
+        return of_motion()
+    behind = elements.slip(t, q, qddot)
+    return impulse.instead(lambda: (jnp.zeros_like(behind), behind), of_motion)
+
+
 def bounds(elements: FrictionElements, sigma, t, q, v, multipliers) -> Float[Array, " e"]:
     """∂D/∂u: what friction is where an element slips, and what it does not exceed where it sticks."""
-    total = lambda u: sum(D(t, q, v, multipliers, u) for D in elements.potentials.values())
-    return jax.grad(total)(extent_of(elements, sigma, elements.slip(t, q, v)))
+    return _bounds(elements, extent_of(elements, sigma, elements.slip(t, q, v)), t, q, v, multipliers)
+
+
+def _bounds(elements, extent, t, q, v, multipliers):
+    total = lambda u: sum((D(t, q, v, multipliers, u) for D in elements.potentials.values()), start=jnp.zeros((), q.dtype))
+    return jax.grad(total)(extent)
 
 
 class Mode(NamedTuple):
@@ -180,6 +203,18 @@ class ModeSelection:
     sigma: Float[Array, " r"]
     at_rest: Bool[Array, " e"]
     breaking: Bool[Array, " e"]
+    impulse: Impulse | None = None  # of an impact, which begins from rest
+
+    def slip(self) -> Float[Array, " r"]:
+        """The slip velocities."""
+        of_motion = lambda: self.elements.slip(self.t, self.q, self.v)
+        return of_motion() if self.impulse is None else self.impulse.instead(lambda: jnp.zeros_like(self.sigma), of_motion)
+
+    def drift(self) -> Float[Array, " r"]:
+        """Slip rates without accelerations; of an impact, slip without velocities."""
+        slip, t, q, v = self.elements.slip, self.t, self.q, self.v
+        of_motion = lambda: jax.jvp(lambda t, q: slip(t, q, v), (t, q), (jnp.ones_like(t), v))[1]
+        return of_motion() if self.impulse is None else self.impulse.instead(lambda: slip(t, q, jnp.zeros_like(v)), of_motion)
 
     @property
     def most(self) -> int:
@@ -215,13 +250,12 @@ class ModeSelection:
         backwards = -elements.sums(found.slip_rate * mode.sigma)
         holds = released & ~idle & ~(elements.is_vector & (found.bound == 0))
         returning = _greatest(backwards, holds & (backwards > jnp.where(search.clearly, 0, 1e-6 * search.free_rate)))
-        there = elements, self.t, self.q, self.v
-        torn = _torn(*there, found, search.free_rate, over > -jnp.inf) & ~jnp.any(beyond) | (stuck & found.driven)
+        torn = _torn(elements, self.drift(), found, search.free_rate, over > -jnp.inf) & ~jnp.any(beyond) | (stuck & found.driven)
         along = (over > -1e-6 * jnp.abs(found.bound)) & elements.are_shared  # those of a share break away together
         leaving = jnp.where((stage == FIRST) & jnp.any(breaking), breaking | along, beyond | torn)
         leaving = (leaving & (stage != LOOSE)) | (idle & (over > -jnp.inf))
         returning = returning & ~jnp.any(leaving) & ~turns
-        onward = jnp.where((rate > 0)[of], found.slip_rate, elements.slip(*there[1:]))
+        onward = jnp.where((rate > 0)[of], found.slip_rate, self.slip())
         way = jnp.where(((beyond | breaking | along) & ~found.driven)[of], -found.force, onward)
         away = jnp.where(idle[of], 1, unit(elements, way))
         sigma = jnp.where(leaving[of], away, jnp.where(returning[of], 0, turned))
@@ -233,7 +267,7 @@ class ModeSelection:
         all_slip = (stage == LOOSE) & ~jnp.any(at_rest)  # nothing to choose
         within = (stage == FIRST) | (stage == NEXT) | all_slip
         last = all_slip | ~jnp.any(at_rest & ~idle & ~sticking(elements, sigma))  # nothing that others may hold
-        asked = self.flat, *there[1:], found.qddot, found.multipliers
+        asked = self.flat, self.t, self.q, self.v, found.qddot, found.multipliers
         contacts, changes = search.contacts.next(*asked, agrees, search.turns > self.most)
         following = jnp.where(within, jnp.where(in_current_mode, jnp.where(last, DONE, HOLD), NEXT), jnp.where(stage == LOOSE, FIRST, DONE))
         anew = within & changes
@@ -254,15 +288,23 @@ class ModeSelection:
 
 
 def select_mode(
-    flat: Flat, elements: FrictionElements, t, q, v, sigma, at_rest, breaking, contacts: Any = NoContact(), friction_in: Any = None
+    flat: Flat,
+    elements: FrictionElements,
+    t,
+    q,
+    v,
+    sigma,
+    at_rest,
+    breaking,
+    contacts: Any = NoContact(),
+    friction_in: Any = None,
+    impulse=None,
 ) -> tuple[Mode, Any]:
     """The mode by a `ModeSelection`, and the closed contacts among `contacts`. `friction_in(σ, contacts)` is the friction of this state in
     another mode, if there is a program of it.
     """
-    friction_in, selection = (
-        friction_in or _in_modes(flat, elements, t, q, v),
-        ModeSelection(flat, elements, t, q, v, sigma, at_rest, breaking),
-    )
+    friction_in = friction_in or _in_modes(flat, elements, t, q, v, impulse)
+    selection = ModeSelection(flat, elements, t, q, v, sigma, at_rest, breaking, impulse)
 
     def turn(search):
         in_mode = lambda sigma: friction_in(sigma, search.contacts)
@@ -277,20 +319,21 @@ def select_mode(
     return done.mode, done.contacts
 
 
-def _in_modes(flat: Flat, elements: FrictionElements, t, q, v) -> Callable:
+def _in_modes(flat: Flat, elements: FrictionElements, t, q, v, impulse: Impulse | None = None) -> Callable:
     """Friction at this state as a function of σ and of the contacts."""
-    on = lambda chosen, sigma: friction(chosen, on_constraints(chosen, elements, t, q, v), sigma, t, q, v)
+    on = lambda chosen, sigma: friction(chosen, on_constraints(chosen, elements, t, q, v), sigma, t, q, v, impulse=impulse)
     return lambda sigma, contacts: on(contacts.applied_to(flat), sigma)
 
 
 def _greatest(x, among):
     """The greatest entry among those marked, if there are any."""
+    if not x.size:
+        return among
     return among & (jnp.arange(x.size) == jnp.argmax(jnp.where(among, x, -jnp.inf)))
 
 
-def _torn(elements, t, q, v, found, free_rate, stuck):
+def _torn(elements, drift, found, free_rate, stuck):
     """Of elements that cannot stick at the same time, as on belts that move apart, the one farthest from rest."""
-    _, drift = jax.jvp(lambda t, q: elements.slip(t, q, v), (t, q), (jnp.ones_like(t), v))
     most, rate = jnp.max(elements.norms(drift), initial=0.0), elements.norms(found.slip_rate)
     return _greatest(rate, stuck & (rate > 1e-6 * most) & (rate > 1e-9 * free_rate) & (most > 0))
 
@@ -299,14 +342,19 @@ def first_mode(
     flat: Flat, elements: FrictionElements, t, q, v, contacts: Any = NoContact(), friction_in: Callable | None = None
 ) -> tuple[Mode, Any]:
     """The initial mode: what moves slips along its motion; what rests sticks or breaks away. And the contacts chosen with it."""
-    slip = jax.lax.stop_gradient(elements.slip(t, q, v))
-    size = elements.norms(slip)
-    at_rest = elements.is_quasistatic | (size <= slip_of(elements, t, q, v, 1e2 * jnp.finfo(v.dtype).eps * jnp.abs(v)))
-    sigma = slip / jnp.where(at_rest, 1, size)[elements.element_of_row]
+    at_rest, sigma = slipping(elements, t, q, v)
     friction_in = friction_in or _in_modes(flat, elements, t, q, v)
     mode, contacts = select_mode(flat, elements, t, q, v, sigma, at_rest, jnp.zeros_like(at_rest), contacts, friction_in)
     begin = at_rest & ~sticking(elements, mode.sigma) & ~mode.held & ~elements.is_quasistatic
     return mode._replace(sigma=turning(elements, lambda sigma: friction_in(sigma, contacts).slip_rate, mode.sigma, begin)), contacts
+
+
+def slipping(elements: FrictionElements, t, q, v) -> tuple[Bool[Array, " e"], Float[Array, " r"]]:
+    """Which elements are at rest, and the directions of the others, but for rounding."""
+    slip = jax.lax.stop_gradient(elements.slip(t, q, v))
+    size = elements.norms(slip)
+    at_rest = elements.is_quasistatic | (size <= slip_of(elements, t, q, v, 1e2 * jnp.finfo(v.dtype).eps * jnp.abs(v)))
+    return at_rest, jnp.where(at_rest[elements.element_of_row], 0, slip / jnp.where(at_rest, 1, size)[elements.element_of_row])
 
 
 def slip_of(elements: FrictionElements, t, q, v, errors: Float[Array, " n"]) -> Float[Array, " e"]:

@@ -11,11 +11,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, PyTree
 
-from .._mechanics.constrained_acceleration import constrained_acceleration
+from .._mechanics.constrained_acceleration import Impulse, constrained_acceleration
 from .._mechanics.constrained_slip import Left, left_by_constraints, on_constraints
 from .._mechanics.contact import free, in_contact
-from .._mechanics.friction_elements import FrictionElements, light_coordinates
-from .._mechanics.impact import check_impacts
+from .._mechanics.friction_elements import FrictionElements, light_coordinates, without_friction
+from .._mechanics.impact import check_impacts, of_impulses
 from .._mechanics.load_sharing import may_share
 from .._mechanics.massless import with_first_order_rates
 from .._mechanics.power import energy_exchange, listed_powers
@@ -223,9 +223,20 @@ class EquationsOfMotion:
         """ẏ."""
         return _rates(self, t, y, args)
 
-    def rates_and_friction(self, t, parts: Parts, args: Arguments) -> tuple[Array, Friction]:
-        """ẏ and the friction in the mode of `parts`, by one evaluation, where nothing but friction changes modes."""
-        return _rates_and_friction(self, t, parts, self._without_scales(args))
+    def rates_and_friction(
+        self, t, parts: Parts, args: Arguments, impulse: Impulse | None = None, shares: Any = True
+    ) -> tuple[Array, Friction]:
+        """ẏ and the friction in the mode of `parts`, by one evaluation, where friction and contact alone change modes; or, of an `impulse`
+        that happens, the friction of an impact. For rates alone, loads need not be shared.
+        """
+        return _rates_and_friction(self, t, parts, self._without_scales(args), impulse, shares)
+
+    def rubbing(self, t, parts: Parts, args: Arguments) -> tuple[Flat, FrictionElements]:
+        """The system with its closed contacts, and its elements of dry friction, of which there may be none."""
+        flat, elements = self.contents(t, parts, args)
+        if elements is not None:
+            return flat, elements
+        return (smooth := self.formulation.friction.smoothed(flat, t, parts.q, parts.v)), without_friction(smooth)
 
     def projected(self, t, y, args):
         """y, put back on the constraints."""
@@ -265,11 +276,15 @@ def _rates(equations: EquationsOfMotion, t, y, args):
 
 
 @jitted
-def _rates_and_friction(equations: EquationsOfMotion, t, parts: Parts, args) -> tuple[Array, Friction]:
-    q, found = parts.q, equations.friction(t, parts, args)
+def _rates_and_friction(equations: EquationsOfMotion, t, parts: Parts, args, impulse: Impulse | None, shares) -> tuple[Array, Friction]:
+    q, v = parts.q, parts.v
+    flat, elements = equations.rubbing(t, parts, args)
+    if equations.elements:
+        elements = on_constraints(flat, elements, t, q, v, lambda: _left_by_constraints(equations, t, parts, args))
+    there, rubbing = (flat, elements) if impulse is None else of_impulses(flat, elements, t, q, v, impulse)
+    assert rubbing is not None  # as many as there are elements
+    found = friction(there, rubbing, parts.sigma, t, q, v, impulse=impulse, shares=shares)
     v, qddot = found.qdot, found.qddot.at[np.array(equations.light, int)].set(0)
-    flat, elements = equations.contents(t, parts, args)
-    assert elements is not None  # asked where there is friction
     powers = listed_powers(in_mode(flat, elements, parts.sigma), t, q, v) if equations.works else parts.works
     stuck = jnp.maximum(sticking(elements, parts.sigma).astype(q.dtype), parts.held)
     resting = Parts(*(jnp.zeros_like(part) for part in parts))

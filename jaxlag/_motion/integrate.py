@@ -24,7 +24,8 @@ from .first_order import EquationsOfMotion
 from .formulation import Formulation
 from .integrated import integrated
 from .loads import told_of_loads
-from .mode_changes import started
+from .mode_changes import started, unstarted
+from .one_evaluation_solver import OneEvaluationSolver, has_one_evaluation
 from .progress import Bar
 from .protocol import Arguments, FirstOrderSystem
 from .results import RESULTS, from_diffrax
@@ -32,7 +33,6 @@ from .runge_kutta import Dop853, ExplicitRungeKutta, is_explicit
 from .scales import Scales
 from .search_for_start import Search
 from .sparse_implicit import in_structure
-from .step_machine import OneEvaluationSolver, has_one_evaluation
 from .step_size import StepControl, with_tolerances
 from .stick_slip_solver import StickSlipSolver
 from .variational import VariationalEquations, derived, varied_along, with_variations
@@ -91,12 +91,16 @@ class Initial(NamedTuple):
     conditions: tuple[tuple[Bool[Array, ""], Any], ...]
 
 
-def initialised(equations: EquationsOfMotion, at: StatesAt, params, scales: Scales | None = None, search: Search = "all") -> Initial:
-    """The start, put on the constraints; `scales` are needed where there are events."""
+def initialised(
+    equations: EquationsOfMotion, at: StatesAt, params, scales: Scales | None = None, search: Search = "all", begins: bool = False
+) -> Initial:
+    """The start, put on the constraints, and in its mode, unless the first step `begins` with that; `scales` are needed where there are
+    events.
+    """
     _, t0, q, v = at
     flat = equations.flat_at(params, at)
     nearest = _nearest(equations, flat, at, params, search)
-    start = started(equations, at._replace(q=nearest.q, v=nearest.v), params)
+    start = (unstarted if begins else started)(equations, at._replace(q=nearest.q, v=nearest.v), params)
     moved = jax.lax.stop_gradient(jnp.max(jnp.abs(jnp.concatenate([nearest.q - q, nearest.v - v]))))
     conditions = (
         *((period > 0, RESULTS.no_period) for period in equations.periods(params)),
@@ -147,7 +151,15 @@ def with_status(ys, result, conditions, inputs) -> tuple[Array, RESULTS]:
 
 
 def states_at(
-    equations: FirstOrderSystem, options: SolverOptions, adjoint: dfx.AbstractAdjoint, t0, y0, ts, args: Arguments, tolerances
+    equations: FirstOrderSystem,
+    options: SolverOptions,
+    adjoint: dfx.AbstractAdjoint,
+    t0,
+    y0,
+    ts,
+    args: Arguments,
+    tolerances,
+    begins: bool = False,
 ) -> tuple[Array, RESULTS, dict]:
     """States at the samples of a single motion, the reason it stopped, and, among the counts, the `last` time and state that it reached.
 
@@ -157,8 +169,18 @@ def states_at(
     if nodes:
         _refuse_adjoint(options.adjoint)
     if nodes or not (reverse or options.adjoint):
-        return in_one_loop(equations, options, t0, y0, ts, args, tolerances, reverse=reverse)
+        return in_one_loop(equations, options, t0, y0, ts, args, tolerances, reverse=reverse, begins=begins)
     return by_diffrax(equations, options, adjoint, t0, y0, ts, args, tolerances)
+
+
+def begins_in_steps(equations: FirstOrderSystem, options: SolverOptions, params: PyTree, reverse: bool, varied: bool) -> bool:
+    """Whether the first step finds the mode of friction and contact at the start, by the evaluation of all others: not where slip begins in
+    a plane, whose direction turns with all that it depends on, nor where coordinates without inertia have to be put where they can be.
+    """
+    if not isinstance(equations, EquationsOfMotion) or (options.adjoint and not has_nodes(equations, params)):
+        return False
+    one = has_one_evaluation(equations, options.solver, reverse, varied)
+    return one and equations.rows == equations.elements and not equations.light
 
 
 def _refuse_adjoint(adjoint: dfx.AbstractAdjoint | None) -> None:
@@ -205,7 +227,7 @@ def _variations(equations: FirstOrderSystem) -> int:
     return 1 + _variations(equations.equations) if isinstance(equations, VariationalEquations) else 0
 
 
-def _wrapped(options, equations, projected, adjoint, start, varied: bool = False):
+def _wrapped(options, equations, projected, adjoint, start, varied: bool = False, begins: bool = False):
     """The chosen solver, with what the equations ask for at the ends of its steps."""
     solver = in_structure(options.solver, equations, *start)
     if isinstance(adjoint, dfx.ForwardMode):
@@ -215,7 +237,7 @@ def _wrapped(options, equations, projected, adjoint, start, varied: bool = False
             solver = dataclasses.replace(solver, scan_kind="lax")  # as diffrax does for a solver that is not wrapped
     if isinstance(equations, EquationsOfMotion) and equations.modes:
         if has_one_evaluation(equations, solver, not isinstance(adjoint, dfx.ForwardMode), varied):
-            return OneEvaluationSolver(solver, projected, equations, reverse=False)
+            return OneEvaluationSolver(solver, projected, equations, reverse=False, begins=begins)
         return StickSlipSolver(solver, projected, equations, reverse=not isinstance(adjoint, dfx.ForwardMode))
     return ProjectedSolver(solver, projected, equations)
 
@@ -228,14 +250,24 @@ def has_nodes(equations: FirstOrderSystem, params: PyTree) -> bool:
 
 
 def in_one_loop(
-    equations: FirstOrderSystem, options: SolverOptions, t0, y0, ts, args: Arguments, tolerances, *, directions=(), reverse=False
+    equations: FirstOrderSystem,
+    options: SolverOptions,
+    t0,
+    y0,
+    ts,
+    args: Arguments,
+    tolerances,
+    *,
+    directions=(),
+    reverse=False,
+    begins=False,
 ) -> tuple[Array, RESULTS, dict]:
     """States at the samples as `states_at`, with their variations along directions of (params, t0) for each order."""
     adjoint = dfx.RecursiveCheckpointAdjoint() if reverse else dfx.ForwardMode()
     meter, dense = Meter() if options.progress else dfx.NoProgressMeter(), not has_nodes(equations, args.params)
     back = in_one_kernel(equations.projected) if dense else equations.projected
-    solver = _wrapped(options, equations, back if equations.projection else None, adjoint, (t0, y0, args), bool(directions))
-    args = told_of_loads(equations, t0, y0[(..., *[0] * len(directions))], args)
+    solver = _wrapped(options, equations, back if equations.projection else None, adjoint, (t0, y0, args), bool(directions), begins)
+    args = told_of_loads(equations, t0, y0[(..., *[0] * len(directions))], args, begins)
     numbers = y0, t0, args, ts, tolerances
     kind = {"variations": _variations(equations), "reverse": reverse, "dense": dense}
     ys, (result, stats) = integrated(equations, solver, options.max_steps, meter, *numbers, directions, **kind)

@@ -97,6 +97,11 @@ class IntervalLoop(NamedTuple):
     variations: int  # how many last axes of the y of the equations hold variations
     dense: bool  # whether there is nothing but samples, which the dense output of the steps then shows
 
+    @property
+    def begins(self) -> bool:
+        """Whether the first step finds the mode at the start."""
+        return getattr(self.solver, "begins", False)
+
     def sample_time(self, sample: Int[Array, ""]) -> Float[Array, ""]:
         """Of a sample of the motion, or of the last."""
         return self.ts.at(jnp.minimum(sample, self.ts.shape[0] - 1))[0]
@@ -115,7 +120,10 @@ class IntervalLoop(NamedTuple):
             sample, before = steps.sample, jax.tree.map(now, moving)
             size = steps.control[0].size
             stepping = self._replace(solver=with_tolerances(self.solver, control, now(size)))
-            scaled = numbers._replace(args=numbers.args._replace(scales=_at_scale(numbers.args.scales, size)))
+            scales = _at_scale(numbers.args.scales, size)
+            if self.begins:
+                scales = scales._replace(held=scales.held + jax.lax.stop_gradient(now(self.solver.loads_of(moving.solver_state))))
+            scaled = numbers._replace(args=numbers.args._replace(scales=scales))
             (moving, reached), (steps, is_sample) = stepping._varied(control, same, steps, scaled)(moving)
             meter = self.meter.step(meter, (now(moving.t) - first) / (last - first))
             if self.dense:
@@ -128,6 +136,8 @@ class IntervalLoop(NamedTuple):
         def going_on(carry):
             moving, steps, *_ = carry
             within = (steps.sample < self.ts.shape[0]) & (self.sample_time(steps.sample) > now(moving.t))  # the last may be repeated
+            if self.begins:
+                within |= ~steps.solver_state[2].known  # where all times are the same, there is the start alone
             going = (steps.result == dfx.RESULTS.successful) & (steps.accepted + steps.rejected < self.max_steps)
             return within & going & ~has_stopped(self.equations, now(moving.y))
 
@@ -135,7 +145,16 @@ class IntervalLoop(NamedTuple):
         saved = with_events(self.equations, write, saved, self.ts.shape[0], None, y0, now)
         moving, steps, saved, meter = loop(going_on, turn, (moving, steps, saved, self.meter.init()))
         self.meter.close(meter)
+        if self.begins:
+            saved = self._with_start(moving, steps, y0, sample, saved, write)
         return moving, steps, saved
+
+    def _with_start(self, moving: Moving, steps: Steps, y0, sample, saved: Any, write: Callable) -> Any:
+        """With the state at the start as the first step has found it, at the samples that are there."""
+        y, fine = self.solver.start_of(eqx.combine(moving.solver_state, steps.solver_state), y0)
+        y = jnp.where(fine, y, jnp.nan)
+        at_start = lambda carry: carry[0] < sample
+        return jax.lax.while_loop(at_start, lambda carry: (carry[0] + 1, write(carry[1], carry[0], y, jnp.array(True))), (0, saved))[1]
 
     def _start(self, control: StepControl, first, last, y0, following, sample, numbers: Numbers) -> tuple[Moving, Steps]:
         """What is there before the first step."""

@@ -9,7 +9,9 @@ import numpy as np
 from jaxtyping import Array, Bool
 
 from .._mechanics.augmented_inertia import units_alike
+from .._mechanics.friction_elements import FrictionElements
 from .._mechanics.lagrange import applied_force, inertia, position_rows, velocity_rows
+from .._mechanics.stick_slip import Friction
 from .._model.flat import Flat
 from .._program.size_of_terms import size_of_terms
 from .._program.sparse_jacobian import MANY
@@ -18,17 +20,21 @@ from .._program.sparsity import sparsity_pattern
 from .batch import BatchedEquations
 from .first_order import EquationsOfMotion
 from .protocol import Arguments, AugmentedSystem, undifferentiated
+from .state_vector import Parts
 
 
-def told_of_loads(equations: Any, t, y, args: Arguments) -> Arguments:
-    """With what weighs as much as one of each coordinate, and what forces at the start make of each velocity."""
+def told_of_loads(equations: Any, t, y, args: Arguments, begins: bool = False) -> Arguments:
+    """With what weighs as much as one of each coordinate, and what forces at the start make of each velocity; where the first step
+    `begins` with the mode, that finds the forces of constraints and friction (`loads_within`).
+    """
     if args.scales is None:
         return args
-    found = _loads(equations, *undifferentiated((t, y, args._replace(scales=args.scales._replace(driven=None)))))
+    t, y, given = undifferentiated((t, y, args._replace(scales=args.scales._replace(driven=None))))
+    found = _loads(equations, t, y, given, begins)
     return args if found is None else args._replace(scales=args.scales._replace(**found))
 
 
-def _loads(equations: Any, t, y, args: Arguments) -> dict[str, Any] | None:
+def _loads(equations: Any, t, y, args: Arguments, begins: bool = False) -> dict[str, Any] | None:
     """What `Scales` calls units, held, given and driven; of a motion, or of each member of a batch.
 
     Where forces, those of constraints and of dry friction at its bound among them, hold one another, the rounding of all is a rate of its
@@ -46,26 +52,46 @@ def _loads(equations: Any, t, y, args: Arguments) -> dict[str, Any] | None:
     units = units_alike(M, [])
     if not isinstance(M, lx.DiagonalLinearOperator) and equations.size >= MANY and elements is None:
         return {"units": units}
-    mass = M.diagonal if isinstance(M, lx.DiagonalLinearOperator) else jnp.diagonal(M.as_matrix())
-    rate = lambda pulls: pulls / jnp.where(mass > 0, mass, jnp.inf)
     terms = size_of_terms(lambda q: _forces(flat, t, q, parts.v), parts.q)
-    held, given, driven = rate(jnp.where(jnp.isfinite(terms), terms, 0)), None, None
+    held, given, driven = _rate(M, jnp.where(jnp.isfinite(terms), terms, 0)), None, None
+    if equations.system.constraints and equations.projection is not None:
+        given = _prescribed(flat, t, parts.q, may_move=not equations.works)  # works are integrals along what moves
+    if begins:
+        return {"units": units, "held": held, "given": given, "driven": driven}
     found = None if elements is None else equations.friction(t, parts, args)
     if equations.system.constraints:
-        G = velocity_rows(flat, t, parts.q, parts.v)[1]
-        G = SparseMatrix(jnp.abs(G.values), G.pattern) if isinstance(G, SparseMatrix) else jnp.abs(G)
         multipliers = (found or equations.accelerated(t, parts, args, False)).multipliers
-        held = held + rate(G.T @ jnp.abs(multipliers[: flat.rows]))
-        if equations.projection is not None:
-            given = _prescribed(flat, t, parts.q, may_move=not equations.works)  # works are integrals along what moves
+        held = held + _rate(M, _pulls_of_constraints(flat, t, parts, multipliers))
     if elements is not None and found is not None:
-        slopes = jnp.abs(jax.jacfwd(lambda v: elements.slip(t, parts.q, v))(parts.v))
-        bound = jnp.abs(found.bound)[elements.element_of_row]
+        by_rows = _pulls_of_friction(elements, t, parts, found.bound)
         in_plane = elements.is_vector[elements.element_of_row]
-        held = held + rate(bound @ slopes)
+        held = held + _rate(M, jnp.sum(by_rows, axis=0))
         if np.any(in_plane):
-            driven = 0.1 * args.scales.duration * rate(bound[in_plane] @ slopes[in_plane])
+            driven = 0.1 * args.scales.duration * _rate(M, jnp.sum(by_rows[in_plane], axis=0))
     return {"units": units, "held": held, "given": given, "driven": driven}
+
+
+def loads_within(flat: Flat, elements: FrictionElements, t, parts: Parts, found: Friction) -> Array:
+    """What forces of constraints and of friction make of each velocity."""
+    pulls = _pulls_of_constraints(flat, t, parts, found.multipliers) + jnp.sum(_pulls_of_friction(elements, t, parts, found.bound), axis=0)
+    return _rate(inertia(flat, t, parts.q, parts.v), pulls)
+
+
+def _rate(M, pulls):
+    mass = M.diagonal if isinstance(M, lx.DiagonalLinearOperator) else jnp.diagonal(M.as_matrix())
+    return pulls / jnp.where(mass > 0, mass, jnp.inf)
+
+
+def _pulls_of_constraints(flat: Flat, t, parts: Parts, multipliers):
+    G = velocity_rows(flat, t, parts.q, parts.v)[1]
+    G = SparseMatrix(jnp.abs(G.values), G.pattern) if isinstance(G, SparseMatrix) else jnp.abs(G)
+    return G.T @ jnp.abs(multipliers[: flat.rows])
+
+
+def _pulls_of_friction(elements: FrictionElements, t, parts: Parts, bound):
+    """Those of each row."""
+    slopes = jnp.abs(jax.jacfwd(lambda v: elements.slip(t, parts.q, v))(parts.v))
+    return jnp.abs(bound)[elements.element_of_row][:, None] * slopes
 
 
 def _prescribed(flat: Flat, t, q, may_move: bool) -> Bool[Array, " n"]:

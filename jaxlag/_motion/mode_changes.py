@@ -5,11 +5,11 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from .._mechanics.contact import (
     ROUNDING,
-    Chosen,
     Contacts,
     contact_rows,
     gap_rates,
@@ -21,9 +21,9 @@ from .._mechanics.contact import (
     select_closed,
 )
 from .._mechanics.friction_elements import FrictionElements
-from .._mechanics.impact import impact, no_impact
+from .._mechanics.impact import Impact, impact, no_impact
 from .._mechanics.return_mapping import returned
-from .._mechanics.stick_slip import Mode, first_mode, select_mode, slip_of, sticking
+from .._mechanics.stick_slip import Friction, Mode, first_mode, select_mode, slip_of, slipping, sticking
 from .._model.flat import Flat, StatesAt
 from .._program.jit import jitted
 from .._program.time_bounds import bounds_over_time
@@ -61,7 +61,7 @@ def margins(equations: EquationsOfMotion, t, y, args: Arguments, start) -> Float
 
 @jitted
 def _margins(equations: EquationsOfMotion, t, parts: Parts, args):
-    q, v, sigma, held = parts.q, parts.v, parts.sigma, parts.held
+    q, v = parts.q, parts.v
     flat, mode, elements = equations.mode(t, parts, args)
     of_events = sum(witness_margins(equations, t, parts, args))
     unbounded = jnp.ones_like(parts.closed), jnp.ones_like(parts.sign)
@@ -70,9 +70,16 @@ def _margins(equations: EquationsOfMotion, t, parts: Parts, args):
         pressing = lambda: contact_rows(flat, equations.acceleration(mode, t, q, v).multipliers)
         forces = jax.lax.cond(jnp.any(closed), pressing, none) if equations.contacts else none()
         return jnp.concatenate([_contact_margins(flat, t, q, closed, forces, args), of_events, *unbounded])
-    found = equations.friction(t, parts, args)
-    of_contacts = _contact_margins(flat, t, q, parts.closed > 0.5, contact_rows(flat, found.multipliers), args)
-    of_elements = jnp.where((held > 0) | idle(flat, elements, sigma, found.bound), 1, found.margin)
+    return margins_of(equations, t, parts, args, equations.friction(t, parts, args), of_events)
+
+
+def margins_of(equations: EquationsOfMotion, t, parts: Parts, args: Arguments, found: Friction, of_events: Array | None = None) -> Array:
+    """Margins and bounds, from the friction that was found in the mode."""
+    flat, elements = equations.rubbing(t, parts, args)
+    of_contacts = _contact_margins(flat, t, parts.q, parts.closed > 0.5, contact_rows(flat, found.multipliers), args)
+    of_elements = jnp.where((parts.held > 0) | idle(flat, elements, parts.sigma, found.bound), 1, found.margin)
+    of_events = jnp.zeros_like(parts.sign) if of_events is None else of_events
+    unbounded = jnp.ones_like(parts.closed), jnp.ones_like(parts.sign)
     return jnp.concatenate([of_elements, of_contacts, of_events, found.bound, *unbounded])
 
 
@@ -142,13 +149,17 @@ class AtEnd(NamedTuple):
 
 
 def at_end(equations: EquationsOfMotion, t, y, args: Arguments, slopes: Float[Array, " m"]) -> AtEnd:
-    """With `slopes` of the margins, those of open contacts apart, which are g and ġ as they are: among many impacts a gap is hardly more
-    than its rounding, and its rate is no difference of gaps.
-    """
+    """Margins at the end of a mode, where they have such `slopes`."""
     found = margins(equations, t, y, args, y)[: equations.modes]
     if not (equations.contacts or equations.events):
         return AtEnd(found, slopes, jnp.zeros_like(slopes))
-    parts = equations.parts(y)
+    return exactly(equations, t, equations.parts(y), args, found, slopes)
+
+
+def exactly(equations: EquationsOfMotion, t, parts: Parts, args: Arguments, found: Float[Array, " m"], slopes: Float[Array, " m"]) -> AtEnd:
+    """With the margins `found` and their `slopes`, those of open contacts apart, which are g and ġ as they are: among many impacts a gap is
+    hardly more than its rounding, and its rate is no difference of gaps.
+    """
     flat, _ = equations.contents(t, parts, args)
     first = [equations.elements, equations.elements + equations.contacts]
     (of_elements, of_contacts, _), (falls, rises, passes) = (jnp.split(x, first) for x in (found, slopes))
@@ -197,6 +208,82 @@ def _slow(elements: FrictionElements, t, parts: Parts, errors, moved):
     return elements.norms(elements.slip(t, parts.q, parts.v)) <= slip_of(elements, t, parts.q, parts.v, errors) + slack
 
 
+class Touch(NamedTuple):
+    """Of each contact, where modes end: whether it touches, opens, and is struck; its restitution, by which impacts that are still to come
+    are summed up where they converge, in the time that remains for them; the rate of its gap within which it rests.
+    """
+
+    near: Bool[Array, " c"]
+    opening: Bool[Array, " c"]
+    hits: Bool[Array, " c"]
+    converged: Bool[Array, " c"]
+    e: Float[Array, " c"]
+    ratio: Float[Array, " c"]
+    remaining: Float[Array, " c"]
+    rest: Float[Array, " c"]
+
+
+def touching_at(equations: EquationsOfMotion, flat: Flat, t, parts: Parts, args: Arguments, of_contact, of_positions) -> Touch:
+    """What touches at this state, where the modes of contacts end that `of_contact` marks."""
+    closed, q, v = parts.closed > 0.5, parts.q, parts.v
+    scales = gap_scales(flat, t, q, v, of_positions, roundings_beside(flat, t, q, v)[1])
+    near = closed | of_contact | (jax.lax.stop_gradient(flat.gaps(t, q)) <= scales.gap)
+    opening, rates = of_contact & closed, gap_rates(flat, t, q, v)
+    hits = near & ~opening & (rates < -scales.rate)
+    duration, own = (jnp.inf, jnp.abs(q)) if args.scales is None else (args.scales.duration, args.scales.of_q)
+    speed = jnp.maximum(-rates, 0)
+    is_low = speed * (t - parts.changed) / 4 <= LOW * gap_scales(flat, t, q, v, roundings(q, own), v).gap
+    ratio, remaining, converged = _last_impacts(t, parts, hits & of_contact, is_low, duration)
+    e = jnp.where(converged, 0, flat.restitution(t, speed))
+    return Touch(near, opening, hits, converged, e, ratio, remaining, scales.rate)
+
+
+def behind_impact(equations: EquationsOfMotion, t, parts: Parts, touch: Touch, found: Impact) -> Parts:
+    """The state with what an impact makes of it, or with q̇ as it was."""
+    if equations.works:
+        does = jnp.stack([jnp.asarray(found.works.get(name, 0.0), found.v.dtype) for name in equations.works])
+        parts = parts._replace(works=parts.works + does)
+    _, opening, hits, converged, _, ratio, remaining, _ = touch
+    impulses = found.impulses * jnp.where(converged, (1 + ratio) / jnp.where(converged, 1 - ratio, 1), 1)
+    return parts._replace(v=found.v, **_counted(t, parts, hits, opening, impulses, jnp.where(converged, remaining, 0)))
+
+
+def resting_at(equations: EquationsOfMotion, flat: Flat, t, parts: Parts, touch: Touch) -> tuple[Bool[Array, " c"], Array]:
+    """Which contacts may stay closed at a state behind the impact, if there was one; and which of them are loose."""
+    rests = jnp.abs(gap_rates(flat, t, parts.q, parts.v)) <= touch.rest
+    varies = np.array([callable(e) for _, e in equations.system.restitution], bool)
+    loose = jnp.where(touch.hits & varies, jnp.finfo(parts.q.dtype).tiny, 0)  # they depart as e grows
+    return touch.near & ~touch.opening & rests, loose
+
+
+class Resting(NamedTuple):
+    """Friction where its modes end: which elements are at rest, which of these break away, and σ of those that slip; whether all whose
+    modes have ended are at rest.
+    """
+
+    at_rest: Bool[Array, " e"]
+    breaking: Bool[Array, " e"]
+    sigma: Float[Array, " r"]
+    fine: Bool[Array, ""]
+
+
+def friction_at(elements: FrictionElements, t, parts: Parts, of_friction, of_velocities, moved, anew) -> Resting:
+    """Of the modes `of_friction` that end; `anew`: whether what slides and sticks follows from the motion alone, as behind an impact."""
+    stuck, slow = sticking(elements, parts.sigma) | (parts.held > 0), _slow(elements, t, parts, of_velocities, moved)
+    slip = elements.slip(t, parts.q, parts.v)
+    size = elements.norms(slip)[elements.element_of_row]
+    at_rest = jnp.where(anew, slow | elements.is_quasistatic, stuck | of_friction | (slow & ~elements.driven))
+    breaking = jnp.where(anew, elements.is_quasistatic & ~stuck, of_friction & stuck)  # at its bound: the forces tell where it goes on
+    along = jnp.where(anew, slip / jnp.where(size > 0, size, 1), parts.sigma)
+    return Resting(at_rest, breaking, along, jnp.all(~of_friction | stuck | slow) | anew)
+
+
+def with_closed(t, parts: Parts, touch: Touch, closed: Bool[Array, " c"]) -> Parts:
+    """The state with these contacts closed, each of which changed now, if not by an impact."""
+    changes = ((parts.closed > 0.5) != closed) & ~touch.hits
+    return parts._replace(closed=closed.astype(parts.q.dtype), changed=jnp.where(changes, t, parts.changed))
+
+
 def behind_contact(equations: EquationsOfMotion, t, parts: Parts, args: Arguments, of_friction, of_contact, errors, anew=False, moved=None):
     """y behind the end of modes of friction and contact; `errors` of positions and velocities, within which contacts touch and slip rests;
     `moved`: slip that is rounding of the time as well, where that is known.
@@ -204,49 +291,31 @@ def behind_contact(equations: EquationsOfMotion, t, parts: Parts, args: Argument
     `anew`: whether what slides and what sticks follows from the motion alone, as it does behind an impact.
     """
     flat, _, elements = equations.mode(t, parts, args)
-    closed, q, before = parts.closed > 0.5, parts.q, parts.v
-    scales = gap_scales(flat, t, q, before, errors[0], roundings_beside(flat, t, q, before)[1])
-    near = closed | of_contact | (jax.lax.stop_gradient(flat.gaps(t, q)) <= scales.gap)
-    opening = of_contact & closed
-    hits = near & ~opening & (gap_rates(flat, t, q, before) < -scales.rate)
-    is_impact = jnp.any(hits)
-    duration, own = (jnp.inf, jnp.abs(q)) if args.scales is None else (args.scales.duration, args.scales.of_q)
-    speed = jnp.maximum(-gap_rates(flat, t, q, before), 0)
-    is_low = speed * (t - parts.changed) / 4 <= LOW * gap_scales(flat, t, q, before, roundings(q, own), before).gap
-    ratio, remaining, converged = _last_impacts(t, parts, hits & of_contact, is_low, duration)
-    e = jnp.where(converged, 0, flat.restitution(t, speed))
+    closed, before = parts.closed > 0.5, parts.v
+    touch = touching_at(equations, flat, t, parts, args, of_contact, errors[0])
+    is_impact = jnp.any(touch.hits)
 
     def struck():
-        there = on_contact(flat, t, q, before, closed | hits)
-        return there, impact(flat, elements, t, there, before, near & ~opening, e)
+        there = on_contact(flat, t, parts.q, before, closed | touch.hits)
+        return there, impact(flat, elements, t, there, before, touch.near & ~touch.opening, touch.e)
 
-    q, found = jax.lax.cond(is_impact, struck, lambda: (q, no_impact(flat, elements, before)))
-    if equations.works:
-        does = jnp.stack([jnp.asarray(found.works.get(name, 0.0), before.dtype) for name in equations.works])
-        parts = parts._replace(works=parts.works + does)
-    impulses = found.impulses * jnp.where(converged, (1 + ratio) / jnp.where(converged, 1 - ratio, 1), 1)
-    parts = parts._replace(q=q, v=found.v, **_counted(t, parts, hits, opening, impulses, jnp.where(converged, remaining, 0)))
-    resting = near & ~opening & (jnp.abs(gap_rates(flat, t, q, found.v)) <= scales.rate)
-    varies = [callable(e) for _, e in equations.system.restitution]
-    loose = jnp.where(hits & jnp.array(varies), jnp.finfo(q.dtype).tiny, 0) if any(varies) else None  # they depart as e grows
+    q, found = jax.lax.cond(is_impact, struck, lambda: (parts.q, no_impact(flat, elements, before)))
+    parts = behind_impact(equations, t, parts._replace(q=q), touch, found)
+    resting, loose = resting_at(equations, flat, t, parts, touch)
+    fine, consistent = jnp.array(True), found.consistent
     if elements is None:
-        chosen = select_closed(flat, t, q, found.v, resting, loose)
-        slow = stuck = jnp.ones_like(of_friction)
+        chosen = select_closed(flat, t, q, parts.v, resting, loose)
+        chosen_closed, consistent = chosen.closed, consistent & chosen.consistent
     else:
-        stuck, slow = sticking(elements, parts.sigma) | (parts.held > 0), _slow(elements, t, parts, errors[1], moved)
-        slip = elements.slip(t, q, found.v)
-        size = elements.norms(slip)[elements.element_of_row]
         anew = is_impact | anew | jnp.any(of_contact & ~closed)
-        at_rest = jnp.where(anew, slow | elements.is_quasistatic, stuck | of_friction | (slow & ~elements.driven))
-        breaking = jnp.where(anew, elements.is_quasistatic & ~stuck, of_friction & stuck)  # at its bound: the forces tell where it goes on
-        along = jnp.where(anew, slip / jnp.where(size > 0, size, 1), parts.sigma)
-        among, there = Contacts.of(flat, t, q, found.v, resting, loose), parts.without(errors[1])
-        mode, contacts = select_mode(flat, elements, t, q, there.v, along, at_rest, breaking, among, in_other(equations, t, there, args))
-        chosen = Chosen(contacts.closed, mode, mode.consistent)
+        at_rest, breaking, along, fine = friction_at(elements, t, parts, of_friction, errors[1], moved, anew)
+        among, there = Contacts.of(flat, t, q, parts.v, resting, loose), parts.without(errors[1])
+        given = q, there.v, along, at_rest, breaking, among
+        mode, contacts = select_mode(flat, elements, t, *given, friction_in=in_other(equations, t, there, args))
+        chosen_closed, consistent = contacts.closed, consistent & mode.consistent
         parts = in_other_mode(elements, parts, mode)
-    parts = parts._replace(closed=chosen.closed.astype(q.dtype), changed=jnp.where((chosen.closed != closed) & ~hits, t, parts.changed))
-    at_rest = jnp.all(~of_friction | stuck | slow) | anew
-    return Change(equations.projected(t, parts.y, args), chosen.consistent & found.consistent, found.dissipates, found.impulsive, at_rest)
+    parts = with_closed(t, parts, touch, chosen_closed)
+    return Change(equations.projected(t, parts.y, args), consistent, found.dissipates, found.impulsive, fine)
 
 
 def _last_impacts(t, parts: Parts, hits, is_low, duration):
@@ -295,14 +364,30 @@ def started(equations: EquationsOfMotion, at: StatesAt, params) -> Start:
     yes = jnp.array(True)
     if equations.contacts:
         errors = roundings_beside(flat, t, parts.q, parts.v)
-        inside = gap_scales(flat, t, parts.q, parts.v, jnp.finfo(parts.q.dtype).eps ** (0.5 - ROUNDING) * errors[0], parts.v).gap
-        is_outside = jnp.all(flat.gaps(t, parts.q) >= -inside)
         of_contact = flat.gaps(t, parts.q) <= 0
         change = behind_contact(equations, t, parts, args, jnp.zeros(equations.elements, bool), of_contact, errors, anew=True)
-        return Start(change.y, change.consistent, yes, is_outside, change.dissipates, change.impulsive)
+        return Start(change.y, change.consistent, yes, _is_outside(flat, t, parts), change.dissipates, change.impulsive)
     if elements is None:
         return Start(parts.y, yes, yes, yes, yes, yes)
     parts = parts._replace(q=returned(flat, elements, t, parts.q, parts.v))
     mode, _ = first_mode(flat, elements, t, parts.q, parts.v, friction_in=in_other(equations, t, parts, args))
     parts = parts._replace(sigma=mode.sigma, held=mode.held.astype(parts.q.dtype))
     return Start(equations.in_new_mode(t, parts.y, args), mode.consistent, ~jnp.any(mode.bound < 0), yes, yes, yes)
+
+
+def unstarted(equations: EquationsOfMotion, at: StatesAt, params) -> Start:
+    """y at the start, whose mode the first step finds: what has no slip is at rest, and contacts are open."""
+    parts, args, t, yes = equations.at_start(at, params), Arguments(params), at.t, jnp.array(True)
+    flat, elements = equations.rubbing(t, parts, args)
+    if equations.elements:
+        _, sigma = slipping(elements, t, parts.q, parts.v)
+        parts = parts._replace(sigma=sigma)
+    is_outside = _is_outside(flat, t, parts) if equations.contacts else yes
+    return Start(parts.y, yes, yes, is_outside, yes, yes)
+
+
+def _is_outside(flat: Flat, t, parts: Parts) -> Bool[Array, ""]:
+    """Whether a start lies in no obstacle, but for the rounding of what put it there."""
+    of_positions, _ = roundings_beside(flat, t, parts.q, parts.v)
+    inside = gap_scales(flat, t, parts.q, parts.v, jnp.finfo(parts.q.dtype).eps ** (0.5 - ROUNDING) * of_positions, parts.v).gap
+    return jnp.all(flat.gaps(t, parts.q) >= -inside)

@@ -21,7 +21,7 @@ from .._program.conditions import computed_first
 from .event_record import records
 from .first_order import EquationsOfMotion
 from .guarantees import verified
-from .integrate import SolverOptions, Variations, in_one_loop, initialised, is_variational, states_at, with_status
+from .integrate import SolverOptions, Variations, begins_in_steps, in_one_loop, initialised, is_variational, states_at, with_status
 from .moments import ContactState, EventState, FrictionState
 from .protocol import Arguments
 from .provenance import Provenance
@@ -81,10 +81,11 @@ class SolutionMap:
     def _solve(self, inputs: Inputs, ts: Array, adjoint: dfx.AbstractAdjoint) -> tuple[Samples, Unchanging]:
         equations, at = self._equations(inputs, ts)
         params, times, tolerances = _counted(inputs, ts), ts - ts[0], inputs.tolerances
-        args = self._arguments(equations, at, inputs, ts)
-        start = initialised(equations, at, args.params, args.scales, self.search)
+        args, reverse = self._arguments(equations, at, inputs, ts), not isinstance(adjoint, dfx.ForwardMode)
+        begins = begins_in_steps(equations, self.options, params, reverse, False)
+        start = initialised(equations, at, args.params, args.scales, self.search, begins)
         if isinstance(adjoint, dfx.ForwardMode) or self.options.adjoint or not is_variational(equations, self.options, None, params):
-            ys, result, stats = states_at(equations, self.options, adjoint, at.t, start.y, times, args, tolerances)
+            ys, result, stats = states_at(equations, self.options, adjoint, at.t, start.y, times, args, tolerances, begins)
         else:
             ys, result, stats = self._accompanied(equations, adjoint, start.y, inputs, ts, args)
         ys, result = with_status(ys, result, start.conditions, (inputs, ts))
@@ -113,7 +114,7 @@ class SolutionMap:
         def initial(inputs):
             at = self._at(inputs, ts)
             args = self._arguments(equations, at, inputs, ts)
-            start = initialised(equations, at, args.params, args.scales, self.search)
+            start = initialised(equations, at, args.params, args.scales, self.search, self._begins(equations, inputs, directions, ts))
             return start.y, start
 
         arguments = lambda inputs: (_first_time(inputs, ts), Arguments(with_second_derivatives(_counted(inputs, ts)), None))
@@ -121,6 +122,11 @@ class SolutionMap:
         for of_order in directions:
             variations = variations.along(of_order, (SinceOrigin(of_order.params, None), None), of_order.t0, arguments)
         return variations
+
+    def _begins(self, equations, inputs: Inputs, directions: tuple[Inputs, ...], ts: Array) -> bool:
+        """Whether the first step finds the mode at the start; not where its time moves, along which y0 is taken in that mode."""
+        stays = all(of_order.t0 is None for of_order in directions)
+        return stays and begins_in_steps(equations, self.options, _counted(inputs, ts), False, True)
 
     def push(self, inputs: Inputs, directions: tuple[Inputs, ...], ts: Array) -> tuple[Any, Unchanging]:
         """The samples and their derivatives along directions, for each order; by the variational equations where they hold."""
@@ -140,7 +146,8 @@ class SolutionMap:
             stats = stats | {"last": (last_t, last_y[(..., *[0] * len(directions))])}
         else:
             along = tuple((SinceOrigin(of_order.params, None), of_order.t0) for of_order in directions)
-            ys, result, stats = in_one_loop(equations, self.options, at.t, y0, times, args, tolerances, directions=along)
+            kind = {"directions": along, "begins": self._begins(equations, inputs, directions, ts)}
+            ys, result, stats = in_one_loop(equations, self.options, at.t, y0, times, args, tolerances, **kind)
         return self._samples_and_variations(equations, inputs, directions, ts, ys, result, stats, start)
 
     def _samples_and_variations(self, equations, inputs, directions, ts, ys, result, stats, start):

@@ -1,5 +1,5 @@
-"""Steps with dry friction in one loop, which holds the equations once: an evaluation serves as a stage of the scheme, as a look at the
-margins of a mode, as the end of a mode, and in the selection of the next one.
+"""Steps with dry friction and contact in one loop, which holds the equations once: an evaluation serves as a stage of the scheme, as a look
+at the margins of a mode, as the end of a mode, and in the selection of the next one.
 
     STAGE   the rates at the stages of a piece of the step    then its end, put back on the constraints
     LOOK    the margins at some times along a piece           then the next times, or where the mode ends, if it does
@@ -7,50 +7,45 @@ margins of a mode, as the end of a mode, and in the selection of the next one.
     SELECT  the friction in a mode that may follow            then another one, or y in that mode, put on its constraints
     TURN    slip rates with each row of σ changed             then the same
 
+and, where there are contacts (`contact_phases`), before each selection
+
+    ALONE   the accelerations without contact                 then the selection, with what counts as rounding of forces
+    STRIKE  the velocities behind an impact                   then its expansion, or the selection of what follows
+
 A turn of the loop evaluates points of one kind, and decides what is next. What is decided is cheap; the projection, which is not, stands
 behind all decisions once.
 """
 
 import dataclasses
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
-import diffrax as dfx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
+from .._mechanics.constrained_acceleration import Impulse
 from .._mechanics.friction_elements import FrictionElements
 from .._mechanics.slip_direction import asks_for_rates, changed_row, turned_by_rates, without_force
 from .._mechanics.stick_slip import DONE as SELECTED
-from .._mechanics.stick_slip import Friction, ModeSelection
+from .._mechanics.stick_slip import Friction, ModeSelection, sticking
 from .._mechanics.stick_slip import Search as ModeSearch
 from .._model.flat import Flat
 from .._program.conditions import computed_first_with_changes
 from .._program.time_bounds import TimeDependence, time_dependence
 from .first_order import EquationsOfMotion
-from .mode_changes import at_rest_within, in_other_mode, margins
+from .loads import loads_within
+from .mode_changes import AtEnd, at_rest_within, exactly, in_other_mode, margins, margins_of
 from .protocol import Arguments, undifferentiated
 from .runge_kutta import ExplicitRungeKutta, weighted, with_row
-from .split import CHANGE, PHASES, REST, WHOLE, Cut, Piece, Split, next_estimate
+from .split import CHANGE, PHASES, REST, SEEN_LATE, WHOLE, Cut, Piece, Split, next_estimate
 from .state_vector import Parts
 from .step_monitor import CHEBYSHEV, LOOKS, Looks, Monitor, Search, Seen, changes_by_time, reach_of_time, slopes_of_interpolant
-from .stick_slip_solver import StickSlipSolver
+from .wrapped_solver import ProjectedSolver
 
-STAGE, LOOK, END, SELECT, TURN, DONE = range(6)
-
-
-def has_one_evaluation(equations: EquationsOfMotion, solver: Any, reverse: bool, varied: bool) -> bool:
-    """Whether one evaluation serves all: of an explicit scheme, where nothing but friction changes modes, and neither shares of it nor
-    slips that constraints turn or drive are to be found beside.
-
-    Where variations go along, it pays beside constraints and for elements of several rows alone: what is less takes longer to compile.
-    """
-    if varied and not equations.system.constraints and equations.rows == equations.elements:
-        return False
-    other = equations.contacts or equations.events or equations.sided
-    plain = equations.formulation.stabilisation.feedback() is None and not equations.entangled
-    return bool(isinstance(solver, ExplicitRungeKutta) and equations.elements and plain and not other and not reverse)
+STAGE, LOOK, END, SELECT, ALONE, STRIKE, TURN, DONE = range(8)
+BEGIN = -1  # the phase before those of a step, in which the motion has no mode yet
 
 
 class Point(NamedTuple):
@@ -100,6 +95,21 @@ class Turn(NamedTuple):
     split: Split
     watch: Watch
     choice: Choice
+    change: Any = None  # of contacts
+    begun: Any = None  # where motions begin here
+
+
+class Begun(NamedTuple):
+    """The start of a motion in the mode that holds there, and what loads make of velocities; whether the mode is consistent, no bound is
+    negative, and an impact there takes energy and follows from impulses.
+    """
+
+    y: Array
+    loads: Array
+    consistent: Any
+    bounded: Any
+    dissipates: Any
+    impulsive: Any
 
 
 class Decision(NamedTuple):
@@ -111,38 +121,30 @@ class Decision(NamedTuple):
     y: Any
 
 
-class OneEvaluationSolver(StickSlipSolver):
-    """A `StickSlipSolver` of an explicit scheme, all of whose evaluations are those of one loop."""
-
-    def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
-        rate, is_new = solver_state
-        done = _Step.of(self, t0, t1, y0, args).run(rate, made_jump | is_new)
-        ended, ok = done.split.seen.ended, dfx.RESULTS.successful
-        first = jax.tree.map(lambda cut, whole: jnp.where(ended, cut, whole), done.split.first, done.piece)
-        split = done.split._replace(first=first._replace(result=ok), second=done.piece._replace(result=ok))
-        y1, error, dense, rate, result = self._joined(split, t0, t1, y0, args)
-        return y1, error, dense, (rate, jnp.array(False)), result
-
-
 @dataclasses.dataclass(frozen=True)
-class _Step:
+class Step:
     """One step from t0 to t1."""
 
-    solver: OneEvaluationSolver
+    solver: ProjectedSolver
     t0: Any
     t1: Any
     y0: Any
     args: Arguments
     of_time_alone: TimeDependence | None
+    begins: Any = None  # whether the motion does, in a mode that has yet to be found
+    patience = 0  # turns of a selection beyond those in which friction is agreed on, if it is at all
 
     @classmethod
-    def of(cls, solver: OneEvaluationSolver, t0, t1, y0, args: Arguments) -> "_Step":
+    def of(cls, solver: ProjectedSolver, t0, t1, y0, args: Arguments, begins: Any = None) -> "Step":
         t, y, still = undifferentiated((t0, y0, args))
-        return cls(solver, t0, t1, y0, args, time_dependence(lambda t, y: margins(solver.equations, t, y, still, y), t, y))
+        equations = solver.equations
+        assert isinstance(equations, EquationsOfMotion)  # as `has_one_evaluation` has it
+        return cls(solver, t0, t1, y0, args, time_dependence(lambda t, y: margins(equations, t, y, still, y), t, y), begins)
 
     @property
     def equations(self) -> EquationsOfMotion:
         """Those of the motion."""
+        assert isinstance(self.solver.equations, EquationsOfMotion)  # as `has_one_evaluation` has it
         return self.solver.equations
 
     @property
@@ -150,6 +152,11 @@ class _Step:
         """The explicit scheme."""
         assert isinstance(self.solver.solver, ExplicitRungeKutta)  # as `has_one_evaluation` has it
         return self.solver.solver
+
+    @property
+    def phases(self) -> Array:
+        """Those of a step."""
+        return jnp.asarray(SEEN_LATE if self.equations.contacts else PHASES)
 
     @property
     def may_turn(self) -> bool:
@@ -162,19 +169,35 @@ class _Step:
 
     def _start(self, rate, made_jump) -> Turn:
         y0, no, none = self.y0, jnp.array(False), jnp.zeros(self.equations.elements, bool)
+        modes = self.equations.modes
         t0, t1 = (jnp.asarray(t, y0.dtype) for t in (self.t0, self.t1))
-        size, rows, margins = len(self.scheme.tableau.c), self.equations.rows, jnp.zeros(none.size, y0.dtype)
+        size, rows, margins = len(self.scheme.tableau.c), self.equations.rows, jnp.zeros(modes, y0.dtype)
         stages = jnp.concatenate([rate[None], jnp.zeros((size - 1, *rate.shape), rate.dtype)])
-        piece = _zeros(jax.eval_shape(self._finished, y0, stages, t1 - t0))
+        piece = zeros(jax.eval_shape(self._finished, y0, stages, t1 - t0))
         start, end, stages, piece = _moving((t0, t1, stages, piece), y0)
-        split = Split(piece, piece, Cut(end, end, y0, no, no, no, no), Seen(no, no, no, t1, margins))
-        looks, steepness = jnp.zeros((LOOKS + 1, 2 * none.size), y0.dtype), jax.eval_shape(self._steepness, piece, t0, t1)
-        watch = Watch(self._monitor(t0, t1).start(y0.dtype), jnp.zeros(LOOKS + 1, y0.dtype), looks, (t0, t1, looks), _zeros(steepness))
-        search = _zeros(jax.eval_shape(lambda: self._selection(y0, t0, none, none)[0].start()))
+        yes = jnp.array(True)
+        split = Split(piece, piece, Cut(end, end, y0, no, yes, yes, no), Seen(no, no, no, t1, margins))
+        looks, steepness = jnp.zeros((LOOKS + 1, 2 * modes), y0.dtype), jax.eval_shape(self._steepness, piece, t0, t1)
+        watch = Watch(self._monitor(t0, t1).start(y0.dtype), jnp.zeros(LOOKS + 1, y0.dtype), looks, (t0, t1, looks), zeros(steepness))
+        search = zeros(jax.eval_shape(lambda: self._begun(y0, t0)))
         slip_rates = jnp.zeros((rows + 1 if self.may_turn else 0, rows), y0.dtype)
-        choice = Choice(search, none, none, _zeros(self._like().friction), slip_rates)
+        choice = Choice(search, none, none, zeros(self._like().friction), slip_rates)
         first = jnp.where(made_jump, 0, 1)
-        return Turn(jnp.array(STAGE), first, jnp.array(0), start, end, y0, stages, piece, split, watch, choice)
+        turn = Turn(jnp.array(STAGE), first, jnp.array(0), start, end, y0, stages, piece, split, watch, choice, self._unchanged())
+        if self.begins is None:
+            return turn
+        kind, phase, first = (jnp.where(self.begins, a, b) for a, b in ((END, STAGE), (BEGIN, 0), (0, first)))
+        piece = piece._replace(y=jnp.where(self.begins, y0, piece.y))
+        end, begun = jnp.where(self.begins, start, end), Begun(y0, jnp.zeros(self.equations.size, y0.dtype), yes, yes, yes, yes)
+        return turn._replace(kind=kind, phase=phase, first=first, end=end, piece=piece, begun=begun)
+
+    def _begun(self, y, t) -> ModeSearch:
+        """A search for the mode at a state, in shapes."""
+        none = jnp.zeros(self.equations.elements, bool)
+        return self.selection(y, t, none, none)[0].start()
+
+    def _unchanged(self) -> Any:
+        """What is known of contacts before any changes: there are none."""
 
     def _like(self) -> Point:
         """What an evaluation gives, in shapes."""
@@ -183,12 +206,16 @@ class _Step:
     def _turned(self, turn: Turn) -> Turn:
         """The points up to the next decision, the decision, and what it puts back on the constraints."""
         turn, point = self._evaluated(turn)
-        kind = jnp.minimum(turn.kind, SELECT)
-        turn, projects, t, y = jax.lax.switch(kind, [self._stages_done, self._looked, self._at_end, self._selected], turn, point)
+        kind = jnp.where(turn.kind == TURN, SELECT, turn.kind)
+        turn, projects, t, y = jax.lax.switch(kind, self.decisions, turn, point)
         projected = self.solver.projected
         assert projected is not None  # there is friction
         y = jax.lax.cond(projects, lambda: projected(t, y, self.args), lambda: y)
         of_piece, of_cut = projects & (kind == STAGE), projects & (kind == SELECT)
+        if turn.begun is not None:
+            begins = of_cut & (turn.phase == BEGIN + 1)
+            y = jnp.where(begins, self._without_works(y), y)
+            turn = turn._replace(begun=turn.begun._replace(y=jnp.where(begins, y, turn.begun.y)))
         piece, cut = turn.piece, turn.split.cut
         piece = piece._replace(
             y=jnp.where(of_piece, y, piece.y),
@@ -196,14 +223,33 @@ class _Step:
             dense=piece.dense | {"y1": jnp.where(of_piece, y, piece.dense["y1"])},
         )
         split = turn.split._replace(cut=cut._replace(y=jnp.where(of_cut, y, cut.y)))
-        return turn._replace(piece=piece, split=split, y0=jnp.where(of_cut, y, turn.y0))
+        turn = turn._replace(piece=piece, split=split, y0=jnp.where(of_cut, y, turn.y0))
+        turn = self.put(turn, projects & (kind == END), y)
+        return self.unless_far(turn, (kind == STAGE) & (turn.kind == LOOK))
+
+    def _without_works(self, y):
+        """y with works that are counted from here on."""
+        return self.equations.parts(y)._replace(works=jnp.zeros(len(self.equations.works), y.dtype)).y
+
+    @property
+    def decisions(self) -> list[Callable]:
+        """What is decided where points have been evaluated, in the order of their kinds."""
+        return [self._stages_done, self._looked, self._at_end, self._selected]
+
+    def put(self, turn: Turn, there, y) -> Turn:
+        """With y, if it was put on the constraints where a mode ends."""
+        return turn
+
+    def unless_far(self, turn: Turn, looks) -> Turn:
+        """Done, where it is known without looking along a piece that no mode ends on it."""
+        return turn
 
     def _evaluated(self, turn: Turn) -> tuple[Turn, Point]:
         """The rates at stages, margins along a piece, or the friction at its end in a mode that is asked about; and the last point."""
         _, c, weights = map(jnp.asarray, self.scheme.stages(turn.y0.dtype))
-        count = jnp.array([len(c), LOOKS + 1, 1, 1, self.equations.rows + 1])[turn.kind]
-        h, path, ts, asks = turn.end - turn.start, self._path(turn.piece, turn.start, turn.end), turn.watch.ts, turn.kind >= SELECT
-        asked = self._asked(turn)
+        count = jnp.array([len(c), LOOKS + 1, 1, 1, 1, 1, self.equations.rows + 1])[turn.kind]
+        h, path, ts, asks = turn.end - turn.start, self.path(turn.piece, turn.start, turn.end), turn.watch.ts, turn.kind >= SELECT
+        asked, impulse = self.asked(turn), self.impulse(turn)
 
         def evaluated(carry):
             k, stages, values, slip_rates, _ = carry
@@ -213,42 +259,54 @@ class _Step:
             t, y = (jnp.where(turn.kind == STAGE, a, jnp.where(turn.kind == LOOK, b, c)) for a, b, c in of_three)
             t, y = computed_first_with_changes((t, y), turn.end)
             parts = self.equations.parts(y)
-            point = computed_first_with_changes(Point(*self.equations.rates_and_friction(t, parts, self.args)), t)
-            seen, slip_rate = jax.lax.stop_gradient((self._margins(parts, point.friction), point.friction.slip_rate))
+            point = computed_first_with_changes(
+                Point(*self.equations.rates_and_friction(t, parts, self.args, impulse, turn.kind != STAGE)), t
+            )
+            seen, slip_rate = jax.lax.stop_gradient((self._margins(t, parts, point.friction), point.friction.slip_rate))
             stages = jnp.where(turn.kind == STAGE, with_row(stages, point.rates, k), stages)
             values = jnp.where(turn.kind == LOOK, with_row(values, seen, k), values)
             if self.may_turn:
                 slip_rates = jnp.where(asks, with_row(slip_rates, slip_rate, k), slip_rates)
             return k + 1, stages, values, slip_rates, point
 
-        start = turn.first, turn.stages, turn.watch.values, turn.choice.slip_rates, _moving(_zeros(self._like()), turn.y0)
+        start = turn.first, turn.stages, turn.watch.values, turn.choice.slip_rates, _moving(zeros(self._like()), turn.y0)
         _, stages, values, slip_rates, point = jax.lax.while_loop(lambda carry: carry[0] < count, evaluated, start)
         watch, choice = turn.watch._replace(values=values), turn.choice._replace(slip_rates=slip_rates)
         return turn._replace(stages=stages, watch=watch, choice=choice), point
 
-    def _asked(self, turn: Turn):
+    def impulse(self, turn: Turn) -> Impulse | None:
+        """The impact that is asked about, if there are contacts."""
+
+    def asked(self, turn: Turn) -> Callable:
         """y at the end of a piece in the mode that is asked about, with row k − 1 of σ changed."""
-        selection, there = self._selection(turn.piece.y, turn.end, turn.choice.at_rest, turn.choice.breaking)
+        selection, there = self.selection(turn.piece.y, turn.end, turn.choice.at_rest, turn.choice.breaking)
         freed, *_ = selection.kinds(turn.choice.search)
         sigma = without_force(selection.elements, turn.choice.search.mode.sigma, freed)
-        changed = lambda k: sigma + changed_row(k - 1, sigma.size, sigma.dtype) if self.may_turn else sigma
-        return lambda k: there._replace(sigma=changed(k)).y
+        return lambda k: there._replace(sigma=self.changed(sigma, k)).y
 
-    def _margins(self, parts: Parts, found: Friction):
-        """Of the elements, and their bounds."""
-        return jnp.concatenate([jnp.where(parts.held > 0, 1, found.margin), found.bound])
+    def changed(self, sigma, k) -> Array:
+        """σ with row k − 1 changed, where there are elements of several rows."""
+        return sigma + changed_row(k - 1, sigma.size, sigma.dtype) if self.may_turn else sigma
 
-    def _path(self, piece: Piece, start, end):
+    def _margins(self, t, parts: Parts, found: Friction):
+        """Of elements and contacts, and bounds."""
+        return margins_of(self.equations, t, parts, self.args, found)
+
+    def path(self, piece: Piece, start, end) -> Callable:
+        """The dense output of a piece."""
         dense, start, end = jax.lax.stop_gradient((piece.dense, start, end))
         return self.scheme.interpolation_cls(t0=start, t1=end, **dense).evaluate
 
     def _monitor(self, start, end) -> Monitor:
         bounded = self.of_time_alone is None or self.of_time_alone.is_bounded
-        return Monitor(self.equations.elements, self.args.scales, *jax.lax.stop_gradient((start, end)), bounded, nodes=CHEBYSHEV)
+        return Monitor(self.equations.modes, self.args.scales, *jax.lax.stop_gradient((start, end)), bounded, nodes=CHEBYSHEV)
+
+    def arriving(self, path: Callable, start, end) -> Callable | None:
+        """Which modes may end between two times along a path, for all that is known of what may be rough."""
 
     def _steepness(self, piece: Piece, start, end):
         """How steeply margins follow what follows the time alone, along a piece."""
-        return jnp.zeros(()) if self.of_time_alone is None else reach_of_time(self.of_time_alone, self._path(piece, start, end), start, end)
+        return jnp.zeros(()) if self.of_time_alone is None else reach_of_time(self.of_time_alone, self.path(piece, start, end), start, end)
 
     def _finished(self, y0, stages, h) -> Piece:
         """A piece of its stages."""
@@ -257,21 +315,20 @@ class _Step:
         counts[: len(self.solver.controlled)] = self.solver.controlled
         return Piece(y1, jnp.where(counts, error, 0), dense, rate, None)
 
-    def _contents(self, t, parts: Parts) -> tuple[Flat, FrictionElements]:
-        flat, elements = self.equations.contents(t, parts, self.args)
-        assert elements is not None  # as `has_one_evaluation` has it
-        return flat, elements
+    def contents(self, t, parts: Parts) -> tuple[Flat, FrictionElements]:
+        """The system and its elements of dry friction."""
+        return self.equations.rubbing(t, parts, self.args)
 
-    def _selection(self, y, t, at_rest, breaking) -> tuple[ModeSelection, Parts]:
+    def selection(self, y, t, at_rest, breaking) -> tuple[ModeSelection, Parts]:
         """The selection of a mode at the end of a piece; and the state there without what is but an error."""
         parts = self.equations.parts(jax.lax.stop_gradient(y))
         t, there = jax.lax.stop_gradient(t), parts.without(self.args.scales.of_velocities(parts.v))
-        return ModeSelection(*self._contents(t, parts), t, parts.q, there.v, parts.sigma, at_rest, breaking), there
+        return ModeSelection(*self.contents(t, parts), t, parts.q, there.v, parts.sigma, at_rest, breaking), there
 
     def _stages_done(self, turn: Turn, point: Point) -> Decision:
         """Stages have become a piece: it is looked along, or the mode may end at its end."""
         piece = self._finished(turn.y0, turn.stages, turn.end - turn.start)
-        phase, monitor = jnp.asarray(PHASES)[turn.phase], self._monitor(turn.start, turn.end)
+        phase, monitor = self.phases[turn.phase], self._monitor(turn.start, turn.end)
         search, looks_along = monitor.start(piece.y.dtype), jnp.where(turn.start < turn.end, LOOK, DONE)
         kind = jnp.where((phase == WHOLE) | (phase == REST), looks_along, END)
         watch = turn.watch._replace(search=search, ts=monitor.times(search))
@@ -281,16 +338,19 @@ class _Step:
         """It was looked along a piece: at other times next, or what was seen is known."""
         (search, ts, values, smooth, steepness), cut = turn.watch, turn.split.cut
         start, end = jax.lax.stop_gradient((turn.start, turn.end))
-        monitor, rest = self._monitor(start, end), jnp.asarray(PHASES)[turn.phase] == REST
+        monitor, rest = self._monitor(start, end), self.phases[turn.phase] == REST
         here = search.low, search.high, values
         smooth = low, high, nodes = jax.tree.map(lambda new, old: jnp.where(search.found, old, new), here, smooth)
         if self.of_time_alone is not None:
             anew = lambda: self._steepness(jax.lax.stop_gradient(turn.piece), start, end)
             steepness = jax.lax.cond(search.rounds == 0, anew, lambda: steepness)
         looks = Looks(values, slopes_of_interpolant(low, high, nodes, ts), changes_by_time(self.of_time_alone, steepness, ts))
-        search = monitor.closer(search, ts, looks)
+        hides = self.arriving(self.path(turn.piece, start, end), start, end)
+        search = dataclasses.replace(monitor, hides=hides).closer(search, ts, looks)
         more, seen = monitor.going_on(search, ~rest), monitor.seen(search)
         fine = more | ~rest | ~(seen.ended | seen.unsure | seen.negative)
+        if not self.equations.elements:
+            fine |= ~cut.consistent  # nothing can follow
         cuts = ~more & ~rest & seen.ended
         cut = cut._replace(usable=cut.usable & fine, estimate=jnp.where(rest, cut.estimate, seen.time))
         kept = jax.tree.map(lambda new, old: jnp.where(rest, old, new), seen, turn.split.seen)
@@ -306,52 +366,94 @@ class _Step:
 
     def _at_end(self, turn: Turn, point: Point) -> Decision:
         """Newton's next step for the time at which the mode ends; after the last, which elements are at rest and which break away."""
-        parts, found = self.equations.parts(turn.piece.y), point.friction
-        value, last = self._margins(parts, found)[: self.equations.elements], jnp.asarray(PHASES)[turn.phase] == CHANGE
-        (_, elements), seen = self._contents(turn.end, parts), turn.split.seen.slope
+        parts, found, end = self.equations.parts(turn.piece.y), point.friction, turn.end
+        value, last = self._margins(end, parts, found)[: self.equations.modes], (self.phases[turn.phase] == CHANGE) | self.at_start(turn)
+        (_, elements), seen = self.contents(end, parts), turn.split.seen.slope
+        seen, of_contacts = jnp.split(seen, [elements.size])
         slides = (elements.norms(parts.sigma) > 0) & (parts.held == 0) & jnp.isfinite(seen) & ~elements.is_quasistatic
         slope = jnp.where(slides, jax.lax.stop_gradient(elements.sums(parts.sigma * found.slip_rate)), seen)  # of a slip, its rate
-        given = turn.end, value, slope, jnp.zeros_like(value)
-        cut, ended, moved = next_estimate(turn.split.cut, *given, (self.t0, self.t1), self.args)
-        at_rest, breaking, stopped = at_rest_within(elements, turn.end, parts, self.args, ended, moved, found.driven)
-        selection, _ = self._selection(turn.piece.y, turn.end, at_rest, breaking)
-        turn = turn._replace(
-            kind=jnp.where(last, SELECT, STAGE),
-            first=jnp.where(last, 0, 1),
+        given = AtEnd(value, slope, jnp.zeros_like(value))
+        if self.equations.contacts:
+            given = exactly(self.equations, end, parts, self.args, value, jnp.concatenate([slope, of_contacts]))
+        cut, ended, moved = next_estimate(turn.split.cut, end, *given, (self.t0, self.t1), self.args)
+        onward = turn._replace(
+            kind=jnp.array(STAGE),
+            first=jnp.array(1),
             phase=turn.phase + ~last,
-            end=jnp.where(last, turn.end, cut.estimate),
+            end=jnp.where(last, end, cut.estimate),
+            split=turn.split._replace(cut=cut),
+        )
+        return self.ended(onward, last, parts, elements, found, ended, moved)
+
+    def at_start(self, turn: Turn) -> Any:
+        """Whether the motion has yet to begin."""
+        return False if self.begins is None else turn.phase == BEGIN
+
+    def ended(self, turn: Turn, last, parts: Parts, elements: FrictionElements, found: Friction, ended, moved) -> Decision:
+        """After the last of Newton's steps, what follows a mode that has ended."""
+        at_rest, breaking, stopped = at_rest_within(elements, turn.end, parts, self.args, ended, moved, found.driven)
+        if self.begins is not None:
+            begins = self.at_start(turn)
+            resting = sticking(elements, parts.sigma)
+            at_rest, breaking = jnp.where(begins, resting, at_rest), jnp.where(begins, False, breaking)
+        selection, _ = self.selection(turn.piece.y, turn.end, at_rest, breaking)
+        cut, choice = turn.split.cut, turn.choice._replace(search=selection.start(), at_rest=at_rest, breaking=breaking)
+        turn = turn._replace(
+            kind=jnp.where(last, SELECT, turn.kind),
+            first=jnp.where(last, 0, turn.first),
             split=turn.split._replace(cut=cut._replace(usable=cut.usable & (stopped | ~last))),
-            choice=turn.choice._replace(search=selection.start(), at_rest=at_rest, breaking=breaking),
+            choice=choice,
         )
         return Decision(turn, jnp.array(False), turn.end, turn.piece.y)
 
     def _selected(self, turn: Turn, point: Point) -> Decision:
         """One more turn of the selection; in the mode that is found the step goes on, to be put on its constraints first."""
         search, at_rest, breaking, kept, slip_rates = turn.choice
-        selection, _ = self._selection(turn.piece.y, turn.end, at_rest, breaking)
+        selection, _ = self.selection(turn.piece.y, turn.end, at_rest, breaking)
+        search, found, more, done = self.onward(selection, turn, point)
+        y = self.in_mode(turn, selection.elements, search).y
+        cut = turn.split.cut
+        cut = cut._replace(consistent=jnp.where(done, search.mode.consistent, cut.consistent))
+        turn = turn._replace(choice=turn.choice._replace(search=search, found=found), split=turn.split._replace(cut=cut))
+        return Decision(self.with_rest(turn, more, done), done, turn.end, y)
+
+    def in_mode(self, turn: Turn, elements: FrictionElements, search: ModeSearch) -> Parts:
+        """The state at the end of a piece in the mode that was found; what holds at the start was not changed to."""
+        before = self.equations.parts(turn.piece.y)
+        after = in_other_mode(elements, before, search.mode)
+        return after._replace(transitions=jnp.where(self.at_start(turn), before.transitions, after.transitions))
+
+    def onward(self, selection: ModeSelection, turn: Turn, point: Point) -> tuple[ModeSearch, Friction, Any, Any]:
+        """The search one turn on, and the friction that was found; whether it asks for slip rates first, and whether it has ended."""
+        search, _, _, kept, slip_rates = turn.choice
         *kinds, breaks = selection.kinds(search)
         found = jax.tree.map(lambda old, new: jnp.where(turn.kind == TURN, old, new), kept, jax.lax.stop_gradient(point.friction))
         given = selection.elements, found, search.mode.sigma
         more = (turn.kind == SELECT) & asks_for_rates(*given, tuple(kinds), search.free_rate)
         onward = selection.next(search, found, *turned_by_rates(*given, slip_rates, tuple(kinds), breaks, search.free_rate))
         search = jax.lax.stop_gradient(jax.tree.map(lambda new, old: jnp.where(more, old, new), onward, search))
-        done = ~more & ((search.stage == SELECTED) | (search.turns >= selection.most))
-        y = in_other_mode(selection.elements, self.equations.parts(turn.piece.y), search.mode).y
-        yes, cut = jnp.array(True), turn.split.cut
-        cut = cut._replace(consistent=jnp.where(done, search.mode.consistent, cut.consistent), dissipates=yes, impulsive=yes)
-        turn = turn._replace(
+        return search, found, more, ~more & ((search.stage == SELECTED) | (search.turns >= selection.most + self.patience))
+
+    def with_rest(self, turn: Turn, more, done) -> Turn:
+        """With the rest of the step next, where the selection is done; what was before is its first piece."""
+        if turn.begun is not None:
+            cut, mode = turn.split.cut, turn.choice.search.mode
+            parts = jax.lax.stop_gradient(self.equations.parts(turn.piece.y))
+            loads = loads_within(*self.contents(turn.end, parts), turn.end, parts, turn.choice.found)
+            found = Begun(turn.begun.y, loads, cut.consistent, ~jnp.any(mode.bound < 0), cut.dissipates, cut.impulsive)
+            begins = done & self.at_start(turn)
+            turn = turn._replace(begun=jax.tree.map(lambda new, old: jnp.where(begins, new, old), found, turn.begun))
+        return turn._replace(
             kind=jnp.where(done, STAGE, jnp.where(more, TURN, SELECT)),
             first=jnp.where(more, 1, 0),
             phase=turn.phase + done,
             start=jnp.where(done, turn.end, turn.start),
             end=jnp.where(done, self.t1, turn.end),
-            split=turn.split._replace(cut=cut, first=turn.piece),
-            choice=turn.choice._replace(search=search, found=found),
+            split=turn.split._replace(first=turn.piece),
         )
-        return Decision(turn, done, turn.start, y)
 
 
-def _zeros(like):
+def zeros(like):
     return jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), like)
 
 

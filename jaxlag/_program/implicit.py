@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from jax.extend import core
 from jaxtyping import Array, Float
 
-from .walker import constants_as_inputs
+from .walker import used_constants
 
 
 def undifferentiated(function: Callable, in_turn: bool = False) -> Callable:
@@ -38,8 +38,9 @@ def open_function(function: Callable, *given: Any) -> tuple[Callable, list[Array
     `jax.closure_convert` leaves truth values and integers closed over, and a rule of derivatives must hold none that is traced.
     """
     closed, shape = jax.make_jaxpr(function, return_shape=True)(*given)
-    run = core.jaxpr_as_fun(core.ClosedJaxpr(constants_as_inputs(closed), ()))
-    numbers = [jnp.asarray(x) for x in closed.consts]
+    program, used = used_constants(closed)
+    run = core.jaxpr_as_fun(core.ClosedJaxpr(program, ()))
+    numbers = [jnp.asarray(x) for x in used]
     counts = [jnp.issubdtype(x.dtype, jnp.integer) or jnp.issubdtype(x.dtype, jnp.bool_) for x in numbers]
 
     def opened(*given_and_more):

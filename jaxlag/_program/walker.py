@@ -49,6 +49,14 @@ def constants_as_inputs(closed: Any) -> Any:
     return closed.jaxpr.replace(constvars=[], invars=[*closed.jaxpr.constvars, *closed.jaxpr.invars])
 
 
+def used_constants(closed: Any) -> tuple[Any, list[Any]]:
+    """The same, with those constants alone that an output depends on; and these."""
+    jaxpr, count = constants_as_inputs(without_unused(closed)), len(closed.consts)
+    needed = [False] * count + [True] * (len(jaxpr.invars) - count)
+    jaxpr, used = pe.dce_jaxpr(jaxpr, [True] * len(jaxpr.outvars), instantiate=needed)
+    return jaxpr, [x for x, is_used in zip(closed.consts, used, strict=False) if is_used]
+
+
 def called_program(equation: Any) -> Any:
     """The program that an equation calls, closed."""
     p = equation.params
@@ -121,5 +129,23 @@ def used_arguments(function: Callable, *arguments: Any) -> Any:
 
 def without_unused(closed: Any) -> Any:
     """A closed program without the operations, and the operands of branches and loops, that no output depends on."""
-    jaxpr, _ = pe.dce_jaxpr(closed.jaxpr, [True] * len(closed.jaxpr.outvars), instantiate=True)
+    jaxpr = closed.jaxpr
+    if any(equation.primitive.name == "while" for equation in jaxpr.eqns):  # JAX itself leaves those of a loop that ends by itself
+        jaxpr = jaxpr.replace(eqns=[_with_used_constants(e) if e.primitive.name == "while" else e for e in jaxpr.eqns])
+    jaxpr, _ = pe.dce_jaxpr(jaxpr, [True] * len(jaxpr.outvars), instantiate=True)
     return closed.replace(jaxpr=jaxpr)
+
+
+def _with_used_constants(loop: Any) -> Any:
+    """A loop with those constants alone that its condition and its body use."""
+    parts, operands, constants = [], list(loop.invars), []
+    for name, count in (("cond_jaxpr", "cond_nconsts"), ("body_jaxpr", "body_nconsts")):
+        number, program = loop.params[count], without_unused(loop.params[name])
+        jaxpr, used = pe.dce_jaxpr(
+            program.jaxpr, [True] * len(program.jaxpr.outvars), instantiate=[False] * number + [True] * len(loop.outvars)
+        )
+        parts.append((name, program.replace(jaxpr=jaxpr), count, sum(used[:number])))
+        constants += [x for x, is_used in zip(operands[:number], used, strict=False) if is_used]
+        operands = operands[number:]
+    params = loop.params | {key: value for name, program, count, number in parts for key, value in ((name, program), (count, number))}
+    return loop.replace(invars=[*constants, *operands], params=params)

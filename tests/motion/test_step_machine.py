@@ -43,6 +43,20 @@ SYSTEMS = {
         holonomic={"wire": lambda q: q[1] - 0.3 * q[0] ** 2},
         force=driven,
     ),
+    "on a floor": jl.System(
+        spring,
+        dissipation=lambda qdot, multipliers, F: F * jnp.abs(qdot[1] - qdot[0]) + 0.3 * multipliers["floor"] * jnp.abs(qdot[0]),
+        unilateral={"floor": jl.Contact(lambda q: q[1], 0.6)},
+        force=driven,
+    ),
+    "between walls": jl.System(
+        spring,
+        unilateral={
+            "left": jl.Contact(lambda q, c: q[0] + 0.3 * q[1], 0.5, jl.PoissonRestitution()),
+            "right": jl.Contact(lambda q, A, c: A / c - q[1], 0.7),
+        },
+        force=driven,
+    ),
 }
 
 
@@ -53,6 +67,10 @@ def state(name, rng):
         v = v[0] * np.array([-q[1], q[0]])
     if name == "on a wire":
         q[1], v[1] = 0.3 * q[0] ** 2, 0.6 * q[0] * v[0]
+    if name == "on a floor":
+        q[1] = max(q[1], 0)  # half of them touch it
+    if name == "between walls":
+        q = np.array([0.5, -0.5])
     return q, v * rng.integers(2)
 
 
@@ -68,13 +86,16 @@ def motions(name, units, count):
         yield motion(length * q, length / time * v, params)
 
 
-@pytest.mark.parametrize(("name", "units"), [("two elements", (1e-6, 1e-3)), ("beside a slider", (1e3, 1e-6)), ("on a rod", (1.0, 1.0))])
+@pytest.mark.parametrize(
+    ("name", "units"),
+    [("two elements", (1e-6, 1e-3)), ("beside a slider", (1e3, 1e-6)), ("on a rod", (1.0, 1.0)), ("on a floor", (1e-6, 1e-3))],
+)
 def test_motions_are_those_of_a_loop_for_each_purpose(name, units, monkeypatch):
     _compare(name, units, monkeypatch, 12)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["in a plane", "on a wire", "two elements", "beside a slider"])
+@pytest.mark.parametrize("name", ["in a plane", "on a wire", "two elements", "beside a slider", "between walls"])
 def test_more_motions_are_those_of_a_loop_for_each_purpose(name, monkeypatch):
     _compare(name, (1.0, 1.0), monkeypatch, 60)
 
@@ -90,10 +111,21 @@ def _compare(name, units, monkeypatch, count):
         assert one.result == other.result == jl.results.RESULTS.successful
         scale = np.max(np.abs(other.q), initial=units[0] * 1e-3)
         np.testing.assert_allclose(one.q, other.q, atol=1e-6 * scale)
-        sliding += int(np.sum(other.stats["transitions"][-1]))
+        impacts = [np.max(contact.impacts) for contact in other.contacts.values()]
+        sliding += int(np.sum(other.stats.get("transitions", np.zeros(1))[-1]) + sum(impacts))
     ratios = [int(one.stats["num_steps"]) / int(other.stats["num_steps"]) for one, other in zip(found, expected, strict=True)]
     assert np.median(ratios) <= 1.03
     assert sliding > count / 4  # modes have changed
+
+
+def test_where_all_times_are_the_same_there_is_the_start():
+    """Behind the impact there, and in the mode that holds."""
+    ball = jl.System(lambda q, qdot, g: 0.5 * qdot**2 - g * q, unilateral={"floor": jl.Contact(lambda q: q, 0.8)})
+    motion = jax.jit(lambda v, ts: jl.simulate(ball, 0.0, v, ts, {"g": 9.81}, throw=False))
+    once, twice = jnp.array([1.0, 1.0]), jnp.array([1.0, 2.0])
+    np.testing.assert_allclose(motion(-1.0, once).qdot, 0.8, rtol=1e-14)
+    np.testing.assert_allclose(motion(0.0, once).multipliers["floor"], 9.81, rtol=1e-14)
+    np.testing.assert_allclose(motion(-1.0, twice).qdot[0], 0.8, rtol=1e-14)
 
 
 @pytest.mark.slow

@@ -1,0 +1,226 @@
+"""Contacts in the loop of `step_machine`: what happens where one closes or opens.
+
+END      a contact is struck: q is put on it
+ALONE    what counts as rounding of impulses                 then which contacts and what friction take part: SELECT
+STRIKE   the velocities behind it, by Poisson's law twice
+ALONE    what counts as rounding of forces                   then which contacts stay closed, and what sticks: SELECT
+"""
+
+import dataclasses
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from .._mechanics.constrained_acceleration import Impulse
+from .._mechanics.contact import Contacts, gap_rates, roundings_beside, scales_of
+from .._mechanics.friction_elements import FrictionElements
+from .._mechanics.impact import Phase, Rubbing, of_compression, of_expansion, of_impulses, phase_behind, together
+from .._mechanics.slip_direction import without_force
+from .._mechanics.stick_slip import Friction, ModeSelection
+from .._mechanics.stick_slip import Search as ModeSearch
+from .._model.flat import rows_by_name
+from .mode_changes import Touch, approach, behind_impact, friction_at, resting_at, touching_at, with_closed
+from .state_vector import Parts
+from .step_machine import ALONE, DONE, SELECT, STRIKE, Decision, Point, Step, Turn, zeros
+
+MOTION, COMPRESSION, EXPANSION = range(3)
+
+
+class Change(NamedTuple):
+    """Where modes end: the phase, of an impact or of none; y on its way to the next mode; which modes have ended, and what slip is rounding
+    of the time; what touches; the impact that is asked about, how much of it is rounding, and what it has done so far.
+    """
+
+    phase: Any
+    y: Array
+    ended: Bool[Array, " m"]
+    moved: Float[Array, " m"]
+    touch: Touch
+    impulse: Impulse
+    loose: Float[Array, "2 c"]
+    total: Phase
+
+    @property
+    def is_impact(self) -> Bool[Array, ""]:
+        """Whether velocities are to jump."""
+        return self.phase != MOTION
+
+
+@dataclasses.dataclass(frozen=True)
+class ContactStep(Step):
+    """A step of a motion with contacts, with friction or without."""
+
+    patience = 2  # then a contact that pulls opens, whether friction is agreed on or not
+
+    @property
+    def decisions(self) -> list:
+        """Those of a step, and those of contacts."""
+        return [*super().decisions, self._alone, self._struck]
+
+    def _unchanged(self) -> Change:
+        y, elements, modes = self.y0, self.equations.elements, self.equations.modes
+        number, none = jnp.zeros(self.equations.contacts, y.dtype), jnp.zeros(self.equations.contacts, bool)
+        touch = Touch(none, none, none, none, number, number, number, number)
+        flat, friction = self.contents(self.t0, self.equations.parts(y))
+        terms = (*rows_by_name(flat), *(friction.rows_of_term if elements else ()))
+        zero, yes = jnp.zeros((), y.dtype), jnp.array(True)
+        total = Phase(y[: self.equations.size], number, dict.fromkeys(terms, zero), yes, yes, zero, zero)
+        impulse, loose = Impulse(number, number, jnp.array(False)), jnp.stack([number, number])
+        return Change(jnp.array(MOTION), y, jnp.zeros(modes, bool), jnp.zeros(modes, y.dtype), touch, impulse, loose, total)
+
+    def _begun(self, y, t) -> ModeSearch:
+        none = jnp.zeros(self.equations.elements, bool)
+        selection, _ = self.selection(y, t, none, none)
+        number = jnp.zeros(self.equations.contacts, y.dtype)
+        return selection.start(Contacts(number > 0, number > 0, jnp.array(0), number, number))
+
+    def impulse(self, turn: Turn) -> Impulse:
+        """The impact that is asked about."""
+        return turn.change.impulse._replace(happens=turn.change.is_impact & (turn.kind >= SELECT))
+
+    def arriving(self, path, start, end):
+        """Which gaps may close, by bounds of them along the path."""
+        return approach(self.equations, path, start, end, self.args).may_arrive
+
+    def asked(self, turn: Turn):
+        """y on its way, in the mode and with the contacts that are asked about; alone, without friction and contacts."""
+        search, kind = turn.choice.search, turn.kind
+        selection, there = self._selection_in(turn)
+        moving = self.equations.parts(turn.change.y)
+        q, v = jax.tree.map(
+            lambda of_all, of_search: jnp.where(kind == STRIKE, of_all, of_search), (moving.q, moving.v), (there.q, there.v)
+        )
+        freed, *_ = selection.kinds(search)
+        alone, none = (kind == ALONE) & jnp.ones_like(freed), jnp.zeros_like(there.closed)
+        sigma = without_force(selection.elements, search.mode.sigma, jnp.where(kind == STRIKE, False, freed | alone))
+        there = moving._replace(q=q, v=v, closed=jnp.where(kind == ALONE, none, search.contacts.closed))
+        return lambda k: there._replace(sigma=self.changed(sigma, k)).y
+
+    def _selection_in(self, turn: Turn) -> tuple[ModeSelection, Parts]:
+        """The selection of a mode on the way to the next: of an impact, which begins from rest, or of the motion."""
+        change, impulse = turn.change, self.impulse(turn)
+        parts = jax.lax.stop_gradient(self.equations.parts(change.y))
+        selection, there = self.selection(change.y, turn.end, turn.choice.at_rest, turn.choice.breaking)
+        v, sigma = (jnp.where(change.is_impact, a, b) for a, b in ((parts.v, there.v), (jnp.zeros_like(parts.sigma), parts.sigma)))
+        impulse = jax.lax.stop_gradient(impulse._replace(happens=change.is_impact))
+        return dataclasses.replace(selection, v=v, sigma=sigma, impulse=impulse), there._replace(v=v)
+
+    def ended(self, turn: Turn, last, parts: Parts, elements: FrictionElements, found: Friction, ended, moved) -> Decision:
+        """After the last of Newton's steps: what is struck, and is put there."""
+        flat, _ = self.contents(turn.end, parts)
+        of_positions, at_start = self.args.scales.of_positions(parts.q), self.at_start(turn)
+        if self.begins is not None:
+            touching = jnp.concatenate([jnp.zeros(self.equations.elements, bool), flat.gaps(turn.end, parts.q) <= 0])
+            ended, moved = jnp.where(at_start, touching, ended), jnp.where(at_start, 0, moved)
+            of_positions = jnp.where(at_start, roundings_beside(flat, turn.end, parts.q, parts.v)[0], of_positions)
+        _, of_contact = jnp.split(ended, [self.equations.elements])
+        touch = touching_at(self.equations, flat, turn.end, parts, self.args, of_contact, of_positions)
+        is_impact = jnp.any(touch.hits)
+        impulse = of_compression(flat, turn.end, parts.q, parts.v, touch.e)._replace(happens=is_impact)
+        nothing = zeros(turn.change.total)._replace(v=parts.v, consistent=jnp.array(True), impulsive=jnp.array(True))
+        loose = jnp.zeros_like(turn.change.loose)
+        phase = jnp.where(is_impact, COMPRESSION, MOTION)
+        change = Change(phase, turn.piece.y, ended, moved, touch, impulse, loose, nothing)
+        change = jax.tree.map(lambda new, old: jnp.where(last, new, old), change, turn.change)
+        search = jax.tree.map(lambda new, old: jnp.where(last, new, old), self._begun(parts.y, turn.end), turn.choice.search)
+        turn = turn._replace(kind=jnp.where(last, ALONE, turn.kind), first=jnp.where(last, 0, turn.first), change=change)
+        turn = turn._replace(choice=turn.choice._replace(search=search))
+        on_contacts = parts._replace(closed=jnp.maximum(parts.closed, touch.hits.astype(parts.closed.dtype)))
+        return Decision(turn, last & is_impact, turn.end, on_contacts.y)
+
+    def put(self, turn: Turn, there, y) -> Turn:
+        """With q on what is struck."""
+        parts = self.equations.parts(turn.change.y)
+        q = jnp.where(there, self.equations.parts(y).q, parts.q)
+        return turn._replace(change=turn.change._replace(y=parts._replace(q=q).y))
+
+    def unless_far(self, turn: Turn, looks) -> Turn:
+        """Done, where bounds say that all gaps stay open along a piece."""
+        start, end = jax.lax.stop_gradient((turn.start, turn.end))
+        stays_away = approach(self.equations, self.path(turn.piece, start, end), start, end, self.args).stays_away
+        if stays_away is None:
+            return turn
+        is_far = jax.lax.cond(looks, lambda: stays_away(start, end), lambda: jnp.array(False))
+        return turn._replace(kind=jnp.where(is_far, DONE, turn.kind))
+
+    def _alone(self, turn: Turn, point: Point) -> Decision:
+        """What the motion is without contact says what is rounding of forces; with that a selection begins."""
+        change, t, equations = turn.change, turn.end, self.equations
+        parts, before = jax.lax.stop_gradient((equations.parts(change.y), equations.parts(turn.piece.y)))
+        flat, elements = self.contents(t, parts)
+        of_friction, of_contact = jnp.split(change.ended, [equations.elements])
+        anew = jnp.any(change.touch.hits) | jnp.any(of_contact & (before.closed < 0.5))
+        behind = before._replace(q=parts.q, v=parts.v)
+        errors, moved = self.args.scales.of_velocities(parts.v), change.moved[: equations.elements]
+        if self.begins is not None:
+            at_start = self.at_start(turn)
+            anew |= at_start
+            errors = jnp.where(at_start, roundings_beside(flat, t, before.q, before.v)[1], errors)
+        at_rest, breaking, along, fine = friction_at(elements, t, behind, of_friction, errors, moved, anew)
+        resting, loose = resting_at(equations, flat, t, parts, change.touch)
+        everywhere = jnp.ones_like(at_rest)
+        of_impact = change.touch.near & ~change.touch.opening, change.loose, everywhere, ~everywhere
+        of_motion = resting, jnp.stack([loose, jnp.zeros_like(loose)]), at_rest, breaking
+        either = jax.tree.map(lambda new, old: jnp.where(change.is_impact, new, old), of_impact, of_motion)
+        candidates, (loose, least), at_rest, breaking = jax.lax.stop_gradient(either)
+        change = change._replace(y=equations.parts(change.y)._replace(sigma=along).y)
+        turn = turn._replace(change=change, choice=turn.choice._replace(at_rest=at_rest, breaking=breaking))
+        selection, _ = self._selection_in(turn)
+        given = flat, t, parts.q, selection.v, jax.lax.stop_gradient(point.friction.qddot), selection.impulse
+        force, acceleration = jax.lax.stop_gradient(scales_of(*given))
+        force, acceleration = jnp.where(loose > 0, -force - loose, force), jnp.maximum(acceleration, least)
+        search = selection.start(Contacts(candidates, candidates, jnp.array(0), force, acceleration))
+        cut = turn.split.cut
+        cut = cut._replace(usable=cut.usable & (change.is_impact | fine))
+        turn = turn._replace(choice=turn.choice._replace(search=search), split=turn.split._replace(cut=cut))
+        return Decision(turn._replace(kind=jnp.array(SELECT), first=jnp.array(0)), jnp.array(False), t, change.y)
+
+    def _selected(self, turn: Turn, point: Point) -> Decision:
+        """One more turn of the selection; behind one of an impact this strikes, behind that of a motion the step goes on."""
+        change, equations = turn.change, self.equations
+        selection, _ = self._selection_in(turn)
+        search = turn.choice.search
+        search = search._replace(contacts=search.contacts._replace(impulse=selection.impulse))
+        turn = turn._replace(choice=turn.choice._replace(search=search))
+        search, found, more, done = self.onward(selection, turn, point)
+        contacts = search.contacts._replace(impulse=None)
+        most = 4 * equations.contacts + 2 ** min(equations.contacts, 10)
+        done |= ~more & (contacts.turn > most)
+        turn = turn._replace(choice=turn.choice._replace(search=search._replace(contacts=contacts), found=found))
+        parts = self.in_mode(turn, selection.elements, search)
+        modes = {"sigma": parts.sigma, "held": parts.held, "transitions": parts.transitions}
+        parts = with_closed(turn.end, equations.parts(change.y)._replace(**modes), change.touch, contacts.closed)
+        goes_on, strikes, cut = done & ~change.is_impact, done & change.is_impact, turn.split.cut
+        struck = change.total.found
+        flags = {"dissipates": struck.dissipates, "impulsive": struck.impulsive, "consistent": search.mode.consistent & struck.consistent}
+        cut = cut._replace(**{name: jnp.where(goes_on, value, getattr(cut, name)) for name, value in flags.items()})
+        turn = self.with_rest(turn._replace(split=turn.split._replace(cut=cut)), more, goes_on)
+        turn = turn._replace(kind=jnp.where(strikes, STRIKE, turn.kind))
+        return Decision(turn, goes_on, jnp.where(goes_on, turn.start, turn.end), parts.y)
+
+    def _struck(self, turn: Turn, point: Point) -> Decision:
+        """Velocities behind an impact; by Poisson's law expansion follows compression."""
+        change, search, equations = turn.change, turn.choice.search, self.equations
+        parts, t = equations.parts(change.y), turn.end
+        flat, elements = self.contents(t, parts)
+        impulse = change.impulse._replace(happens=True)
+        _, of_impact = of_impulses(flat, elements, t, parts.q, parts.v, impulse)
+        assert of_impact is not None  # as many as there are elements
+        rubbing = Rubbing(elements, of_impact, search.mode.sigma, search.mode.held, point.friction) if equations.elements else None
+        solution = point.friction.qddot, point.friction.multipliers
+        struck = phase_behind(flat, rubbing, t, parts.q, parts.v, impulse, solution, search.mode.consistent)
+        total = together(change.total, struck)
+        expands = jnp.array(any(flat.poisson)) & (change.phase == COMPRESSION)
+        behind = parts._replace(v=total.v)
+        expansion, loose = change.impulse, change.loose
+        if any(flat.poisson):
+            before = gap_rates(flat, t, parts.q, parts.v)
+            expansion, loose = of_expansion(flat, change.impulse, change.touch.e, total.impulses, before)
+        final = behind_impact(equations, t, behind, change.touch, total.found)
+        y = jnp.where(expands, behind.y, final.y)
+        phase = jnp.where(expands, EXPANSION, MOTION)
+        change = change._replace(phase=phase, y=y, impulse=expansion, loose=loose, total=total)
+        turn = turn._replace(kind=jnp.array(ALONE), first=jnp.array(0), change=change)
+        return Decision(turn, jnp.array(False), t, y)
