@@ -32,7 +32,7 @@ REFERENCE = {  # names in `jaxlag`
     "At one state": "acceleration results.Acceleration mass_matrix momentum energy constraint_jacobian constraint_residual "
     "constraint_force powers results.Residual consistent_state examine results.Examination",
     "Motions": "simulate simulate_many results.Trajectory results.FrictionState results.ContactState results.EventState "
-    "results.RESULTS results.Instant results.Interpolated load Dop853 Dopri5 stabilisation.Projection "
+    "stepper results.Stepper results.StepState results.RESULTS results.Instant results.Interpolated load Dop853 Dopri5 stabilisation.Projection "
     "stabilisation.Baumgarte stabilisation.NoStabilisation StickSlip Regularised "
     "keep_compiled",
     "Near a steady state": "equilibrium steady results.Equilibrium linearise results.LinearSystem results.Modes lowest_modes root_locus "

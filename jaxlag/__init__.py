@@ -31,6 +31,7 @@ from ._fit.regress import regress as regress
 from ._motion.simulate import simulate as simulate
 from ._motion.load import load as load
 from ._motion.simulate_many import simulate_many as simulate_many
+from ._motion.stepper import stepper as stepper
 from ._linear.equilibrium import equilibrium as equilibrium, steady as steady
 from ._linear.linearise import linearise as linearise
 from ._linear.root_locus import root_locus as root_locus

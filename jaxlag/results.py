@@ -16,6 +16,7 @@ from ._mechanics.examine import Examination as Examination
 from ._mechanics.lagrange import Residual as Residual
 from ._motion.moments import ContactState as ContactState, EventState as EventState
 from ._motion.results import RESULTS as RESULTS
+from ._motion.stepper import Stepper as Stepper, StepState as StepState
 from ._motion.trajectory import (
     FrictionState as FrictionState,
     Instant as Instant,

@@ -169,6 +169,8 @@ WINGS = {  # each imports only from those above it, and each file of a wing only
         "simulate",
         "members",
         "simulate_many",
+        "step_map",
+        "stepper",
     ],
     "_linear": [
         "origin",

@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from .._model.flat import Flat, variant
@@ -168,15 +169,34 @@ class Contacts(NamedTuple):
         """The system with those that are closed."""
         return in_contact(flat, self.closed)
 
+    @property
+    def size(self) -> int:
+        """How many contacts there are."""
+        return self.closed.size
+
+    @property
+    def choices(self) -> int:
+        """How many there are."""
+        return 2**self.closed.size
+
+    @property
+    def is_long(self) -> Bool[Array, ""]:
+        """Whether contacts have changed so often that they might have begun to repeat themselves."""
+        return self.turn > 4 * self.closed.size + 2 ** min(self.closed.size, 10)
+
+    def chosen(self, number: Any) -> "Contacts":
+        """The choice of this number, all candidates closed in that of zero."""
+        return self._replace(closed=self.candidates & (number & 2 ** np.arange(self.closed.size) == 0))
+
     def unloaded(self, bound: Float[Array, " e"]) -> Bool[Array, " e"]:
         """Which elements no force loads while a contact is open."""
         return (bound == 0) & ~jnp.all(self.closed)
 
     def next(
         self, flat: Flat, t, q, v, qddot, multipliers, agreed: Any = True, hopeless: Any = False
-    ) -> tuple["Contacts", Bool[Array, ""]]:
-        """Other ones, where the friction is `agreed` on and a contact pulls or goes deeper; and whether there was any. If agreement
-        is `hopeless`, what pulls opens as well.
+    ) -> tuple["Contacts", Bool[Array, ""], Float[Array, " c"]]:
+        """Other ones, where the friction is `agreed` on and a contact pulls or goes deeper; whether there was any; how all depart. If
+        agreement is `hopeless`, what pulls opens as well.
         """
         size = len(flat.contacts)
         pull = jnp.where(self.closed & (agreed | hopeless), -contact_rows(flat, multipliers) - self.force, -jnp.inf)
@@ -185,7 +205,7 @@ class Contacts(NamedTuple):
         in_order = jnp.where((pull > 0) | (deeper > 0), size - jnp.arange(size, dtype=v.dtype), 0)
         excess = jnp.where(self.turn > 2 * size, in_order, jnp.where(jnp.any(pull > 0), pull, deeper))
         flips = (jnp.arange(size) == jnp.argmax(excess)) & (excess > 0)
-        return self._replace(closed=self.closed ^ flips, turn=self.turn + 1), jnp.any(flips)
+        return self._replace(closed=self.closed ^ flips, turn=self.turn + 1), jnp.any(flips), departs
 
 
 def accelerated(flat: Flat, t, q, v, impulse: Impulse | None = None) -> SaddlePoint:
@@ -222,7 +242,7 @@ def select_closed(
     def turn(carry):
         contacts, _ = carry
         qddot, multipliers, _ = accelerated(contacts.applied_to(flat), t, q, v, impulse)
-        return contacts.next(flat, t, q, v, qddot, multipliers)
+        return contacts.next(flat, t, q, v, qddot, multipliers)[:2]
 
     most = 4 * len(flat.contacts) + 2 ** min(len(flat.contacts), 10)
     start = Contacts.of(flat, t, q, v, candidates, loose, least, impulse), jnp.any(candidates)

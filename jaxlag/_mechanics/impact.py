@@ -135,7 +135,7 @@ def phase_behind(flat: Flat, rubbing: Rubbing | None, t, q, v, impulse: Impulse,
         lost = found.force @ (elements.slip(t, q, v) + elements.slip(t, q, after))
         rubbed = friction_by_term(of_impact, sigma, held, t, q, v, found)
         twice = bounds(of_impact, sigma, t, q, v, 2 * multipliers[: flat.rows] + impulse.among_rows(flat))
-        impulsive = jnp.all(jnp.abs(twice - 2 * found.bound) <= RISE * (jnp.abs(twice) + jnp.abs(found.bound)))
+        impulsive = ~jnp.any(jnp.abs(twice - 2 * found.bound) > RISE * (jnp.abs(twice) + jnp.abs(found.bound)))
     impulses, departure = contact_rows(flat, multipliers) + impulse.given, gap_rates(flat, t, q, after)
     gained = impulses @ (approach + departure) + lost
     exchanged = jnp.abs(impulses) @ (jnp.abs(approach) + jnp.abs(departure))

@@ -161,15 +161,44 @@ class Search(NamedTuple):
     contacts: Any
     mode: Mode
     turns: Any  # since the contacts changed
+    tried: Any  # of all modes in order, how many were, where a search did not end
+    only: Any  # the number of the first of them that is consistent, if all others that are have the same motion
+    rates: Float[Array, " k"]  # of that motion, how contacts depart and what slips
     clearly: Bool[Array, " e"]  # broken away by more than rounding
     free_rate: Float[Array, " e"]
 
 
 LOOSE, FIRST, NEXT, HOLD, DONE = range(5)  # stages of the search
+MOST_MODES = 2000  # which are tried one after the other, where a search does not end
+NONE, SEVERAL = -1, -2  # of these, where no mode is consistent so far, or others with another motion are
 
 
 class NoContact(NamedTuple):
     """Contacts to choose from, where there are none."""
+
+    @property
+    def size(self) -> int:
+        """How many contacts there are."""
+        return 0
+
+    @property
+    def choices(self) -> int:
+        """How many choices there are."""
+        return 1
+
+    @property
+    def is_long(self) -> bool:
+        """Whether they might have begun to repeat themselves."""
+        return False
+
+    @property
+    def acceleration(self) -> np.ndarray:
+        """What counts as rounding of how they depart."""
+        return np.zeros(0)
+
+    def chosen(self, number: Any) -> "NoContact":
+        """The choice of this number."""
+        return self
 
     def applied_to(self, flat: Flat) -> Flat:
         """The system with those that are closed."""
@@ -179,9 +208,11 @@ class NoContact(NamedTuple):
         """Which elements no open contact loads."""
         return jnp.zeros(bound.size, bool)
 
-    def next(self, flat: Flat, t, q, v, qddot, multipliers, agreed: Any = True, hopeless: Any = False) -> tuple["NoContact", bool]:
-        """Other ones, where the friction is `agreed` on and a contact pulls or goes deeper; and whether there was any."""
-        return self, False
+    def next(
+        self, flat: Flat, t, q, v, qddot, multipliers, agreed: Any = True, hopeless: Any = False
+    ) -> tuple["NoContact", bool, np.ndarray]:
+        """Other ones, where the friction is `agreed` on and a contact pulls or goes deeper; whether there was any; how all depart."""
+        return self, False, np.zeros(0)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -192,7 +223,8 @@ class ModeSelection:
     (`slip_direction`). One by one, the element farthest beyond its bound slips against its force, and one that would start backwards
     sticks again, until none is beyond its bound and none moves backwards. Of dependent elements some may be at their bound while others
     hold them: one of the possible shares, with the same motion for all. Where one of the contacts pulls or goes deeper in this mode, it
-    changes and all begins anew.
+    changes and all begins anew. Where that does not end, as it may where inertia couples normal and friction forces, all modes are tried
+    in turn, unless they are too many, so that one motion, and one alone, is possible in the mode that is found.
     """
 
     flat: Flat
@@ -229,13 +261,49 @@ class ModeSelection:
     def start(self, contacts: Any = NoContact()) -> Search:
         """Nothing is known yet."""
         nothing, no = jnp.zeros(self.elements.size, self.v.dtype), jnp.zeros(self.elements.size, bool)
-        return Search(jnp.array(LOOSE), contacts, Mode(self.resting, no, jnp.array(False), nothing), jnp.array(0), no, nothing)
+        mode, zero = Mode(self.resting, no, jnp.array(False), nothing), jnp.array(0)
+        rates = jnp.zeros(contacts.size + self.sigma.size, self.v.dtype)
+        return Search(jnp.array(LOOSE), contacts, mode, zero, zero, jnp.array(NONE), rates, no, nothing)
+
+    def _in_order(self, number: Any, contacts: Any) -> tuple[Float[Array, " r"], Any]:
+        """Of all modes the one of this number: σ, and which contacts are closed. What breaks away at its bound sticks last."""
+        size = self.elements.size
+        digits = jax.lax.div(number, 3 ** np.arange(size)) + self.breaking.astype(int)
+        way = jnp.where(self.at_rest, jax.lax.rem(digits + 1, 3) - 1, 0).astype(self.sigma.dtype)[self.elements.element_of_row]
+        return self.resting + way, contacts.chosen(jax.lax.div(number, 3**size))
+
+    def _among_others(self, search: Search, consistent, broken, rates: Float[Array, " k"]) -> tuple[int, Any, Float[Array, " k"]]:
+        """How many modes there are to try in order: none of elements of several rows; and, with the one that was tried last, which of them
+        is consistent, and its rates. Where forces in a mode may be none or several (`self_consistent`), it is `broken`: the motion beside
+        is one of several then; of an impact that is no objection.
+        """
+        count = 3**self.elements.size * search.contacts.choices
+        if np.any(self.elements.is_vector) or count > MOST_MODES:
+            return 0, search.only, search.rates
+        rounding = jnp.concatenate([search.contacts.acceleration, 1e-9 * search.free_rate[self.elements.element_of_row]])
+        size = jnp.maximum(jnp.abs(rates), jnp.abs(search.rates))
+        differs = jnp.any(jnp.abs(rates - search.rates) > 1e-6 * size + rounding)
+        is_one, first = consistent & (search.tried > 0), search.only == NONE
+        if self.impulse is not None:
+            broken = self.impulse.instead(lambda: jnp.zeros_like(broken), lambda: broken)
+        only = jnp.where(is_one & first, search.tried - 1, jnp.where(is_one & differs | broken, SEVERAL, search.only))
+        return count, only, jnp.where(is_one & first, rates, search.rates)
 
     def kinds(self, search: Search) -> tuple[Any, Any, Any, Any]:
         """Which elements are freed of their force, which slip that were at rest; whether all begins anew, and whether some break away."""
         released = self.at_rest & ~sticking(self.elements, search.mode.sigma)
         freed = jnp.where(search.stage == LOOSE, self.at_rest, released & (search.stage == HOLD))
         return freed, released, search.stage == LOOSE, jnp.any(self.breaking)
+
+    def _torn(self, found: Friction, free_rate: Float[Array, " e"], stuck: Bool[Array, " e"]) -> Bool[Array, " e"]:
+        """Of elements that cannot stick at the same time, as on belts that move apart, or beside a contact that returns from an impact,
+        the one farthest from rest.
+        """
+        norms = self.elements.norms
+        rate, most = norms(found.slip_rate), jnp.max(norms(self.drift()), initial=0.0)
+        if self.impulse is not None:
+            most = self.impulse.instead(lambda: jnp.maximum(most, jnp.max(free_rate, initial=0.0)), lambda: most)
+        return _greatest(rate, stuck & (rate > 1e-6 * most) & (rate > 1e-9 * free_rate) & (most > 0))
 
     def next(self, search: Search, found: Friction, turned: Float[Array, " r"], turns: Any) -> Search:
         """Onward with the friction that was `found` in the mode of the search, and with σ `turned`, where it `turns`."""
@@ -250,7 +318,7 @@ class ModeSelection:
         backwards = -elements.sums(found.slip_rate * mode.sigma)
         holds = released & ~idle & ~(elements.is_vector & (found.bound == 0))
         returning = _greatest(backwards, holds & (backwards > jnp.where(search.clearly, 0, 1e-6 * search.free_rate)))
-        torn = _torn(elements, self.drift(), found, search.free_rate, over > -jnp.inf) & ~jnp.any(beyond) | (stuck & found.driven)
+        torn = self._torn(found, search.free_rate, over > -jnp.inf) & ~jnp.any(beyond) | (stuck & found.driven)
         along = (over > -1e-6 * jnp.abs(found.bound)) & elements.are_shared  # those of a share break away together
         leaving = jnp.where((stage == FIRST) & jnp.any(breaking), breaking | along, beyond | torn)
         leaving = (leaving & (stage != LOOSE)) | (idle & (over > -jnp.inf))
@@ -268,20 +336,31 @@ class ModeSelection:
         within = (stage == FIRST) | (stage == NEXT) | all_slip
         last = all_slip | ~jnp.any(at_rest & ~idle & ~sticking(elements, sigma))  # nothing that others may hold
         asked = self.flat, self.t, self.q, self.v, found.qddot, found.multipliers
-        contacts, changes = search.contacts.next(*asked, agrees, search.turns > self.most)
+        contacts, changes, departs = search.contacts.next(*asked, agrees, search.turns > self.most)
         following = jnp.where(within, jnp.where(in_current_mode, jnp.where(last, DONE, HOLD), NEXT), jnp.where(stage == LOOSE, FIRST, DONE))
-        anew = within & changes
+        consistent, broken = agrees & jnp.logical_not(changes), in_current_mode & ~agrees
+        count, only, rates = self._among_others(search, within & consistent, broken, jnp.concatenate([departs, found.slip_rate]))
+        is_long = (search.turns > self.most + 2) | search.contacts.is_long | broken | (search.tried > 0)
+        fails = within & (((search.tried > 0) & (search.tried <= count)) | (is_long & ~consistent))
+        tries = fails & ((search.tried < count) | ((search.tried == count) & (only >= 0)))
+        anew = within & changes & ~fails
+        following = jnp.where(fails, jnp.where(tries, NEXT, DONE), jnp.where(anew, LOOSE, following))
+        onward = jnp.where(anew, self.resting, jnp.where(within | (stage == LOOSE), sigma, mode.sigma))
+        sigma, others = self._in_order(jnp.where(search.tried < count, search.tried, only), search.contacts)
         contacts = jax.tree.map(lambda new, old: jnp.where(anew, new, old), contacts, search.contacts)
         return Search(
-            jnp.where(anew, LOOSE, following),
-            contacts,
+            following,
+            jax.tree.map(lambda new, old: jnp.where(tries, new, old), others, contacts),
             Mode(
-                jnp.where(anew, self.resting, jnp.where(within | (stage == LOOSE), sigma, mode.sigma)),
+                jnp.where(tries, sigma, onward),
                 jnp.where(stage == HOLD, released & ~idle & ~elements.is_quasistatic & (rate <= 1e-6 * search.free_rate), mode.held),
-                jnp.where(within, agrees & ~anew, mode.consistent),
+                jnp.where(within, consistent & ~fails, mode.consistent),
                 jnp.where(within, found.bound, mode.bound),
             ),
             jnp.where(anew, 0, search.turns + 1),
+            jnp.where(tries, search.tried + 1, search.tried),
+            only,
+            rates,
             jnp.where(within | (stage == LOOSE), clearly & ~anew, search.clearly),
             jnp.where(stage == LOOSE, rate, search.free_rate),
         )
@@ -312,10 +391,7 @@ def select_mode(
         return selection.next(search, *found)
 
     # Nothing here is differentiated, so that the loop may end by itself: a motion behind many jumps of an input takes a tenth less.
-    most = selection.most * (1 + 4 * len(jax.tree.leaves(contacts)) * flat.rows)
-    going_on = lambda carry: (carry[0] < most) & (carry[1].stage != DONE)
-    search = lambda: jax.lax.while_loop(going_on, lambda carry: (carry[0] + 1, turn(carry[1])), (0, selection.start(contacts)))
-    done = undifferentiated(search)()[1]
+    done = undifferentiated(lambda: jax.lax.while_loop(lambda search: search.stage != DONE, turn, selection.start(contacts)))()
     return done.mode, done.contacts
 
 
@@ -330,12 +406,6 @@ def _greatest(x, among):
     if not x.size:
         return among
     return among & (jnp.arange(x.size) == jnp.argmax(jnp.where(among, x, -jnp.inf)))
-
-
-def _torn(elements, drift, found, free_rate, stuck):
-    """Of elements that cannot stick at the same time, as on belts that move apart, the one farthest from rest."""
-    most, rate = jnp.max(elements.norms(drift), initial=0.0), elements.norms(found.slip_rate)
-    return _greatest(rate, stuck & (rate > 1e-6 * most) & (rate > 1e-9 * free_rate) & (most > 0))
 
 
 def first_mode(

@@ -52,8 +52,6 @@ class Change(NamedTuple):
 class ContactStep(Step):
     """A step of a motion with contacts, with friction or without."""
 
-    patience = 2  # then a contact that pulls opens, whether friction is agreed on or not
-
     @property
     def decisions(self) -> list:
         """Those of a step, and those of contacts."""
@@ -112,7 +110,8 @@ class ContactStep(Step):
         flat, _ = self.contents(turn.end, parts)
         of_positions, at_start = self.args.scales.of_positions(parts.q), self.at_start(turn)
         if self.begins is not None:
-            touching = jnp.concatenate([jnp.zeros(self.equations.elements, bool), flat.gaps(turn.end, parts.q) <= 0])
+            closing = (flat.gaps(turn.end, parts.q) <= 0) & (parts.closed < 0.5)
+            touching = jnp.concatenate([jnp.zeros(self.equations.elements, bool), closing])
             ended, moved = jnp.where(at_start, touching, ended), jnp.where(at_start, 0, moved)
             of_positions = jnp.where(at_start, roundings_beside(flat, turn.end, parts.q, parts.v)[0], of_positions)
         _, of_contact = jnp.split(ended, [self.equations.elements])
@@ -186,8 +185,6 @@ class ContactStep(Step):
         turn = turn._replace(choice=turn.choice._replace(search=search))
         search, found, more, done = self.onward(selection, turn, point)
         contacts = search.contacts._replace(impulse=None)
-        most = 4 * equations.contacts + 2 ** min(equations.contacts, 10)
-        done |= ~more & (contacts.turn > most)
         turn = turn._replace(choice=turn.choice._replace(search=search._replace(contacts=contacts), found=found))
         parts = self.in_mode(turn, selection.elements, search)
         modes = {"sigma": parts.sigma, "held": parts.held, "transitions": parts.transitions}

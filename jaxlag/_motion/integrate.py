@@ -23,6 +23,7 @@ from .events import begun
 from .first_order import EquationsOfMotion
 from .formulation import Formulation
 from .integrated import integrated
+from .interval_loop import Resumed
 from .loads import told_of_loads
 from .mode_changes import started, unstarted
 from .one_evaluation_solver import OneEvaluationSolver, has_one_evaluation
@@ -261,15 +262,20 @@ def in_one_loop(
     directions=(),
     reverse=False,
     begins=False,
+    resumed: Resumed | None = None,
 ) -> tuple[Array, RESULTS, dict]:
-    """States at the samples as `states_at`, with their variations along directions of (params, t0) for each order."""
+    """States at the samples as `states_at`, with their variations along directions of (params, t0) for each order.
+
+    A motion that is `resumed` has been told of its loads.
+    """
     adjoint = dfx.RecursiveCheckpointAdjoint() if reverse else dfx.ForwardMode()
-    meter, dense = Meter() if options.progress else dfx.NoProgressMeter(), not has_nodes(equations, args.params)
+    meter, dense = Meter() if options.progress else dfx.NoProgressMeter(), not (has_nodes(equations, args.params) or resumed)
     back = in_one_kernel(equations.projected) if dense else equations.projected
     solver = _wrapped(options, equations, back if equations.projection else None, adjoint, (t0, y0, args), bool(directions), begins)
-    args = told_of_loads(equations, t0, y0[(..., *[0] * len(directions))], args, begins)
+    if resumed is None:
+        args = told_of_loads(equations, t0, y0[(..., *[0] * len(directions))], args, begins)
     numbers = y0, t0, args, ts, tolerances
-    kind = {"variations": _variations(equations), "reverse": reverse, "dense": dense}
+    kind = {"variations": _variations(equations), "reverse": reverse, "dense": dense, "resumed": resumed}
     ys, (result, stats) = integrated(equations, solver, options.max_steps, meter, *numbers, directions, **kind)
     if dense and equations.projection:
         along = [(of_params, None) for of_params, _ in directions]

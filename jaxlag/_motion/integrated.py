@@ -11,14 +11,29 @@ from .._model.signal import nonsmooth_signals
 from .._program.whole_kernel import in_whole_kernel
 from .event_record import has_stopped, most
 from .interval_inputs import Inputs, Record, Recorded, packed
-from .interval_loop import IntervalLoop, Moving, Numbers, Steps
+from .interval_loop import IntervalLoop, Moving, Numbers, Resumed, Steps
 from .results import number_of, numbered
 
 
 def integrated(
-    equations, solver, max_steps, meter, y0, origin, args, ts, tolerances, directions=(), *, variations=0, reverse=False, dense=False
+    equations,
+    solver,
+    max_steps,
+    meter,
+    y0,
+    origin,
+    args,
+    ts,
+    tolerances,
+    directions=(),
+    *,
+    variations=0,
+    reverse=False,
+    dense=False,
+    resumed=None,
 ):
-    """States at the samples and behind events; and, not differentiated, the reason it ended, counts, and the `last` time and state.
+    """States at the samples and behind events; and, not differentiated, the reason it ended, counts, and the `last` time and state; of a
+    motion that is `resumed`, what it may be resumed with in its turn.
 
     `origin` is the time of the start. With `directions` of (params, origin), for each order, the states and y0 have their variations as
     last axes. `reverse`: whether reverse mode goes through the loop; `dense`: whether there are no nodes but samples.
@@ -35,7 +50,7 @@ def integrated(
     numbers = Numbers((recorded.params, origin), args, tolerances, along)
     at_start = ts <= start  # the first, which may be repeated, as a delay has it
     # A number comes first that is not NaN, as the kernel asks for.
-    given, unpack, rows = packed((start, (y0, following, at_start.sum(), numbers)), large)
+    given, unpack, rows = packed((start, (y0, following, at_start.sum(), numbers, resumed)), large)
 
     def started(given):
         ts, *columns = rows(given)
@@ -52,15 +67,15 @@ def integrated(
         write = lambda saved, i, y, wanted: saved.at[i].set(y, pred=wanted)
         checkpointed = functools.partial(while_loop, max_steps=max_steps, buffers=lambda carry: carry[2], kind="checkpointed")
         moving, steps, ys = started(given)(saved, write, checkpointed)
-        return _results(equations, ys, _end(moving, steps), ts, max_steps)
+        return _results(equations, ys, _end(moving, steps, resumed), ts, max_steps)
 
-    like = y0[(0,) * (y0.ndim - len(directions))], y0, *[jnp.zeros((), int)] * 4
+    like = y0[(0,) * (y0.ndim - len(directions))], y0, *[jnp.zeros((), int)] * 4, resumed
     space, unpack_end, _ = packed(like, [])
 
     def run(given, saved):
         write = functools.partial(_written, length, y0.size)
         moving, steps, saved = started(given)(saved, write, jax.lax.while_loop)
-        end = packed(_end(moving, steps), [])[0].astype(saved.dtype)
+        end = packed(_end(moving, steps, resumed), [])[0].astype(saved.dtype)
         return jax.lax.dynamic_update_slice_in_dim(saved, end, length * y0.size, 0)
 
     found = in_whole_kernel(run)(given, jnp.concatenate([saved.ravel(), 0 * space]))
@@ -76,9 +91,13 @@ def _moving(equations, params, directions, reverse) -> tuple[bool, ...]:
     return (*of_signals, *((reverse or shifted or (varies and bool(directions))) for varies in equations.varying_periods))
 
 
-def _end(moving: Moving, steps: Steps):
-    """What is of interest of the last state: t, y, the number of the result, counts of steps, the next sample."""
-    return moving.t, moving.y, *(jnp.asarray(x, int) for x in (number_of(steps.result), steps.accepted, steps.rejected, steps.sample))
+def _end(moving: Moving, steps: Steps, resumed: Resumed | None):
+    """What is of interest of the last state: t, y, the number of the result, counts of steps, the next sample; what it is resumed with."""
+    counts = (jnp.asarray(x, int) for x in (number_of(steps.result), steps.accepted, steps.rejected, steps.sample))
+    if resumed is not None:
+        of_motion = lambda x, like: x[(..., *[0] * (x.ndim - like.ndim))]
+        resumed = Resumed(steps.length, jax.tree.map(of_motion, steps.control, resumed.control), jnp.array(True))
+    return moving.t, moving.y, *counts, resumed
 
 
 def _written(length, width, saved, i, y, wanted):
@@ -89,7 +108,7 @@ def _written(length, width, saved, i, y, wanted):
 
 
 def _results(equations, ys, end, ts, max_steps):
-    t, y, number, accepted, rejected, sample = end
+    t, y, number, accepted, rejected, sample, resumed = end
     alone = lambda x: x[(..., *[0] * t.ndim)]  # without its variations
     last = alone(t), alone(y)
     t, stopped = last[0], has_stopped(equations, last[1])
@@ -100,4 +119,4 @@ def _results(equations, ys, end, ts, max_steps):
     unfinished = (result == dfx.RESULTS.successful) & ~stopped & (ts[-1] > t) & (accepted + rejected >= max_steps)
     result = dfx.RESULTS.where(unfinished, dfx.RESULTS.max_steps_reached, result)
     stats = {"num_steps": accepted + rejected, "num_accepted_steps": accepted, "num_rejected_steps": rejected}
-    return ys, (result, stats | {"last": jax.lax.stop_gradient(last)})
+    return ys, (result, stats | jax.lax.stop_gradient({"last": last} | ({"resumed": resumed} if resumed else {})))

@@ -8,6 +8,7 @@ and not of the loop, which stays the same.
 Source: Hairer, Nørsett & Wanner, Solving Ordinary Differential Equations I, section I.14: this gives what the variational equations would.
 """
 
+import dataclasses
 import functools
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -84,6 +85,16 @@ class Numbers(NamedTuple):
     directions: tuple  # of what is varied, for each order
 
 
+class Resumed(NamedTuple):
+    """Where a motion goes on that was left: the planned length of its next step, what controls the steps, and whether inputs, which are
+    others since, leave it in its mode.
+    """
+
+    length: Float[Array, ""]
+    control: PyTree
+    known: Bool[Array, ""]
+
+
 class IntervalLoop(NamedTuple):
     """The loop, apart from its numbers."""
 
@@ -106,13 +117,17 @@ class IntervalLoop(NamedTuple):
         """Of a sample of the motion, or of the last."""
         return self.ts.at(jnp.minimum(sample, self.ts.shape[0] - 1))[0]
 
-    def run(self, y0, following, sample, numbers: Numbers, saved: Any, write: Callable, loop: Callable) -> tuple[Moving, Steps, Any]:
+    def run(
+        self, y0, following, sample, numbers: Numbers, resumed: Resumed | None, saved: Any, write: Callable, loop: Callable
+    ) -> tuple[Moving, Steps, Any]:
         """From the first sample to the last, or as far as it goes; with what was saved at the samples. `sample` is the first one later."""
         first, last = (self.ts.at(i)[0] for i in (0, self.ts.shape[0] - 1))
         rounding = jnp.finfo(y0.dtype).eps * jnp.maximum(jnp.abs(first), jnp.abs(last))
         same = rounding + jnp.finfo(y0.dtype).eps * jnp.abs(origin_of(numbers.varied[0]))  # times as given, which round with the user's
         variations = self.variations + len(numbers.directions)
         control = StepControl.of(numbers.tolerances, (first, last), self.equations, variations, resumes=not self.dense)
+        if resumed is not None:
+            control = dataclasses.replace(control, duration=numbers.args.scales.duration)
         now = lambda x: _alone(x, numbers)
 
         def turn(carry):
@@ -142,12 +157,20 @@ class IntervalLoop(NamedTuple):
             return within & going & ~has_stopped(self.equations, now(moving.y))
 
         moving, steps = self._start(control, first, last, y0, following, sample, numbers)
+        steps = steps if resumed is None else self._resumed(steps, resumed, numbers)
         saved = with_events(self.equations, write, saved, self.ts.shape[0], None, y0, now)
         moving, steps, saved, meter = loop(going_on, turn, (moving, steps, saved, self.meter.init()))
         self.meter.close(meter)
         if self.begins:
             saved = self._with_start(moving, steps, y0, sample, saved, write)
         return moving, steps, saved
+
+    def _resumed(self, steps: Steps, resumed: Resumed, numbers: Numbers) -> Steps:
+        """With the steps as they were planned; variations, whose scales are those of this part alone, are planned for anew."""
+        of_motion = lambda new, old: jnp.asarray(new).at[(..., *[0] * (jnp.ndim(new) - old.ndim))].set(old)
+        control = jax.tree.map(of_motion, steps.control, resumed.control)
+        state = self.solver.knowing(steps.solver_state, resumed.known) if self.begins else steps.solver_state
+        return steps._replace(length=resumed.length, control=control, solver_state=state)
 
     def _with_start(self, moving: Moving, steps: Steps, y0, sample, saved: Any, write: Callable) -> Any:
         """With the state at the start as the first step has found it, at the samples that are there."""

@@ -79,3 +79,9 @@ class OneEvaluationSolver(StickSlipSolver):
     def loads_of(self, solver_state: Any) -> Any:
         """What loads at the start make of velocities, as soon as that is known."""
         return solver_state[2].loads
+
+    @staticmethod
+    def knowing(solver_state: Any, known: Any) -> Any:
+        """The state of the solver where the mode at the start may be known."""
+        rate, is_new, start = solver_state
+        return rate, is_new, start._replace(known=known)

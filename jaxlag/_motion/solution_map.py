@@ -146,8 +146,8 @@ class SolutionMap:
             stats = stats | {"last": (last_t, last_y[(..., *[0] * len(directions))])}
         else:
             along = tuple((SinceOrigin(of_order.params, None), of_order.t0) for of_order in directions)
-            kind = {"directions": along, "begins": self._begins(equations, inputs, directions, ts)}
-            ys, result, stats = in_one_loop(equations, self.options, at.t, y0, times, args, tolerances, **kind)
+            given, begins = (equations, self.options, at.t, y0, times, args, tolerances), self._begins(equations, inputs, directions, ts)
+            ys, result, stats = in_one_loop(*given, directions=along, begins=begins)
         return self._samples_and_variations(equations, inputs, directions, ts, ys, result, stats, start)
 
     def _samples_and_variations(self, equations, inputs, directions, ts, ys, result, stats, start):

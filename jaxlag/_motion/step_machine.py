@@ -132,7 +132,6 @@ class Step:
     args: Arguments
     of_time_alone: TimeDependence | None
     begins: Any = None  # whether the motion does, in a mode that has yet to be found
-    patience = 0  # turns of a selection beyond those in which friction is agreed on, if it is at all
 
     @classmethod
     def of(cls, solver: ProjectedSolver, t0, t1, y0, args: Arguments, begins: Any = None) -> "Step":
@@ -432,7 +431,7 @@ class Step:
         more = (turn.kind == SELECT) & asks_for_rates(*given, tuple(kinds), search.free_rate)
         onward = selection.next(search, found, *turned_by_rates(*given, slip_rates, tuple(kinds), breaks, search.free_rate))
         search = jax.lax.stop_gradient(jax.tree.map(lambda new, old: jnp.where(more, old, new), onward, search))
-        return search, found, more, ~more & ((search.stage == SELECTED) | (search.turns >= selection.most + self.patience))
+        return search, found, more, ~more & (search.stage == SELECTED)
 
     def with_rest(self, turn: Turn, more, done) -> Turn:
         """With the rest of the step next, where the selection is done; what was before is its first piece."""

@@ -97,12 +97,12 @@ class StepControl(dfx.AbstractStepSizeController):
         keep, t, end, made_jump, inner, result = step
         kept = Scale(size, *_followed(noise, growth, error, h, allowed), jnp.maximum(first / 2, h))
         scale = jax.tree.map(lambda new, old: jnp.where(keep, new, old), kept, Scale(scale.size, noise, growth, first))
-        lost = (result == dfx.RESULTS.dt_min_reached) & ~finite
-        result = dfx.RESULTS.where(lost, under_diffrax(RESULTS.undefined), result)
         if self.resumes:
             planned = jnp.where(keep, jnp.maximum(end - t, planned), end - t)
             result = dfx.RESULTS.where(keep | (planned >= self.smallest), result, dfx.RESULTS.dt_min_reached)
             end = t + planned
+        lost = (result == dfx.RESULTS.dt_min_reached) & ~finite
+        result = dfx.RESULTS.where(lost, under_diffrax(RESULTS.undefined), result)
         return keep, t, end, made_jump, (scale, planned, inner), result
 
     def _reach(self, size, args):

@@ -4,6 +4,7 @@ from collections.abc import Callable
 from typing import Any
 
 import jax
+import jax.custom_batching
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
@@ -17,6 +18,24 @@ def everywhere(condition: Bool[Array, ""]) -> Bool[Array, ""]:
 @everywhere.def_vmap
 def _for_all_members(axis_size, in_batched, conditions):
     return everywhere(jnp.all(conditions)), False
+
+
+def one_by_one(function: Callable) -> Callable:
+    """`function`, which a batch computes for one member after the other.
+
+    JAX's own finds nothing to go through where derivatives have members and what they are taken of has none.
+    """
+    call = jax.custom_batching.sequential_vmap(function)
+    through_members = call.vmap_rule
+
+    @call.def_vmap
+    def _once_or_through_members(axis_size, in_batched, *given):
+        if any(jax.tree.leaves(in_batched)):
+            return through_members(axis_size, in_batched, *given)
+        found = function(*given)
+        return found, jax.tree.map(lambda _: False, found)
+
+    return call
 
 
 def repeated(turn: Callable, start: Any, going_on: Callable, begins: Bool[Array, ""] | bool = True) -> Any:

@@ -5,11 +5,11 @@ from collections.abc import Callable
 from typing import Any
 
 import jax
-import jax.custom_batching
 import jax.numpy as jnp
 from jax.extend import core
 from jaxtyping import Array, Float
 
+from .conditions import one_by_one
 from .walker import used_constants
 
 
@@ -24,7 +24,7 @@ def undifferentiated(function: Callable, in_turn: bool = False) -> Callable:
     def call(*given):
         if in_turn and jax.default_backend() == "cpu":
             program, closed_over = open_function(function, *given)
-            program = jax.custom_batching.sequential_vmap(program)
+            program = one_by_one(program)
         else:
             program, closed_over = jax.closure_convert(function, *given)
         return program(*jax.lax.stop_gradient((*given, *closed_over)))

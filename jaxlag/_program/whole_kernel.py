@@ -11,12 +11,12 @@ from collections.abc import Callable, Iterator
 from typing import Any
 
 import jax
-import jax.custom_batching
 import jax.numpy as jnp
 import numpy as np
 from jax.extend import core
 from jaxtyping import Array, Float
 
+from .conditions import one_by_one
 from .walker import called_program, count_equations
 from .without_libraries import is_scattered, without_libraries, without_scatters
 
@@ -63,7 +63,7 @@ def in_whole_kernel(function: Callable) -> Callable:
             return jax.lax.cond(is_number, inside, lambda given, result: jnp.full_like(result, jnp.nan), given, result)
 
         @jax.custom_jvp
-        @jax.custom_batching.sequential_vmap
+        @one_by_one
         def call(given, result):
             unknown = jax.lax.optimization_barrier((given, result))  # a constant would be moved into the program, its argument be unused
             return set_xla_metadata(jax.jit(chosen)(*unknown), inlineable="false", xla_cpu_small_call="true")

@@ -95,7 +95,7 @@ def test_motions_are_those_of_a_loop_for_each_purpose(name, units, monkeypatch):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["in a plane", "on a wire", "two elements", "beside a slider", "between walls"])
+@pytest.mark.parametrize("name", ["in a plane", "on a wire", "two elements", "beside a slider", "between walls", "on a floor"])
 def test_more_motions_are_those_of_a_loop_for_each_purpose(name, monkeypatch):
     _compare(name, (1.0, 1.0), monkeypatch, 60)
 
