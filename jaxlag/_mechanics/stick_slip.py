@@ -265,21 +265,27 @@ class ModeSelection:
         rates = jnp.zeros(contacts.size + self.sigma.size, self.v.dtype)
         return Search(jnp.array(LOOSE), contacts, mode, zero, zero, jnp.array(NONE), rates, no, nothing)
 
+    def _count(self, contacts: Any) -> int:
+        """How many modes there are to try in order: none of elements of several rows, nor where there are too many."""
+        count = 3**self.elements.size * contacts.choices
+        return 0 if np.any(self.elements.is_vector) or count > MOST_MODES else count
+
     def _in_order(self, number: Any, contacts: Any) -> tuple[Float[Array, " r"], Any]:
-        """Of all modes the one of this number: σ, and which contacts are closed. What breaks away at its bound sticks last."""
+        """Of these modes the one of this number: σ, and which contacts are closed. What breaks away at its bound sticks last."""
         size = self.elements.size
+        if not self._count(contacts):
+            return self.resting, contacts
         digits = jax.lax.div(number, 3 ** np.arange(size)) + self.breaking.astype(int)
         way = jnp.where(self.at_rest, jax.lax.rem(digits + 1, 3) - 1, 0).astype(self.sigma.dtype)[self.elements.element_of_row]
         return self.resting + way, contacts.chosen(jax.lax.div(number, 3**size))
 
-    def _among_others(self, search: Search, consistent, broken, rates: Float[Array, " k"]) -> tuple[int, Any, Float[Array, " k"]]:
-        """How many modes there are to try in order: none of elements of several rows; and, with the one that was tried last, which of them
-        is consistent, and its rates. Where forces in a mode may be none or several (`self_consistent`), it is `broken`: the motion beside
-        is one of several then; of an impact that is no objection.
+    def _among_others(self, search: Search, consistent, broken, rates: Float[Array, " k"]) -> tuple[Any, Float[Array, " k"]]:
+        """Which of the modes that are tried in order is consistent, with the one that was tried last, and its rates. Where a mode may have
+        no forces or several (`self_consistent`), it is `broken`: the motion beside is one of several then; of an impact that is no
+        objection.
         """
-        count = 3**self.elements.size * search.contacts.choices
-        if np.any(self.elements.is_vector) or count > MOST_MODES:
-            return 0, search.only, search.rates
+        if not self._count(search.contacts):
+            return search.only, search.rates
         rounding = jnp.concatenate([search.contacts.acceleration, 1e-9 * search.free_rate[self.elements.element_of_row]])
         size = jnp.maximum(jnp.abs(rates), jnp.abs(search.rates))
         differs = jnp.any(jnp.abs(rates - search.rates) > 1e-6 * size + rounding)
@@ -287,7 +293,7 @@ class ModeSelection:
         if self.impulse is not None:
             broken = self.impulse.instead(lambda: jnp.zeros_like(broken), lambda: broken)
         only = jnp.where(is_one & first, search.tried - 1, jnp.where(is_one & differs | broken, SEVERAL, search.only))
-        return count, only, jnp.where(is_one & first, rates, search.rates)
+        return only, jnp.where(is_one & first, rates, search.rates)
 
     def kinds(self, search: Search) -> tuple[Any, Any, Any, Any]:
         """Which elements are freed of their force, which slip that were at rest; whether all begins anew, and whether some break away."""
@@ -339,7 +345,8 @@ class ModeSelection:
         contacts, changes, departs = search.contacts.next(*asked, agrees, search.turns > self.most)
         following = jnp.where(within, jnp.where(in_current_mode, jnp.where(last, DONE, HOLD), NEXT), jnp.where(stage == LOOSE, FIRST, DONE))
         consistent, broken = agrees & jnp.logical_not(changes), in_current_mode & ~agrees
-        count, only, rates = self._among_others(search, within & consistent, broken, jnp.concatenate([departs, found.slip_rate]))
+        only, rates = self._among_others(search, within & consistent, broken, jnp.concatenate([departs, found.slip_rate]))
+        count = self._count(search.contacts)
         is_long = (search.turns > self.most + 2) | search.contacts.is_long | broken | (search.tried > 0)
         fails = within & (((search.tried > 0) & (search.tried <= count)) | (is_long & ~consistent))
         tries = fails & ((search.tried < count) | ((search.tried == count) & (only >= 0)))

@@ -79,7 +79,7 @@ class SolutionMap:
         return self._solve(inputs, ts, dfx.RecursiveCheckpointAdjoint())
 
     def _solve(self, inputs: Inputs, ts: Array, adjoint: dfx.AbstractAdjoint) -> tuple[Samples, Unchanging]:
-        equations, at = self._equations(inputs, ts)
+        equations, at = self.equations(inputs, ts)
         params, times, tolerances = _counted(inputs, ts), ts - ts[0], inputs.tolerances
         args, reverse = self._arguments(equations, at, inputs, ts), not isinstance(adjoint, dfx.ForwardMode)
         begins = begins_in_steps(equations, self.options, params, reverse, False)
@@ -132,7 +132,7 @@ class SolutionMap:
         """The samples and their derivatives along directions, for each order; by the variational equations where they hold."""
         if self.options.adjoint is not None:
             return pushforward(self.solve)(inputs, directions, ts)
-        equations, at = self._equations(inputs, ts)
+        equations, at = self.equations(inputs, ts)
         varying = [split_varying(inputs, of_order)[0].params for of_order in directions]
         variations, times = self._variations(equations, inputs, directions, ts), ts - ts[0]
         y0, start = variations.initial(inputs)
@@ -179,7 +179,7 @@ class SolutionMap:
 
     def drift(self, inputs: Inputs, ts: Array, samples: Samples) -> Samples:
         """The change of each sample with its own time."""
-        equations, _ = self._equations(inputs, ts)
+        equations, _ = self.equations(inputs, ts)
         params, times = _counted(inputs, ts), ts - ts[0]
         scales = scales_of(equations, inputs.tolerances, times, params, samples.ys)
 
@@ -195,7 +195,8 @@ class SolutionMap:
         ys, shown = jax.vmap(of_one)(ts - ts[0], samples.ys)
         return Samples(ys, shown, jax.tree.map(jnp.zeros_like, samples.events))
 
-    def _equations(self, inputs: Inputs, ts: Array) -> tuple[EquationsOfMotion, StatesAt]:
+    def equations(self, inputs: Inputs, ts: Array) -> tuple[EquationsOfMotion, StatesAt]:
+        """The equations of motion, found and checked in shapes alone, and the start as it is given."""
         at = self._at(inputs, ts)
         check(self.system, at.t, inputs.q0, inputs.qdot0, inputs.params, at.values)
         return EquationsOfMotion.of(self.system, inputs.q0, self.options.formulation, _counted(inputs, ts), at), at

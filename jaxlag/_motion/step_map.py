@@ -1,7 +1,6 @@
 """The map of one step of a `Stepper`: from the state at its beginning and params to the state at its end; and what differentiates it."""
 
 import dataclasses
-from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
@@ -11,7 +10,7 @@ from jaxtyping import Array, Bool, PyTree
 from .._model.flat import StatesAt
 from .._model.signal import SinceOrigin, with_second_derivatives
 from .first_order import EquationsOfMotion
-from .integrate import SolverOptions, begins_in_steps, in_one_loop, initialised, with_status
+from .integrate import SolverOptions, Variations, begins_in_steps, in_one_loop, initialised, with_status
 from .interval_loop import Resumed
 from .jumps import after_jump
 from .loads import told_of_loads
@@ -19,7 +18,7 @@ from .protocol import Arguments
 from .results import RESULTS
 from .scales import Scales
 from .step_size import StepControl
-from .variational import derived, varied_along, with_variations
+from .variational import varied_along
 
 HORIZON = 1000  # steps: what counts as small is judged as in a motion of as many, or, in a longer one, as long as it has been
 
@@ -69,10 +68,11 @@ class StepMap:
 
     def push(self, inputs: Inputs, directions: tuple[Inputs, ...], ts: Array) -> tuple[Any, Unchanging]:
         """The same and its derivatives along directions, for each order."""
-        of_y = lambda inputs: (self._moved_on_constraints(inputs, ts), None)
+        variations = Variations(self.equations, lambda inputs: (self._moved_on_constraints(inputs, ts), None))
         for of_order in directions:
-            of_y = _with_variations(of_y, of_order)
-        ys, aux = self._ended(inputs, of_y(inputs)[0] if directions else inputs.y, ts, directions, reverse=False)
+            variations = variations.along(of_order, None, None, lambda _: None)
+        y0 = variations.initial(inputs)[0] if directions else inputs.y
+        ys, aux = self._ended(inputs, y0, ts, directions, reverse=False)
         return _taken_apart(ys, len(directions)), aux
 
     def drift(self, inputs: Inputs, ts: Array, y: Array) -> Array:
@@ -81,7 +81,7 @@ class StepMap:
 
     def _ended(self, inputs: Inputs, y0: Array, ts: Array, directions: tuple, reverse: bool) -> tuple[Array, Unchanging]:
         equations, params = self.equations, SinceOrigin.of(inputs.params, inputs.t0)
-        args = self.arguments(inputs.params, inputs.t0, ts, inputs.tolerances, inputs.y, inputs.going.loads)
+        args = self.arguments(inputs.params, inputs.t0, ts, inputs.tolerances, *self._moving(inputs.y), inputs.going.loads)
         may_jump, fine = inputs.jumps is not None, jnp.array(True)
         begins = may_jump and begins_in_steps(equations, self.options, params, reverse, bool(directions))
         if may_jump and not begins and equations.projection is not None:
@@ -97,7 +97,7 @@ class StepMap:
         """y, which is on the constraints of its mode, with changes that are so, too: others say nothing of its next step."""
         if self.equations.projection is None:
             return inputs.y
-        args = self.arguments(inputs.params, inputs.t0, ts, inputs.tolerances, inputs.y, inputs.going.loads)
+        args = self.arguments(inputs.params, inputs.t0, ts, inputs.tolerances, *self._moving(inputs.y), inputs.going.loads)
         there = self.equations.projected(ts[0], inputs.y, args)
         return jax.lax.stop_gradient(inputs.y) + (there - jax.lax.stop_gradient(there))
 
@@ -112,18 +112,20 @@ class StepMap:
         along = [of_order.params for of_order in directions]
         return jax.lax.cond(inputs.jumps, lambda: varied_along(behind, along)(y0, inputs.params), lambda: (y0, jnp.array(True)))
 
-    def arguments(self, params: PyTree, t0: Array, ts: Array, tolerances, y: Array, loads: dict[str, Any]) -> Arguments:
+    def _moving(self, y: Array) -> tuple[Array, Array]:
+        """q and q̇."""
+        return self.equations.parts(y)[:2]
+
+    def arguments(self, params: PyTree, t0: Array, ts: Array, tolerances, q: Array, v: Array, loads: dict[str, Any]) -> Arguments:
         """Those of a step, or of the start, where nothing is known of loads."""
-        parts = self.equations.parts(y)
         params = with_second_derivatives(SinceOrigin.of(params, t0))
         duration = jnp.stack([0 * ts[0], jnp.maximum(HORIZON * (ts[1] - ts[0]), ts[1])])
-        scales = Scales.of(tolerances, duration, params, parts.q, parts.v, self.equations.sees_time)
+        scales = Scales.of(tolerances, duration, params, q, v, self.equations.sees_time)
         return Arguments(params, scales._replace(**loads))
 
     def start(self, at: StatesAt, params: PyTree, t0: Array, ts: Array, tolerances) -> tuple[Array, Unchanging]:
         """y at the start, put on the constraints and in its mode; `at` is on the clock of the motion."""
-        equations, counted = self.equations, SinceOrigin.of(params, t0)
-        args = self.arguments(params, t0, ts, tolerances, jnp.concatenate([equations.at_start(at, counted).y]), {})
+        equations, args = self.equations, self.arguments(params, t0, ts, tolerances, at.q, at.v, {})
         found = initialised(equations, at, args.params, args.scales)
         y, result = with_status(found.y, RESULTS.successful, found.conditions, (at, params, ts))
         scales = told_of_loads(equations, at.t, found.y, args).scales
@@ -132,16 +134,6 @@ class StepMap:
         control = dataclasses.replace(control, duration=args.scales.duration)
         end, state = jax.tree.map(jnp.asarray, control.init(None, ts[0], ts[1], found.y, None, None, None, None))
         return y, Unchanging(result, jax.lax.stop_gradient(Going(Resumed(end - ts[0], state, jnp.array(True)), loads)))
-
-
-def _with_variations(of_y: Callable, directions: Inputs) -> Callable:
-    """With the variations along more directions."""
-
-    def varied(inputs):
-        (y, dy), aux = derived(of_y, directions)(inputs)
-        return with_variations(y, dy), aux
-
-    return varied
 
 
 def _taken_apart(ys: Array, orders: int) -> Any:

@@ -8,18 +8,15 @@ import diffrax as dfx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float, PyTree
 
 from .._mechanics.friction_treatment import Regularised, StickSlip
 from .._mechanics.projection import Baumgarte, NoStabilisation, Projection
 from .._model.event import Event
-from .._model.flat import StatesAt
 from .._model.numbers import number
-from .._model.signal import SinceOrigin
-from .._model.state_values import given_states, sampled, start_values
+from .._model.state_values import given_states, sampled
 from .._model.system import System
-from .._model.validation import check, parameters, state_and_params
+from .._model.validation import parameters, state_and_params
 from .._program.jit import compiled
 from .derivative_rule import differentiable
 from .first_order import EquationsOfMotion
@@ -27,6 +24,8 @@ from .formulation import Formulation
 from .integrate import SolverOptions
 from .results import RESULTS
 from .scales import tolerances_of
+from .solution_map import Inputs as Start
+from .solution_map import SolutionMap
 from .step_map import Going, Inputs, StepMap
 
 
@@ -101,12 +100,12 @@ class Stepper:
         states = {} if states is None else given_states(self.system, states, q0)
         rtol, atol = self._tolerances
         tolerances, inputs = tolerances_of(rtol, atol, q0), {name: params[name] for name in self.inputs}
-        start = q0, qdot0, params, t0, states
-        equations = _equations(self.system, self._options.formulation, start)
-        y, (result, going) = _started(StepMap(equations, self._options), start, self.dt, tolerances)
+        start = Start(None, q0, qdot0, params, tolerances, states)
+        equations = _equations(SolutionMap(self.system, self._options), start, t0)
+        y, (result, going) = _started(StepMap(equations, self._options), start, t0, self.dt)
         return StepState(y, t0, jnp.zeros_like(t0), jnp.array(0), inputs, going, result, tolerances, equations)
 
-    def __call__(self, state: StepState, inputs: Mapping[str, PyTree] | None = None) -> StepState:
+    def __call__(self, state: StepState, inputs: PyTree = None) -> StepState:
         """The state that is a step of dt later than `state`, with these `inputs` all the while, or those of the last step. Differentiable
         in all of it, forward and reverse, to any order.
         """
@@ -120,8 +119,9 @@ class Stepper:
         result = RESULTS.where(state.result == RESULTS.successful, result, state.result)
         return dataclasses.replace(state, _y=y, _time=times[1], _steps=steps, inputs=new, _going=going, result=result)
 
-    def _checked(self, inputs: Mapping[str, PyTree], state: StepState) -> dict[str, PyTree]:
+    def _checked(self, inputs: Any, state: StepState) -> dict[str, PyTree]:
         """Inputs as arrays, each like that at the start."""
+        _check_mapping(inputs, "inputs")
         if unknown := sorted(set(inputs) - set(self.inputs)):
             raise ValueError(
                 f"`inputs` must be among those that the stepper has, {', '.join(self.inputs) or 'none'}, but hold {', '.join(unknown)}. "
@@ -138,41 +138,29 @@ class Stepper:
         return given
 
 
+def _check_mapping(given: Any, name: str) -> None:
+    if not isinstance(given, Mapping):
+        raise TypeError(f"`{name}` must be a mapping from names to values, but is {given!r}. Name them.")
+
+
 def _differ(inputs: PyTree, before: PyTree) -> Bool[Array, ""]:
     """Whether some number is another than before."""
     differ = [jnp.any(new != old) for new, old in zip(*map(jax.tree.leaves, (inputs, before)), strict=True)]
     return jax.lax.stop_gradient(jnp.any(jnp.stack(differ)))
 
 
-def _at_start(system: System, start: tuple) -> StatesAt:
-    """The start as it is given, on the clock of the motion."""
-    q0, qdot0, params, t0, states = start
-    given = start_values(system, states, t0, q0, qdot0, params)
-    q, v = (ravel_pytree(tree)[0] for tree in (q0, qdot0))
-    return StatesAt(given, jnp.zeros_like(t0), q, v)
-
-
-def _equations(system: System, formulation: Formulation, start: tuple) -> EquationsOfMotion:
+def _equations(of: SolutionMap, start: Start, t0: Array) -> EquationsOfMotion:
     """The equations of motion, which are found while shapes are traced."""
     found = []
-
-    def traced(start):
-        q0, qdot0, params, t0, _ = start
-        at = _at_start(system, start)
-        check(system, t0, q0, qdot0, params, at.values)
-        found.append(EquationsOfMotion.of(system, q0, formulation, SinceOrigin.of(params, t0), at))
-        return at
-
-    jax.eval_shape(traced, start)
+    jax.eval_shape(lambda start, t0: found.append(of.equations(start, t0[None])[0]), start, t0)
     return found[-1]
 
 
 @compiled
-def _started(of: StepMap, start: tuple, dt, tolerances) -> tuple[Array, Any]:
+def _started(of: StepMap, start: Start, t0: Array, dt: Any) -> tuple[Array, Any]:
     """y at the start, and what is not differentiated."""
-    _, _, params, t0, _ = start
-    ts = jnp.stack([jnp.zeros_like(t0), jnp.asarray(dt, t0.dtype)])
-    return of.start(_at_start(of.equations.system, start), params, t0, ts, tolerances)
+    _, at = SolutionMap(of.equations.system, of.options).equations(start, t0[None])
+    return of.start(at, start.params, t0, jnp.stack([jnp.zeros_like(t0), jnp.asarray(dt, t0.dtype)]), start.tolerances)
 
 
 def stepper(
@@ -180,7 +168,7 @@ def stepper(
     dt: Any,
     params: PyTree = None,
     *,
-    inputs: Mapping[str, PyTree] | None = None,
+    inputs: PyTree = None,
     events: Mapping[str, Event] | None = None,
     solver: dfx.AbstractSolver | None = None,
     rtol: float | Array | None = None,
@@ -227,9 +215,9 @@ def stepper(
             f"`system` must have no sampled states, but has {', '.join(sampled(system))}. Update them in your own loop, and pass what they "
             "do as `inputs`."
         )
-    params, inputs = {} if params is None else params, {} if inputs is None else dict(inputs)
-    if not isinstance(params, Mapping):
-        raise TypeError(f"`params` must be a mapping from names to values, but is {params!r}. Name them.")
+    params, inputs = ({} if given is None else given for given in (params, inputs))
+    _check_mapping(params, "params")
+    _check_mapping(inputs, "inputs")
     options = SolverOptions.of(solver, Formulation(stabilisation, friction, False), max_steps)
     dt = number(dt, "`dt`", positive=True, cure="It is the length of a step.")
-    return Stepper(system, options, dt, dict(params), inputs, (rtol, atol))
+    return Stepper(system, options, dt, dict(params), dict(inputs), (rtol, atol))

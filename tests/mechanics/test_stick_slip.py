@@ -438,3 +438,11 @@ def test_friction_beside_a_constraint_of_constant_rows():
     motion = jl.simulate(slope, np.zeros(2), np.ones(2), np.linspace(0.0, 3.0, 31))
     top, turn = 1 / 1.1, 1 / 0.55
     np.testing.assert_allclose(motion.q[-1], np.full(2, top - 0.5 * 0.45 * (3 - turn) ** 2), rtol=1e-9)
+
+
+def test_more_elements_than_modes_can_be_numbered():
+    """Eighty blocks, each under a force of its own: those beyond their bound slide."""
+    blocks = jl.System(lambda qdot: 0.5 * qdot @ qdot, dissipation=lambda qdot, F: F * jnp.sum(jnp.abs(qdot)), force=lambda u: u)
+    u = np.linspace(-3, 3, 80)
+    found = jl.acceleration(blocks, np.zeros(80), np.zeros(80), {"F": 1.5, "u": u}).qddot
+    np.testing.assert_allclose(found, np.sign(u) * np.maximum(np.abs(u) - 1.5, 0), atol=1e-14)

@@ -177,6 +177,8 @@ def test_what_cannot_be_is_refused():
         stepper(state, {"w": 1.0})
     with pytest.raises(ValueError, match=r"`inputs\['u'\]` must be shaped as"):
         stepper(state, {"u": jnp.ones(2)})
+    with pytest.raises(TypeError, match="`inputs` must be a mapping"):
+        stepper(state, 1.0)
     with pytest.raises(ValueError, match="`dt` must be positive"):
         jl.stepper(block, 0.0)
     with pytest.raises(TypeError, match="`params` must be a mapping"):
@@ -201,8 +203,7 @@ def test_derivatives_by_many_numbers():
 def test_single_precision():
     """Steps and their states keep the precision that they are given."""
     stepper = jl.stepper(ball, 0.05, {"g": 9.81})
-    with pytest.warns(UserWarning, match="single precision"):
-        state = stepper.start(np.float32(1.0), np.float32(0.0))
+    state = stepper.start(np.float32(1.0), np.float32(0.0))
     state, q = rolled(stepper, state, length=20)
     assert q.dtype == np.float32
     motion = jl.simulate(ball, 1.0, 0.0, np.linspace(0, 1, 21), {"g": 9.81})
