@@ -36,9 +36,17 @@ class Determined(NamedTuple):
         return np.where(finite, np.where(loose, np.inf, np.sqrt(np.maximum(variance, 0))), np.nan)
 
 
-def determined_by(J: np.ndarray, gaps_J: np.ndarray, hidden: int | None = None) -> Determined:
-    """(JᵀJ)⁻¹ among the changes that open no gap, without the directions that do not show; how many these are, unless `hidden` says so."""
-    zero = max(ZERO, ZERO_ULPS * float(np.finfo(J.dtype).eps))
+def rounding_of(dtype: Any) -> float:
+    """What counts as zero beside one, of derivatives in this precision."""
+    return max(ZERO, ZERO_ULPS * float(np.finfo(dtype).eps))
+
+
+def determined_by(J: np.ndarray, gaps_J: np.ndarray, hidden: int | None = None, precision: Any = None) -> Determined:
+    """(JᵀJ)⁻¹ among the changes that open no gap, without the directions that do not show; how many these are, unless `hidden` says so.
+
+    `precision`: the type of numbers that J was computed in, if it is not its own.
+    """
+    zero = rounding_of(precision or J.dtype)
     J, gaps_J = J.astype(float), gaps_J.astype(float)
     size = np.linalg.norm(J, axis=0)
     scale = np.where(size > 0, 1 / np.where(size > 0, size, 1), 1)

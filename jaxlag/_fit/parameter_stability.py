@@ -39,7 +39,7 @@ def different_halves(minimum: Minimum, uncertainty: Uncertainty) -> Halves | Non
         return None
     both = _with_changes(J, p, _second_halves(minimum))
     gaps = np.asarray(minimum.found.gaps_jacobian)
-    known = determined_by(gathered(both), np.hstack([gaps, np.zeros((len(gaps), p))]))
+    known = determined_by(gathered(both), np.hstack([gaps, np.zeros((len(gaps), p))]), precision=minimum.x.dtype)
     own = np.flatnonzero(known.determined[-p:]) + J.size
     r = np.concatenate([-np.asarray(minimum.found.residuals)[:beside], np.nan_to_num(minimum.flat)])
     found = known.covariance @ transposed(both, r)

@@ -14,15 +14,13 @@ from .._model.system import System
 from .._model.validation import without_contacts, without_events
 from .base_parameters import nearby
 from .experiment import Experiment, validate_inputs
-from .identifiability import determined_by, undetermined
+from .identifiability import determined_by, rounding_of, undetermined
 from .parameters import Free
 from .rounding import plus_minus
 from .smoothing_spline import without_delay
 from .undetermined import on_undetermined
 from .weak_form import Record
 from .weak_regression import SLIDING, WeakFormProblem, best_estimate, half_widths, with_scatter
-
-LINEAR = 1e-9  # relative change of a Jacobian that counts as zero
 
 
 @dataclasses.dataclass(frozen=True, eq=False, repr=False)
@@ -186,17 +184,18 @@ def _start(records, given, free, bounds):
 def _is_linear(records, free):
     """Whether the Jacobian is the same at another point; refuses linear equations without a known term."""
     y = jnp.zeros(free.size)
+    nothing = rounding_of(y.dtype)
     elsewhere = y + 0.37 * jnp.cos(1.0 + jnp.arange(y.size))
     here = [record.form.linearised(free, y) for record in records]
     if not all(np.all(np.isfinite(part)) for parts in here for part in parts):
         return False
     for record, (_, J) in zip(records, here, strict=True):
-        if np.linalg.norm(J - record.form.linearised(free, elsewhere)[1]) > LINEAR * np.linalg.norm(J):
+        if np.linalg.norm(J - record.form.linearised(free, elsewhere)[1]) > nothing * np.linalg.norm(J):
             return False
     to_zero = -np.asarray(free.theta(y) / free.slope(y))
     known = sum(_sizes(record, terms + J @ to_zero) for record, (terms, J) in zip(records, here, strict=True))
     of_free = lambda sizes: sum(_sizes(record, np.abs(J) @ sizes) for record, (_, J) in zip(records, here, strict=True))
-    if np.all((known <= LINEAR * of_free(np.abs(to_zero))) | (of_free(np.ones(free.size)) == 0)):
+    if np.all((known <= nothing * of_free(np.abs(to_zero))) | (of_free(np.ones(free.size)) == 0)):
         raise ValueError(
             f"`free` must leave a known term in the equations of motion, but every term has a factor out of {', '.join(free.names)}: "
             "only their ratios are determined. Fix one of them."

@@ -9,7 +9,7 @@ from jax import lax
 from jaxtyping import Array, Float, Int
 
 from .._program.block_tridiagonal import Factors, factorised, positive_eigenvalues, solution
-from .._program.conditions import halved, repeated
+from .._program.conditions import halved, repeated, zeros_like
 from .._program.sparse_matrix import SparseMatrix, row_sums
 from .descent import STEPS, far_down
 
@@ -69,7 +69,7 @@ def _made_definite(K: SparseMatrix, added: Array) -> tuple[Array, Factors]:
         sound = jnp.all(jnp.isfinite(factors.inverse)) & (positive == 0)
         return ~sound & (added < 8 * largest)
 
-    nothing = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), jax.eval_shape(factors_with, added))
+    nothing = zeros_like(jax.eval_shape(factors_with, added))
     added, factors, _ = repeated(attempt, (added, nothing, added), is_indefinite)
     return added, factors
 

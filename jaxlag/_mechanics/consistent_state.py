@@ -51,8 +51,9 @@ class Consistent(NamedTuple):
     defined: Bool[Array, ""]
 
 
-def nearest_state(flat: Flat, t, q0, v0, free: Sequence[int] | None = None, *, found: bool = False) -> Consistent:
-    """The state on the constraints nearest to (q0, v0), in which only the `free` coordinates move; where it is `found`, itself.
+def nearest_state(flat: Flat, t, q0, v0, free: Sequence[int] | None = None, *, found: bool = False, decides: bool = True) -> Consistent:
+    """The state on the constraints nearest to (q0, v0), in which only the `free` coordinates move; where it is `found`, itself. It
+    `decides` the velocities that follow from the rest.
 
     M (q − q0) = Gᵀλ,  g(t, q) = 0  by Newton's method, with M = M(q0); then  M (v − v0) = Gᵀμ,  ψ(t, q, v) = 0  with M = M(q).
     Derivatives are those that these equations imply.
@@ -66,7 +67,8 @@ def nearest_state(flat: Flat, t, q0, v0, free: Sequence[int] | None = None, *, f
     positions = flat.holonomic(t, q0).size
     if given.size == 0:  # nothing to satisfy: saves the compilation of the search
         determined = is_determined(M, jnp.zeros((0, moving.size), q0.dtype))
-        return Consistent(q0, _with_decided_rates(stated, t, q0, v0), yes, determined, yes, _is_finite(M))
+        v = _with_decided_rates(stated, t, q0, v0) if decides else v0
+        return Consistent(q0, v, yes, determined, yes, _is_finite(M))
     q = q0
     if positions:
         if given.size > 2 * positions:  # velocity constraints may be all that holds a coordinate
@@ -77,7 +79,7 @@ def nearest_state(flat: Flat, t, q0, v0, free: Sequence[int] | None = None, *, f
     v, determined = _nearest_velocity(inertial_part(flat, t, q, v0), moving, t, q, v0, found)
     if found:
         return Consistent(q, v, yes, determined, yes, yes)
-    v = _with_decided_rates(stated, t, q, v)
+    v = _with_decided_rates(stated, t, q, v) if decides else v
 
     @undifferentiated
     def judged(t, q0, v0, q, v, M, given):
@@ -159,7 +161,7 @@ def _nearest_position(flat: Flat, moving, t, q0, M, found: bool) -> Float[Array,
             change = jnp.abs(found.x)  # of each coordinate in its own unit, until rounding makes it
             # Rows that depend on each other on the constraints alone hold more directions off them: one or two ever smaller steps
             # onto the constraints are followed by a larger one along them, which leads off them again.
-            is_off = jnp.any(jnp.isinf(step.reach))
+            is_off = jnp.any(jnp.isinf(step.reach.sizes))
             moves = jnp.any((change > 4 * eps * jnp.abs(w[:free])) & ((change < jnp.max(before, axis=0)) | (i < FEW) | is_off))
             return jnp.concatenate([w[:free] + found.x, found.multipliers]), jnp.stack([*before[1:], change]), moves, i + 1
 

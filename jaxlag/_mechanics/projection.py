@@ -52,9 +52,11 @@ class Projection:
         """None: the accelerations remain unchanged."""
 
     def project(
-        self, flat: Flat, t: Any, q: Float[Array, " n"], v: Float[Array, " n"], *, found: bool = False
+        self, flat: Flat, t: Any, q: Float[Array, " n"], v: Float[Array, " n"], *, found: bool = False, of_velocities: bool = True
     ) -> tuple[Float[Array, " n"], Float[Array, " n"]]:
-        """The state on the constraints that is nearest to this one, which is near already; or has its positions `found` on them."""
+        """The state on the constraints that is nearest to this one, which is near already; or has its positions `found` on them. Without
+        those `of_velocities`, these stay as they are.
+        """
         part, light = inertial_part(flat, t, q, v), without_inertia(flat)
         M = inertia(part, t, q, v)  # at the start serves throughout: corrections are small
 
@@ -69,15 +71,15 @@ class Projection:
         def on_velocities(t, q, v, M):
             psi, G, _ = velocity_rows(part, t, q, v)
             dv = saddle_point_beside(light, M, G, jnp.zeros_like(v), -psi, reach_of(v)).x
-            return with_first_order_rates(flat, t, q, _corrected(v, dv)).v
+            return with_first_order_rates(flat, t, q, corrected(v, dv)).v
 
         if (flat.holonomic_names or flat.sliders is not None) and not found:
             metric = metric_of_positions(part, M, t, q, v) if flat.holonomic_names else M
             q, _ = jax.lax.scan(lambda q, _: (newton(t, q, metric), None), q, length=self.iterations)
-        return q, on_velocities(t, q, v, M)
+        return q, on_velocities(t, q, v, M) if of_velocities else v
 
 
-def _corrected(v, dv):
+def corrected(v: Float[Array, " n"], dv: Float[Array, " n"]) -> Float[Array, " n"]:
     """v + dv, and zero where that is only rounding: what comes to rest is at rest."""
     left = v + dv
     nothing = jnp.abs(left) <= 4 * jnp.finfo(v.dtype).eps * jnp.abs(v)

@@ -4,7 +4,7 @@ Differentiated at constant rank. Source: Golub & Pereyra, SIAM J. Numer. Anal. 1
 """
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -32,15 +32,22 @@ class Beside(NamedTuple):
     change: Callable[[Float[Array, " m"]], Float[Array, "m n"]]
 
 
+class Reach(NamedTuple):
+    """How far what each row sees may go, or each coordinate, in directions that are barely held; and where that `counts`, if not always."""
+
+    sizes: Float[Array, " m"]
+    counts: Any = None
+
+
 class Request(NamedTuple):
     """Of a constrained solve, in the metric of M: the `rows` of G, what is asked of them, the `free` motion without them, and, where
-    that is given, how far what each row sees may `reach` in directions that are barely held, and where the state is `beside` them.
+    that is given, how far what each row sees may `reach`, and where the state is `beside` them.
     """
 
     rows: Float[Array, "m n"]
     c: Float[Array, "m k"]
     free: Float[Array, "n k"]
-    reach: Float[Array, " m"] | None
+    reach: Reach | None
     beside: Beside | None
 
 
@@ -89,7 +96,10 @@ def by_rows(asked: Request, D) -> tuple[Float[Array, "m m"], Bool[Array, ""]]:
     of_rows = lambda sizes: jnp.abs(U.T) @ sizes  # of what the rows in a direction have, so that what these do not touch has no say
     length = lambda x: of_rows(jnp.sqrt((rows != 0).astype(x.dtype) @ x**2))
     moved = rows.T @ (U @ (jnp.where(clear[:, None], step, 0) / jnp.where(clear, values, 1)[:, None]))
-    bound = FARTHER * (length(asked.free) + length(moved)) if asked.reach is None else of_rows(asked.reach)[:, None]
+    bound = FARTHER * (length(asked.free) + length(moved))
+    if (reach := asked.reach) is not None:
+        within = of_rows(reach.sizes)[:, None]
+        bound = within if reach.counts is None else jnp.where(reach.counts, within, bound)
     bound = bound / jnp.max(jnp.abs(U), axis=0)[:, None]  # a direction of many rows goes as far as what all of them touch
     blur = jnp.zeros_like(values) if asked.beside is None else _blur(asked.beside, D, U, values, clear)
     held = (clear | (seen & jnp.all(jnp.abs(step) <= bound, axis=1))) & (values > blur)

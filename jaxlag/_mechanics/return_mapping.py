@@ -35,7 +35,7 @@ def returned(flat: Flat, elements: FrictionElements, t, q, v) -> Float[Array, " 
         force = smooth_force(in_mode(flat, elements, resting), t, q, jnp.zeros_like(v))[coordinates] / slope
         beyond = jnp.abs(force) > (1 + 1e2 * jnp.finfo(v.dtype).eps) * bounds(elements, resting, t, q, v, nothing)[of]
         sigma = sigma.at[rows].set(jnp.where(beyond & (sigma[rows] == 0), jnp.sign(force), sigma[rows]))
-        return Projection(iterations=4).project(in_mode(flat, elements, sigma), t, q, v)[0], sigma
+        return Projection(iterations=4).project(in_mode(flat, elements, sigma), t, q, v, of_velocities=False)[0], sigma
 
     carry = q, jnp.zeros(elements.massless.size, v.dtype)
     if are_apart(in_mode(flat, elements, carry[1])):

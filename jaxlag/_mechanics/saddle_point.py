@@ -11,12 +11,11 @@ from jaxtyping import Array, Bool, Float
 
 from .._program.conditions import everywhere
 from .._program.recursive_elimination import Factors as Articulated
-from .._program.scalarise import scalarised
 from .._program.sparse_jacobian import MANY
 from .._program.sparse_matrix import SparseMatrix, dense
 from . import block_saddle_point, sparse_saddle_point
 from .augmented_inertia import augmented
-from .pseudo_inverse import Beside, Constraints, Inverse, Request, applied, by_rows, inverse_of
+from .pseudo_inverse import Beside, Constraints, Inverse, Reach, Request, applied, by_rows, inverse_of
 from .structured_inertia import MOST_FULL, StructuredInertia, by_inertia, is_positive, root_of_inverse
 from .structured_inertia import factorised as structure_factorised
 
@@ -33,12 +32,12 @@ class Sound(NamedTuple):
     satisfied: Bool[Array, ""]
 
 
-def reach_of(state: Float[Array, " n"], off: Bool[Array, ""] | None = None) -> Float[Array, " n"]:
+def reach_of(state: Float[Array, " n"], off: Bool[Array, ""] | None = None) -> Reach:
     """How far each number of a state may go in a direction that is barely held, where a solve puts the state right: by rounding alone,
     or, where it is clearly `off`, as far as need be.
     """
     near = jnp.finfo(state.dtype).eps ** 0.5 * jnp.abs(jax.lax.stop_gradient(state))
-    return near if off is None else jnp.where(off, jnp.inf, near)
+    return Reach(near if off is None else jnp.where(off, jnp.inf, near))
 
 
 class SaddlePoint(NamedTuple):
@@ -49,9 +48,7 @@ class SaddlePoint(NamedTuple):
     sound: Sound
 
 
-def saddle_point(
-    M: lx.AbstractLinearOperator, G: Rows, f, c, reach: Float[Array, " n"] | None = None, near: Constraints | None = None
-) -> SaddlePoint:
+def saddle_point(M: lx.AbstractLinearOperator, G: Rows, f, c, reach: Reach | None = None, near: Constraints | None = None) -> SaddlePoint:
     """The unique x and the λ of least norm with M x = f + Gᵀλ and G x = c.
 
     f and c are vectors, or as many columns each. M need be positive definite on the null space of G only, and rows of G may
@@ -125,7 +122,7 @@ def _way(M):
 
 
 def saddle_point_beside(
-    apart: np.ndarray, M: lx.AbstractLinearOperator, G: Rows, f, c, reach: Float[Array, " n"] | None = None, near: Constraints | None = None
+    apart: np.ndarray, M: lx.AbstractLinearOperator, G: Rows, f, c, reach: Reach | None = None, near: Constraints | None = None
 ) -> SaddlePoint:
     """`saddle_point` where few coordinates stand `apart`, which M and G couple with none: x is zero there, and no time goes into them."""
     kept = np.setdiff1d(np.arange(f.size), apart)
@@ -135,11 +132,11 @@ def saddle_point_beside(
         near = Constraints(near.off, lambda change, rows=near.rows: rows(jnp.zeros_like(f).at[kept].set(change))[:, kept])
     is_diagonal = isinstance(M, lx.DiagonalLinearOperator)
     part = lx.DiagonalLinearOperator(M.diagonal[kept]) if is_diagonal else lx.MatrixLinearOperator(M.as_matrix()[np.ix_(kept, kept)])
-    found = saddle_point(part, G[:, kept], f[kept], c, None if reach is None else reach[kept], near)
+    found = saddle_point(part, G[:, kept], f[kept], c, reach and reach._replace(sizes=reach.sizes[kept]), near)
     return found._replace(x=jnp.zeros_like(f).at[kept].set(found.x))
 
 
-def saddle_solver(M: lx.AbstractLinearOperator, G: Rows, f, c, reach: Float[Array, " n"] | None = None) -> Callable:
+def saddle_solver(M: lx.AbstractLinearOperator, G: Rows, f, c, reach: Reach | None = None) -> Callable:
     """(f, c) ↦ (x, λ) as of `saddle_point`, for other vectors f and c; what G barely holds is held as it is for these."""
     M, G = _for_rows(M, G)
 
@@ -195,8 +192,7 @@ def _factorised(M, G, f, c, reach, near=None) -> Factors:
         return Request(by_root(G.T).T, c, by_root(_load(G, W, f, c)), _reach_of_rows(M, G, W, reach), beside)
 
     S = G @ moved(G.T)
-    judged = scalarised(by_rows) if len(G) == 2 and near is None else by_rows
-    inverse, satisfied = inverse_of(S, c, lambda D: judged(request(), D))
+    inverse, satisfied = inverse_of(S, c, lambda D: by_rows(request(), D))
     return Factors(W, cholesky, inverse, determined, satisfied)
 
 
@@ -205,9 +201,9 @@ def _reach_of_rows(M, G, W, reach):
     if reach is None:
         return None
     if isinstance(M, StructuredInertia):
-        return jnp.full(len(G), jnp.sqrt(reach @ M.mv(reach)))
-    of_each = jnp.sqrt(jnp.diagonal(M.as_matrix()) + (0 if W is None else W @ G**2)) * reach
-    return jnp.linalg.norm(jnp.where(G != 0, of_each, 0), axis=1)
+        return reach._replace(sizes=jnp.full(len(G), jnp.sqrt(reach.sizes @ M.mv(reach.sizes))))
+    of_each = jnp.sqrt(jnp.diagonal(M.as_matrix()) + (0 if W is None else W @ G**2)) * reach.sizes
+    return reach._replace(sizes=jnp.linalg.norm(jnp.where(G != 0, of_each, 0), axis=1))
 
 
 def _load(G, W, f, c):
@@ -226,8 +222,13 @@ def _by_inertia(M, G, W, cholesky):
 
 @jax.custom_jvp
 def _solution(M, G, f, c, factors):
+    """What rows hold still is still: of x that cancels there is only rounding, as a compiler leaves it that joins products and sums."""
     solve, _ = _solver(M, G, factors)
-    return solve(f, c)
+    x, multipliers = solve(f, c)
+    if isinstance(G, SparseMatrix) or not c.size:
+        return x, multipliers
+    pull = _by_inertia(M, G, factors.W, factors.cholesky)(G.T @ multipliers)
+    return jnp.where(jnp.abs(x) <= 4 * jnp.finfo(x.dtype).eps * jnp.abs(pull), 0, x), multipliers
 
 
 @_solution.defjvp

@@ -19,7 +19,7 @@ from jaxtyping import Array, Bool, Float
 from .._model.flat import Flat, variant
 from .._program.implicit import undifferentiated
 from .._program.scalarise import scalarised
-from .constrained_acceleration import Impulse, constrained_motion
+from .constrained_acceleration import Correction, Impulse, constrained_motion
 from .constrained_slip import directed, extent_of, freely, on_constraints
 from .friction_elements import FrictionElements, find_elements
 from .load_sharing import may_share, shared
@@ -90,21 +90,34 @@ MOST_OPERATIONS = 1200
 
 
 def friction(
-    flat: Flat, elements: FrictionElements, sigma, t, q, v, feedback=None, impulse: Impulse | None = None, shares: Any = True
+    flat: Flat,
+    elements: FrictionElements,
+    sigma,
+    t,
+    q,
+    v,
+    feedback=None,
+    impulse: Impulse | None = None,
+    correction: Correction | None = None,
+    shares: Any = True,
 ) -> Friction:
     """Friction forces of elements on the constraints; `margin` < 0 where a mode has ended: the slip reverses, or a bound is exceeded.
 
-    Of an impact, friction begins from rest, and q̇⁺, Λ and the slip behind stand in the place of q̈, λ and the slip rate. Where nothing but
-    accelerations is asked for, no admissible share of loads is looked for, which have the same motion: not unless it `shares`.
+    Of an impact, friction begins from rest, and q̇⁺, Λ and the slip behind stand in the place of q̈, λ and the slip rate; of a state that is
+    put back on its constraints, what it takes stands in the place of q̈, and the rest is of no use. Where nothing but accelerations is
+    asked for, no admissible share of loads is looked for, which have the same motion: not unless it `shares`.
     """
-    of_state = lambda sigma, t, q, v, impulse: _friction(flat, elements, sigma, t, q, v, feedback, impulse, shares)
-    return scalarised(of_state, limit=MOST_OPERATIONS, apart=True)(sigma, t, q, v, impulse)
+
+    def of_state(sigma, t, q, v, impulse, correction):
+        return _friction(flat, elements, sigma, t, q, v, feedback, impulse, correction, shares)
+
+    return scalarised(of_state, limit=MOST_OPERATIONS, apart=True)(sigma, t, q, v, impulse, correction)
 
 
-def _friction(flat, elements, sigma, t, q, v, feedback, impulse, shares):
+def _friction(flat, elements, sigma, t, q, v, feedback, impulse, correction, shares):
     stuck, of = sticking(elements, sigma), elements.element_of_row
     mode = in_mode(flat, elements, sigma)
-    v, (qddot, multipliers, _) = constrained_motion(mode, t, q, v, feedback, impulse)
+    v, (qddot, multipliers, _) = constrained_motion(mode, t, q, v, feedback, impulse, correction)
     slip, slip_rate = _slip_and_rate(elements, t, q, v, qddot, impulse)
     if np.any(elements.is_quasistatic):  # what has no inertia slips at once
         still = slip_of(elements, t, q, v, 1e2 * jnp.finfo(v.dtype).eps * jnp.abs(v))

@@ -10,6 +10,7 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float, PyTree
 
+from .._program.conditions import zeros_like
 from .._program.sparse_jacobian import empty_rows
 from .contact import PoissonRestitution
 from .event import Every, merged
@@ -125,7 +126,7 @@ class _Bound:
 
     def __init__(self, system: System, like: PyTree, params: PyTree, states: Mapping[str, PyTree]):
         self.system, self.params, self.states = system, params, states
-        self.zeros = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), like)
+        self.zeros = zeros_like(like)
         zero, self.unravel = ravel_pytree(self.zeros)
         t = jnp.zeros((), zero.dtype)
         shapes = [

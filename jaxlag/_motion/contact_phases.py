@@ -21,9 +21,11 @@ from .._mechanics.slip_direction import without_force
 from .._mechanics.stick_slip import Friction, ModeSelection
 from .._mechanics.stick_slip import Search as ModeSearch
 from .._model.flat import rows_by_name
-from .mode_changes import Touch, approach, behind_impact, friction_at, resting_at, touching_at, with_closed
+from .._program.conditions import zeros_like
+from .mode_changes import Approach, Touch, approach, behind_impact, friction_at, resting_at, touching_at, with_closed
+from .split import Piece
 from .state_vector import Parts
-from .step_machine import ALONE, DONE, SELECT, STRIKE, Decision, Point, Step, Turn, zeros
+from .step_machine import ALONE, BACK, DONE, SELECT, STAGE, STRIKE, Decision, Point, Step, Turn
 
 MOTION, COMPRESSION, EXPANSION = range(3)
 
@@ -57,6 +59,12 @@ class ContactStep(Step):
         """Those of a step, and those of contacts."""
         return [*super().decisions, self._alone, self._struck]
 
+    @property
+    def no_impulse(self) -> Impulse:
+        """Of no contact."""
+        number = jnp.zeros(self.equations.contacts, self.y0.dtype)
+        return Impulse(number, number, jnp.array(False))
+
     def _unchanged(self) -> Change:
         y, elements, modes = self.y0, self.equations.elements, self.equations.modes
         number, none = jnp.zeros(self.equations.contacts, y.dtype), jnp.zeros(self.equations.contacts, bool)
@@ -65,8 +73,8 @@ class ContactStep(Step):
         terms = (*rows_by_name(flat), *(friction.rows_of_term if elements else ()))
         zero, yes = jnp.zeros((), y.dtype), jnp.array(True)
         total = Phase(y[: self.equations.size], number, dict.fromkeys(terms, zero), yes, yes, zero, zero)
-        impulse, loose = Impulse(number, number, jnp.array(False)), jnp.stack([number, number])
-        return Change(jnp.array(MOTION), y, jnp.zeros(modes, bool), jnp.zeros(modes, y.dtype), touch, impulse, loose, total)
+        loose = jnp.stack([number, number])
+        return Change(jnp.array(MOTION), y, jnp.zeros(modes, bool), jnp.zeros(modes, y.dtype), touch, self.no_impulse, loose, total)
 
     def _begun(self, y, t) -> ModeSearch:
         none = jnp.zeros(self.equations.elements, bool)
@@ -76,11 +84,22 @@ class ContactStep(Step):
 
     def impulse(self, turn: Turn) -> Impulse:
         """The impact that is asked about."""
-        return turn.change.impulse._replace(happens=turn.change.is_impact & (turn.kind >= SELECT))
+        return turn.change.impulse._replace(happens=turn.change.is_impact & (turn.kind >= SELECT) & (turn.kind != BACK))
 
-    def arriving(self, path, start, end):
+    def corrections(self, turn: Turn):
+        """None where nothing is held."""
+        holds = self.equations.system.constraints or self.equations.elements
+        closed = self.equations.parts(jnp.where(turn.kind == STAGE, turn.y0, turn.back.there)).closed
+        return self.equations.corrections[1] if holds else jnp.where(jnp.any(closed > 0.5), self.equations.corrections[1], 0)
+
+    def arriving(self, piece: Piece, start, end):
         """Which gaps may close, by bounds of them along the path."""
-        return approach(self.equations, path, start, end, self.args).may_arrive
+        return self._approach(piece, start, end).may_arrive
+
+    def _approach(self, piece: Piece, start, end) -> Approach:
+        """What is known of gaps along a piece."""
+        by_share = self.path(piece, jnp.zeros_like(start), jnp.ones_like(start))
+        return approach(self.equations, by_share, start, end, self.args)
 
     def asked(self, turn: Turn):
         """y on its way, in the mode and with the contacts that are asked about; alone, without friction and contacts."""
@@ -118,7 +137,7 @@ class ContactStep(Step):
         touch = touching_at(self.equations, flat, turn.end, parts, self.args, of_contact, of_positions)
         is_impact = jnp.any(touch.hits)
         impulse = of_compression(flat, turn.end, parts.q, parts.v, touch.e)._replace(happens=is_impact)
-        nothing = zeros(turn.change.total)._replace(v=parts.v, consistent=jnp.array(True), impulsive=jnp.array(True))
+        nothing = zeros_like(turn.change.total)._replace(v=parts.v, consistent=jnp.array(True), impulsive=jnp.array(True))
         loose = jnp.zeros_like(turn.change.loose)
         phase = jnp.where(is_impact, COMPRESSION, MOTION)
         change = Change(phase, turn.piece.y, ended, moved, touch, impulse, loose, nothing)
@@ -138,7 +157,7 @@ class ContactStep(Step):
     def unless_far(self, turn: Turn, looks) -> Turn:
         """Done, where bounds say that all gaps stay open along a piece."""
         start, end = jax.lax.stop_gradient((turn.start, turn.end))
-        stays_away = approach(self.equations, self.path(turn.piece, start, end), start, end, self.args).stays_away
+        stays_away = self._approach(turn.piece, start, end).stays_away
         if stays_away is None:
             return turn
         is_far = jax.lax.cond(looks, lambda: stays_away(start, end), lambda: jnp.array(False))

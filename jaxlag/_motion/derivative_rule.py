@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
 
-from .._program.conditions import everywhere
+from .._program.conditions import everywhere, zeros_like
 from .._program.jit import compiled, jitted
 from .unreached import rows_reached, with_unreached
 from .variational import derived, pushforward, split_varying
@@ -217,7 +217,7 @@ def pulled(of: DifferentiableMap, varying: Any, constant: Any, ts: Any, dy: Any)
 def _unless_zero(of_vector, vector):
     """A product of the Jacobian and a vector; where that is zero, without a motion."""
     like = jax.eval_shape(of_vector, vector)
-    nothing = lambda _: jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), like)
+    nothing = lambda _: zeros_like(like)
     is_zero = everywhere(jnp.all(jnp.array([jnp.all(leaf == 0) for leaf in jax.tree.leaves(vector)])))
     return jax.lax.cond(is_zero, nothing, of_vector, vector)
 

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, PyTree
 
-from .._mechanics.constrained_acceleration import Impulse, constrained_acceleration
+from .._mechanics.constrained_acceleration import Correction, Impulse, constrained_acceleration
 from .._mechanics.constrained_slip import Left, left_by_constraints, on_constraints
 from .._mechanics.contact import free, in_contact
 from .._mechanics.friction_elements import FrictionElements, light_coordinates, without_friction
@@ -19,8 +19,9 @@ from .._mechanics.impact import check_impacts, of_impulses
 from .._mechanics.load_sharing import may_share
 from .._mechanics.massless import with_first_order_rates
 from .._mechanics.power import energy_exchange, listed_powers
-from .._mechanics.projection import Projection
+from .._mechanics.projection import Projection, corrected
 from .._mechanics.saddle_point import SaddlePoint
+from .._mechanics.sliders import with_sliders_returned
 from .._mechanics.stick_slip import Friction, friction, in_mode, redirected, slip_of, sticking
 from .._mechanics.surfaces import bends_by_position
 from .._model.flat import Flat, StatesAt, bind
@@ -32,7 +33,7 @@ from .._program.scalarise import scalarised
 from .._program.walker import used_arguments
 from .formulation import PROJECTION, Formulation
 from .held_sides import on_held_sides
-from .interval_inputs import at_events, called_elsewhere, pieces_at, sees_time, values_of, warn_of_delays
+from .interval_inputs import at_events, called_elsewhere, follows_time, pieces_at, values_of, warn_of_delays
 from .protocol import Arguments
 from .state_vector import Parts
 
@@ -56,6 +57,7 @@ class EquationsOfMotion:
     entangled: bool = False  # whether elements of friction may share their forces in more than one way, or constraints drive their slips
     sided: bool = False  # whether functions choose by the position, perhaps across the surface of an event
     sees_time: bool = False  # whether functions ask for the time, beside signals at that time
+    follows_time: bool = True  # whether they depend on the time at all
 
     @classmethod
     def of(cls, system: System, q0: PyTree, formulation: Formulation, params: PyTree, at: StatesAt) -> "EquationsOfMotion":
@@ -71,8 +73,9 @@ class EquationsOfMotion:
             driving = (k for k, signal in enumerate(nonsmooth_signals(used)) if any(jax.tree.leaves(signal)))
             alone = dataclasses.replace(alone, elsewhere=elsewhere, driving=frozenset(driving))
         light = light_coordinates(alone.flat_at(params, at))
-        sees = sees_time(lambda params: values_of(alone.flat_at(params, at), *at[1:]), system, params)
-        alone = dataclasses.replace(alone, light=tuple(map(int, light)), sees_time=sees)
+        at_time = lambda params, t: values_of(alone.flat_at(params, at._replace(t=t)), t, *at[2:])
+        follows, sees = follows_time(at_time, system, params, at.t)
+        alone = dataclasses.replace(alone, light=tuple(map(int, light)), sees_time=sees, follows_time=follows)
         if any(callable(event.when) for _, event in system.events):
             alone = dataclasses.replace(alone, sided=bends_by_position(system, alone.flat_at(params, at), *at[1:]))
         elements = formulation.friction.elements(alone.flat_at(params, at))
@@ -157,13 +160,22 @@ class EquationsOfMotion:
         followed = {self.size + i for i in self.light}
         return tuple(i not in followed for i in range(2 * self.size + self.states.size))
 
-    def parts(self, y) -> Parts:
-        """y, taken apart."""
+    @property
+    def sizes(self) -> tuple[int, ...]:
+        """Of the parts of y."""
         beside = self.states.size, self.sampled.size, len(self.works)
         of_friction = self.rows, self.elements, min(self.elements, 1), self.elements
         of_events = self.events, self.events, self.seen, min(self.events, 1)
-        sizes = [self.size, self.size, *beside, *of_friction, *[self.contacts] * 5, *of_events]
-        return Parts(*jnp.split(y, np.cumsum(sizes)[:-1]))
+        return (self.size, self.size, *beside, *of_friction, *[self.contacts] * 5, *of_events)
+
+    @property
+    def width(self) -> int:
+        """The size of y."""
+        return sum(self.sizes)
+
+    def parts(self, y) -> Parts:
+        """y, taken apart."""
+        return Parts(*jnp.split(y, np.cumsum(self.sizes)[:-1]))
 
     @property
     def seen(self) -> int:
@@ -224,12 +236,60 @@ class EquationsOfMotion:
         return _rates(self, t, y, args)
 
     def rates_and_friction(
-        self, t, parts: Parts, args: Arguments, impulse: Impulse | None = None, shares: Any = True
+        self, t, parts: Parts, args: Arguments, impulse: Impulse | None = None, correction: Correction | None = None, shares: Any = True
     ) -> tuple[Array, Friction]:
         """ẏ and the friction in the mode of `parts`, by one evaluation, where friction and contact alone change modes; or, of an `impulse`
-        that happens, the friction of an impact. For rates alone, loads need not be shared.
+        that happens, the friction of an impact; or of a `correction`, that. For rates alone, loads need not be shared.
         """
-        return _rates_and_friction(self, t, parts, self._without_scales(args), impulse, shares)
+        correction, shares = jax.tree.map(lambda x: jnp.asarray(x, bool), (correction, shares))  # so that it is traced once
+        return _rates_and_friction(self, t, parts, self._without_scales(args), impulse, correction, shares)
+
+    @property
+    def corrections(self) -> tuple[int, int]:
+        """How many evaluations put positions back on their constraints, and how many all of a state: behind positions stand velocities,
+        and those that follow from the rest.
+        """
+        assert self.projection is not None  # asked where there is something to keep
+        holds = self.system.holonomic or self.contacts or self.light
+        of_positions = self.projection.iterations if holds else 0
+        return of_positions, of_positions + 1 + bool(self.light)
+
+    def correction(self, k) -> Correction:
+        """The one of this number, none of a negative one."""
+        of_positions, _ = self.corrections
+        return Correction((k >= 0) & (k < of_positions), k == of_positions)
+
+    def next_correction(self, parts: Parts, found: Friction, k) -> Any:
+        """The number of the one behind that of this number: Newton's steps square what is left, so that a small one is the last."""
+        of_positions, _ = self.corrections
+        small = jnp.all(jnp.abs(found.qddot) <= jnp.finfo(parts.q.dtype).eps ** 0.5 * jnp.abs(parts.q))
+        return jnp.where(small & (k >= 0) & (k < of_positions), of_positions, k + 1)
+
+    def corrected(self, t, parts: Parts, args: Arguments, found: Friction, k) -> Parts:
+        """With what the correction of this number has found."""
+        q, v, (of_positions, all_of_them) = parts.q, parts.v, self.corrections
+        if of_positions:
+            moved = q + found.qddot
+            if self.light:
+                moved = self._with_sliders_returned(t, parts, args, moved)
+            q = jnp.where(k < of_positions, moved, q)
+        v = jnp.where(k == of_positions, corrected(v, found.qddot), v)
+        return parts._replace(q=q, v=jnp.where(k == all_of_them - 1, found.qdot, v) if self.light else v)
+
+    def _with_sliders_returned(self, t, parts: Parts, args: Arguments, q):
+        _, mode, _ = self.mode(t, parts, args)
+        return q if mode.sliders is None else with_sliders_returned(mode, t, q)
+
+    def put_back(self, t, parts: Parts, q, v, args: Arguments) -> Float[Array, " y"]:
+        """y with this state in the place of its own, which was near: the work of that is counted, and slip turns with it."""
+        flat, mode, elements = self.mode(t, parts, args)
+        works, sigma = parts.works, parts.sigma
+        if self.works:
+            lift = energy_exchange(mode, t, q, v)[0] - energy_exchange(mode, t, parts.q, parts.v)[0]
+            works = works.at[self.works.index(PROJECTION)].add(lift)
+        if elements is not None:
+            sigma = redirected(elements, sigma, parts.held > 0, t, q, v)
+        return parts._replace(q=q, v=v, works=works, sigma=sigma).y
 
     def rubbing(self, t, parts: Parts, args: Arguments) -> tuple[Flat, FrictionElements]:
         """The system with its closed contacts, and its elements of dry friction, of which there may be none."""
@@ -276,14 +336,16 @@ def _rates(equations: EquationsOfMotion, t, y, args):
 
 
 @jitted
-def _rates_and_friction(equations: EquationsOfMotion, t, parts: Parts, args, impulse: Impulse | None, shares) -> tuple[Array, Friction]:
+def _rates_and_friction(
+    equations: EquationsOfMotion, t, parts: Parts, args, impulse: Impulse | None, correction: Correction | None, shares
+) -> tuple[Array, Friction]:
     q, v = parts.q, parts.v
     flat, elements = equations.rubbing(t, parts, args)
     if equations.elements:
         elements = on_constraints(flat, elements, t, q, v, lambda: _left_by_constraints(equations, t, parts, args))
     there, rubbing = (flat, elements) if impulse is None else of_impulses(flat, elements, t, q, v, impulse)
     assert rubbing is not None  # as many as there are elements
-    found = friction(there, rubbing, parts.sigma, t, q, v, impulse=impulse, shares=shares)
+    found = friction(there, rubbing, parts.sigma, t, q, v, impulse=impulse, correction=correction, shares=shares)
     v, qddot = found.qdot, found.qddot.at[np.array(equations.light, int)].set(0)
     powers = listed_powers(in_mode(flat, elements, parts.sigma), t, q, v) if equations.works else parts.works
     stuck = jnp.maximum(sticking(elements, parts.sigma).astype(q.dtype), parts.held)
@@ -325,15 +387,10 @@ def _updated(equations: EquationsOfMotion, t, y, args, due):
 @jitted
 def _projected(equations: EquationsOfMotion, t, y, args, found):
     parts = equations.parts(y)
-    q, v, works, sigma = parts.q, parts.v, parts.works, parts.sigma
-    flat, mode, elements = equations.mode(t, parts, args)
+    q, v = parts.q, parts.v
+    flat, mode, _ = equations.mode(t, parts, args)
     assert equations.projection is not None  # asked where there is something to keep
     projection = equations.projection
     of_none = (lambda: (q, v)) if flat.rows == equations.contacts else lambda: projection.project(free(mode), t, q, v, found=found)
     on_q, on_v = equations.where_closed(parts, lambda: projection.project(mode, t, q, v, found=found), of_none)
-    if equations.works:
-        lift = energy_exchange(mode, t, on_q, on_v)[0] - energy_exchange(mode, t, q, v)[0]
-        works = works.at[equations.works.index(PROJECTION)].add(lift)
-    if elements is not None:
-        sigma = redirected(elements, sigma, parts.held > 0, t, on_q, on_v)
-    return parts._replace(q=on_q, v=on_v, works=works, sigma=sigma).y
+    return equations.put_back(t, parts, on_q, on_v, args)

@@ -19,6 +19,7 @@ from .._model.flat import Flat, StatesAt
 from .._model.numbers import count
 from .._model.signal import moves_smoothly, nonsmooth_signals
 from .._program.single_kernel import in_one_kernel
+from .evaluated_samples import rows_of
 from .events import begun
 from .first_order import EquationsOfMotion
 from .formulation import Formulation
@@ -131,7 +132,8 @@ def _nearest(equations: EquationsOfMotion, flat: Flat, at: StatesAt, params, sea
     _, t0, q, v = at
     if search != "nothing":
         flat = free(flat)
-        return nearest_state(flat, t0, outside(flat, t0, q, v), v, found=search == "derivative")
+        decides = not equations.elements  # with its mode friction does
+        return nearest_state(flat, t0, outside(flat, t0, q, v), v, found=search == "derivative", decides=decides)
     yes = jnp.array(True)
     if equations.elements:  # what sticks would hold directions, too
         determined = has_inertia(flat, t0, q, v)
@@ -174,14 +176,19 @@ def states_at(
     return by_diffrax(equations, options, adjoint, t0, y0, ts, args, tolerances)
 
 
-def begins_in_steps(equations: FirstOrderSystem, options: SolverOptions, params: PyTree, reverse: bool, varied: bool) -> bool:
+def begins_in_steps(equations: FirstOrderSystem, options: SolverOptions, params: PyTree, reverse: bool) -> bool:
     """Whether the first step finds the mode of friction and contact at the start, by the evaluation of all others: not where slip begins in
-    a plane, whose direction turns with all that it depends on, nor where coordinates without inertia have to be put where they can be.
+    a plane, whose direction turns with all that it depends on.
     """
     if not isinstance(equations, EquationsOfMotion) or (options.adjoint and not has_nodes(equations, params)):
         return False
-    one = has_one_evaluation(equations, options.solver, reverse, varied)
-    return one and equations.rows == equations.elements and not equations.light
+    one = has_one_evaluation(equations, options.solver, reverse)
+    return one and equations.rows == equations.elements
+
+
+def in_rows(equations: EquationsOfMotion, options: SolverOptions, params: PyTree, reverse: bool) -> bool:
+    """Whether samples are between steps, and come from these as rows of `evaluated_samples`."""
+    return not (options.adjoint or has_nodes(equations, params)) and has_one_evaluation(equations, options.solver, reverse)
 
 
 def _refuse_adjoint(adjoint: dfx.AbstractAdjoint | None) -> None:
@@ -228,7 +235,7 @@ def _variations(equations: FirstOrderSystem) -> int:
     return 1 + _variations(equations.equations) if isinstance(equations, VariationalEquations) else 0
 
 
-def _wrapped(options, equations, projected, adjoint, start, varied: bool = False, begins: bool = False):
+def _wrapped(options, equations, projected, adjoint, start, begins: bool = False):
     """The chosen solver, with what the equations ask for at the ends of its steps."""
     solver = in_structure(options.solver, equations, *start)
     if isinstance(adjoint, dfx.ForwardMode):
@@ -237,7 +244,7 @@ def _wrapped(options, equations, projected, adjoint, start, varied: bool = False
         elif isinstance(solver, dfx.AbstractRungeKutta) and solver.scan_kind is None:
             solver = dataclasses.replace(solver, scan_kind="lax")  # as diffrax does for a solver that is not wrapped
     if isinstance(equations, EquationsOfMotion) and equations.modes:
-        if has_one_evaluation(equations, solver, not isinstance(adjoint, dfx.ForwardMode), varied):
+        if has_one_evaluation(equations, solver, not isinstance(adjoint, dfx.ForwardMode)):
             return OneEvaluationSolver(solver, projected, equations, reverse=False, begins=begins)
         return StickSlipSolver(solver, projected, equations, reverse=not isinstance(adjoint, dfx.ForwardMode))
     return ProjectedSolver(solver, projected, equations)
@@ -264,22 +271,25 @@ def in_one_loop(
     begins=False,
     resumed: Resumed | None = None,
 ) -> tuple[Array, RESULTS, dict]:
-    """States at the samples as `states_at`, with their variations along directions of (params, t0) for each order.
-
-    A motion that is `resumed` has been told of its loads.
+    """States at the samples as `states_at`, with their variations along directions of (params, t0) for each order; where they
+    are `in_rows`, with friction. A motion that is `resumed` has been told of its loads.
     """
     adjoint = dfx.RecursiveCheckpointAdjoint() if reverse else dfx.ForwardMode()
     meter, dense = Meter() if options.progress else dfx.NoProgressMeter(), not (has_nodes(equations, args.params) or resumed)
     back = in_one_kernel(equations.projected) if dense else equations.projected
-    solver = _wrapped(options, equations, back if equations.projection else None, adjoint, (t0, y0, args), bool(directions), begins)
+    solver = _wrapped(options, equations, back if equations.projection else None, adjoint, (t0, y0, args), begins)
     if resumed is None:
         args = told_of_loads(equations, t0, y0[(..., *[0] * len(directions))], args, begins)
     numbers = y0, t0, args, ts, tolerances
     kind = {"variations": _variations(equations), "reverse": reverse, "dense": dense, "resumed": resumed}
     ys, (result, stats) = integrated(equations, solver, options.max_steps, meter, *numbers, directions, **kind)
-    if dense and equations.projection:
-        along = [(of_params, None) for of_params, _ in directions]
-        projected = varied_along(lambda y, given: (equations.projected(given[1], y, args._replace(params=given[0])), None), along)
+    of_params = tuple(of_params for of_params, _ in directions)
+    if dense and isinstance(solver, OneEvaluationSolver):
+        ys, last_y = rows_of(solver.equations, ts, ys, stats["last"], args._replace(scales=None), of_params)
+        stats = stats | {"last": jax.lax.stop_gradient((stats["last"][0], last_y))}
+    elif dense and equations.projection:
+        back = lambda y, given: (equations.projected(given[1], y, args._replace(params=given[0])), None)
+        projected = varied_along(back, [(of_one, None) for of_one in of_params])
         ys = jax.vmap(lambda t, y: projected(y, (args.params, t))[0])(ts, ys)
     return ys, from_diffrax(result), stats
 

@@ -181,13 +181,16 @@ def at_events(system: System, flat: Flat, t, q, v) -> PyTree:
     return flat.witnesses(t, q, v, jnp.zeros(flat.rows, v.dtype)), [flat.happened(name, t, q, v) for name in changing]
 
 
-def sees_time(values: Callable, system: System, params: PyTree) -> bool:
-    """Whether functions ask for the time, beside signals at that time; `values(params)` is what those that are no events' return."""
+def follows_time(values: Callable, system: System, params: PyTree, t: Array) -> tuple[bool, bool]:
+    """Whether functions depend on the time, and whether they ask for it, beside signals at that time; `values(params, t)` is what those
+    that are no events' return.
+    """
     if not isinstance(params, SinceOrigin):
-        return False
+        return True, False
     of_events = [function for _, event in system.events for function in (event.when, event.then) if callable(function)]
-    of_origin = lambda origin: values(dataclasses.replace(params, origin=origin))
-    return any(needs(function, "t") for function in of_events) or bool(used_arguments(of_origin, params.origin)[0])
+    of_times = lambda t, origin: values(dataclasses.replace(params, origin=origin), t)
+    follows, sees = used_arguments(of_times, t, params.origin)
+    return bool(follows), bool(sees) or any(needs(function, "t") for function in of_events)
 
 
 def warn_of_delays(params: PyTree, elsewhere: frozenset[int]) -> None:

@@ -21,6 +21,7 @@ from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from .._model.signal import origin_of
 from .._model.states import flow
+from .._program.conditions import zeros_like
 from .._program.single_kernel import in_one_kernel
 from .event_record import has_stopped, with_events
 from .events import behind_jump
@@ -191,8 +192,7 @@ class IntervalLoop(NamedTuple):
 
         is_new = isinstance(getattr(self.solver, "solver", self.solver), (ExplicitRungeKutta, SparseImplicit))
         if is_new:  # the first step makes the state of the solver, as it does behind a jump
-            zeros = lambda like: jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), like)
-            changing, rest = zeros(jax.eval_shape(lambda: make(y, numbers.varied)))
+            changing, rest = zeros_like(jax.eval_shape(lambda: make(y, numbers.varied)))
             changing = jax.tree.map(lambda x: functools.reduce(_with_zeros, y0.shape[y.ndim :], x), changing)
         else:
             changing, rest = varied_along(make, numbers.directions)(y0, numbers.varied)

@@ -43,7 +43,7 @@ def _loads(equations: Any, t, y, args: Arguments, begins: bool = False) -> dict[
     if isinstance(equations, BatchedEquations):
         return equations.along_axis(lambda *of_member: _loads(equations.equations, *of_member), t, y, args)
     if isinstance(equations, AugmentedSystem):
-        return _loads(equations.equations, t, y[..., 0], args)
+        return _loads(equations.equations, t, y[..., 0], args._replace(directions=args.directions[:-1]))
     if not isinstance(equations, EquationsOfMotion):
         return None
     parts = equations.parts(y)

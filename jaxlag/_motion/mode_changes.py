@@ -26,8 +26,9 @@ from .._mechanics.return_mapping import returned
 from .._mechanics.stick_slip import Friction, Mode, first_mode, select_mode, slip_of, slipping, sticking
 from .._model.flat import Flat, StatesAt
 from .._program.jit import jitted
-from .._program.time_bounds import bounds_over_time
+from .._program.time_bounds import bounds_over_boxes
 from .first_order import EquationsOfMotion
+from .path_bounds import PathBounds
 from .protocol import Arguments
 from .state_vector import Parts, Start
 from .witnesses import plain_witnesses, witness_margins
@@ -101,20 +102,24 @@ class Approach(NamedTuple):
 
 
 def approach(equations: EquationsOfMotion, path: Callable, t0, t1, args: Arguments) -> Approach:
-    """Bounds of gaps and witnesses and of their rates, where there are any. What rises or falls all the time is seen at the ends; what has
-    no bounds is looked at more often.
+    """Bounds of gaps and witnesses and of their rates, where there are any, along the path over shares of a step. What rises or falls all
+    the time is seen at the ends; what has no bounds is looked at more often.
     """
-    t, parts = t0, equations.parts(path(t0))
+    t, bounds = t0, PathBounds.of(path, t0, t1)
+    y, parts = bounds.y, equations.parts(bounds.y)
     closed, sign = parts.closed > 0.5, parts.sign
     flat, _ = equations.contents(t, parts, args)
     often = lambda start, end: end - start > (t1 - t0) / OFTEN
 
     def along(function):
-        def at(t):
-            parts = equations.decided(t, equations.parts(path(t)), args)
+        def at(t, y):
+            parts = equations.decided(t, equations.parts(y), args)
             return function(equations.flat_at(args.params, equations.states_of(t, parts)), t, parts)
 
-        return bounds_over_time(at, t), bounds_over_time(lambda t: jax.jvp(at, (t,), (jnp.ones_like(t),))[1], t)
+        rate = lambda t, y, ydot: jax.jvp(at, (t, y), (jnp.ones_like(t), ydot))[1]
+        of_value, of_rate = bounds_over_boxes(at, t, y), bounds_over_boxes(rate, t, y, y)
+        value = of_value and (lambda start, end: of_value((start, end), bounds.between(start, end)[0]))
+        return value, of_rate and (lambda start, end: of_rate((start, end), *bounds.between(start, end)))
 
     of_gaps = along(lambda flat, t, parts: flat.gaps(t, parts.q))
     of_events = along(lambda flat, t, parts: sign * plain_witnesses(flat, t, parts.q, parts.v))
@@ -381,7 +386,7 @@ def unstarted(equations: EquationsOfMotion, at: StatesAt, params) -> Start:
     flat, elements = equations.rubbing(t, parts, args)
     if equations.elements:
         _, sigma = slipping(elements, t, parts.q, parts.v)
-        parts = parts._replace(sigma=sigma)
+        parts = parts._replace(q=returned(flat, elements, t, parts.q, parts.v), sigma=sigma)
     is_outside = _is_outside(flat, t, parts) if equations.contacts else yes
     return Start(parts.y, yes, yes, is_outside, yes, yes)
 

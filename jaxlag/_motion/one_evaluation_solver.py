@@ -17,14 +17,10 @@ from .stick_slip_solver import StickSlipSolver
 AT_START = RESULTS.no_friction, RESULTS.negative_bound, RESULTS.energy_gained, RESULTS.not_impulsive  # what `Begun` says in this order
 
 
-def has_one_evaluation(equations: EquationsOfMotion, solver: Any, reverse: bool, varied: bool) -> bool:
+def has_one_evaluation(equations: EquationsOfMotion, solver: Any, reverse: bool) -> bool:
     """Whether one evaluation serves all: of an explicit scheme, where nothing but friction and contact changes modes, and neither shares of
     it nor slips that constraints turn or drive are to be found beside.
-
-    Where variations go along, it pays beside constraints and for elements of several rows alone: what is less takes longer to compile.
     """
-    if varied and not equations.system.constraints and equations.rows == equations.elements:
-        return False
     other = equations.events or equations.sided or (equations.contacts and equations.light)
     plain = equations.formulation.stabilisation.feedback() is None and (equations.contacts or not equations.entangled)
     return bool(isinstance(solver, ExplicitRungeKutta) and equations.modes and plain and not other and not reverse)

@@ -40,6 +40,10 @@ class FirstOrderSystem(Protocol):
         """n, the number of coordinates: the first entries of y, whose velocities are the next."""
 
     @property
+    def follows_time(self) -> bool:
+        """Whether functions of the system depend on the time."""
+
+    @property
     def controlled(self) -> tuple[bool, ...]:
         """Which of the first entries of y set the steps by their error: positions, velocities, states of first order."""
 
@@ -71,6 +75,11 @@ class AugmentedSystem(abc.ABC):
     def size(self) -> int:
         """The same as of the equations alone."""
         return self.equations.size
+
+    @property
+    def follows_time(self) -> bool:
+        """The same as of the equations alone."""
+        return self.equations.follows_time
 
     @property
     def controlled(self) -> tuple[bool, ...]:

@@ -38,6 +38,8 @@ def hides_pulse(equations: FirstOrderSystem, nodes: np.ndarray, t0, t1, y, args:
 
     Of such a pulse the error of the step does not know. Not differentiated.
     """
+    if not equations.follows_time:
+        return jnp.array(False)
     t0, t1, y, args = undifferentiated((t0, t1, y, args))
     functions = time_functions(lambda t, y: equations.rates(t, y, args), t0, y)
     if functions is None:

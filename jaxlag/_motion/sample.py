@@ -9,7 +9,7 @@ from jaxtyping import Array, Float, PyTree
 from .._mechanics.constraint_residuals import off_constraints
 from .._mechanics.contact import contact_rows, gap_scales, idle
 from .._mechanics.saddle_point import Sound
-from .._mechanics.stick_slip import friction_by_term, slip_of, sticking
+from .._mechanics.stick_slip import Friction, friction_by_term, slip_of, sticking
 from .._model.signal import origin_of
 from .._program.implicit import undifferentiated
 from .._program.scalarise import scalarised
@@ -54,8 +54,8 @@ class Evidence(NamedTuple):
     violation: Violation
 
 
-def sample_at(equations: EquationsOfMotion, t, y, params, scales: Scales) -> tuple[Sample, Evidence]:
-    """One sample, from y on the constraints."""
+def sample_at(equations: EquationsOfMotion, t, y, params, scales: Scales, found: Friction | None = None) -> tuple[Sample, Evidence]:
+    """One sample, from y on the constraints, and the friction there, if that is `found` already."""
     parts = equations.parts(y)
     q, v, works, sigma, held = parts.q, parts.v, parts.works, parts.sigma, parts.held
     flat, mode, elements = equations.mode(t, parts, Arguments(params))
@@ -64,7 +64,7 @@ def sample_at(equations: EquationsOfMotion, t, y, params, scales: Scales) -> tup
     if elements is None:
         qddot, multipliers, sound = equations.accelerated(t, parts, Arguments(params))
     else:
-        found = equations.friction(t, parts, Arguments(params), stabilised=True)
+        found = found or equations.friction(t, parts, Arguments(params), stabilised=True)
         qddot, multipliers, sound = found.qddot, found.multipliers, Sound(jnp.array(True), jnp.array(True))
         friction_states = friction_by_term(elements, sigma, held > 0, t, q, v, found)
         stuck, load = sticking(elements, sigma), elements.norms(found.force)

@@ -18,10 +18,21 @@ from .._model.state_values import start_values
 from .._model.system import System
 from .._model.validation import check
 from .._program.conditions import computed_first
+from .evaluated_samples import taken_apart
 from .event_record import records
 from .first_order import EquationsOfMotion
 from .guarantees import verified
-from .integrate import SolverOptions, Variations, begins_in_steps, in_one_loop, initialised, is_variational, states_at, with_status
+from .integrate import (
+    SolverOptions,
+    Variations,
+    begins_in_steps,
+    in_one_loop,
+    in_rows,
+    initialised,
+    is_variational,
+    states_at,
+    with_status,
+)
 from .moments import ContactState, EventState, FrictionState
 from .protocol import Arguments
 from .provenance import Provenance
@@ -82,14 +93,15 @@ class SolutionMap:
         equations, at = self.equations(inputs, ts)
         params, times, tolerances = _counted(inputs, ts), ts - ts[0], inputs.tolerances
         args, reverse = self._arguments(equations, at, inputs, ts), not isinstance(adjoint, dfx.ForwardMode)
-        begins = begins_in_steps(equations, self.options, params, reverse, False)
+        begins = begins_in_steps(equations, self.options, params, reverse)
         start = initialised(equations, at, args.params, args.scales, self.search, begins)
         if isinstance(adjoint, dfx.ForwardMode) or self.options.adjoint or not is_variational(equations, self.options, None, params):
             ys, result, stats = states_at(equations, self.options, adjoint, at.t, start.y, times, args, tolerances, begins)
         else:
             ys, result, stats = self._accompanied(equations, adjoint, start.y, inputs, ts, args)
         ys, result = with_status(ys, result, start.conditions, (inputs, ts))
-        return samples_at(equations, times, ys, params, result, stats | {"start_moved": start.moved}, tolerances)
+        rows = in_rows(equations, self.options, params, reverse)
+        return samples_at(equations, times, ys, params, result, stats | {"start_moved": start.moved}, tolerances, rows)
 
     def _accompanied(self, equations, adjoint, y0, inputs: Inputs, ts: Array, args: Arguments):
         """The states of a motion in steps that fit a variation along a direction at random as well: reverse mode asks for all."""
@@ -126,7 +138,7 @@ class SolutionMap:
     def _begins(self, equations, inputs: Inputs, directions: tuple[Inputs, ...], ts: Array) -> bool:
         """Whether the first step finds the mode at the start; not where its time moves, along which y0 is taken in that mode."""
         stays = all(of_order.t0 is None for of_order in directions)
-        return stays and begins_in_steps(equations, self.options, _counted(inputs, ts), False, True)
+        return stays and begins_in_steps(equations, self.options, _counted(inputs, ts), False)
 
     def push(self, inputs: Inputs, directions: tuple[Inputs, ...], ts: Array) -> tuple[Any, Unchanging]:
         """The samples and their derivatives along directions, for each order; by the variational equations where they hold."""
@@ -154,12 +166,13 @@ class SolutionMap:
         motion = lambda ys: ys[(..., *[0] * len(directions))]  # without variations
         stats = stats | {"start_moved": start.moved}
         states, result = with_status(motion(ys), result, start.conditions, (inputs, ts))
+        rows = in_rows(equations, self.options, _counted(inputs, ts), False)
         known = jnp.isfinite(states).reshape(*states.shape, *[1] * len(directions))
 
         def samples(ys_and_params):
             ys, params = ys_and_params
             of_these = _counted(inputs._replace(params=params), ts)
-            return samples_at(equations, ts - ts[0], ys, of_these, result, stats, inputs.tolerances)
+            return samples_at(equations, ts - ts[0], ys, of_these, result, stats, inputs.tolerances, rows)
 
         def with_more(function, directions):
             """Of states with the variations of one order more."""
@@ -247,13 +260,22 @@ def _first_time(inputs: Inputs, ts: Array) -> Array:
     return ts[0] - ts[0] if inputs.t0 is None else inputs.t0 - ts[0]
 
 
-def samples_at(equations: EquationsOfMotion, ts, ys, params, result, stats, tolerances) -> tuple[Samples, Unchanging]:
-    """The samples of a motion with these states, as far as they keep what a successful motion guarantees; behind them are its events."""
+def samples_at(equations: EquationsOfMotion, ts, ys, params, result, stats, tolerances, rows: bool = False) -> tuple[Samples, Unchanging]:
+    """The samples of a motion with these states, as far as they keep what a successful motion guarantees; behind them are its events.
+
+    `rows`: whether they come with the friction there.
+    """
     ys, events = ys[: ts.size], records(equations, ys[ts.size :], origin_of(params))
     last_t, last_y = stats["last"]
     times, states = jnp.concatenate([ts, last_t[None]]), jnp.concatenate([ys, last_y[None]])
     scales = scales_of(equations, tolerances, ts, params, states)
-    samples = computed_first(jax.vmap(lambda t, y: sample_at(equations, t, y, params, scales))(times, states), last_t)
+
+    def at(t, y):
+        y, found = taken_apart(equations, t, y, Arguments(params)) if rows else (y, None)
+        return y, sample_at(equations, t, y, params, scales, found)
+
+    states, samples = computed_first(jax.vmap(at)(times, states), last_t)
+    ys = states[:-1]
     if equations.events:  # behind the end of a motion there is none
         states = jnp.where(states[:, -1:] > 0, jnp.nan, states)
     shown, result, reached = verified(equations, times, states, samples, result, tolerances[0])

@@ -6,14 +6,14 @@ at the margins of a mode, as the end of a mode, and in the selection of the next
     END     the margins where it ends                         then Newton's next piece up to there, or what is at rest there
     SELECT  the friction in a mode that may follow            then another one, or y in that mode, put on its constraints
     TURN    slip rates with each row of σ changed             then the same
+    BACK    what takes a state back to its constraints        then what follows with that state there
 
 and, where there are contacts (`contact_phases`), before each selection
 
     ALONE   the accelerations without contact                 then the selection, with what counts as rounding of forces
     STRIKE  the velocities behind an impact                   then its expansion, or the selection of what follows
 
-A turn of the loop evaluates points of one kind, and decides what is next. What is decided is cheap; the projection, which is not, stands
-behind all decisions once.
+A turn of the loop evaluates points of one kind, and decides what is next, which is cheap.
 """
 
 import dataclasses
@@ -32,7 +32,7 @@ from .._mechanics.stick_slip import DONE as SELECTED
 from .._mechanics.stick_slip import Friction, ModeSelection, sticking
 from .._mechanics.stick_slip import Search as ModeSearch
 from .._model.flat import Flat
-from .._program.conditions import computed_first_with_changes
+from .._program.conditions import computed_first_with_changes, zeros_like
 from .._program.time_bounds import TimeDependence, time_dependence
 from .first_order import EquationsOfMotion
 from .loads import loads_within
@@ -44,7 +44,7 @@ from .state_vector import Parts
 from .step_monitor import CHEBYSHEV, LOOKS, Looks, Monitor, Search, Seen, changes_by_time, reach_of_time, slopes_of_interpolant
 from .wrapped_solver import ProjectedSolver
 
-STAGE, LOOK, END, SELECT, ALONE, STRIKE, TURN, DONE = range(8)
+STAGE, LOOK, END, SELECT, BACK, ALONE, STRIKE, TURN, DONE = range(9)
 BEGIN = -1  # the phase before those of a step, in which the motion has no mode yet
 
 
@@ -79,6 +79,19 @@ class Choice(NamedTuple):
     slip_rates: Any
 
 
+class Back(NamedTuple):
+    """A state that is put back on its constraints at some time: y before, and y on its way; what it is of, and what follows: the kind of
+    the next points, and the number of the first.
+    """
+
+    t: Any
+    y: Array
+    there: Array
+    of: Any
+    kind: Any
+    first: Any
+
+
 class Turn(NamedTuple):
     """What the loop carries: the kind of its next points, and the number of the first; the phase of the step; the piece of it that is
     made, from y0 at its start to its end; the step so far.
@@ -95,6 +108,7 @@ class Turn(NamedTuple):
     split: Split
     watch: Watch
     choice: Choice
+    back: Back
     change: Any = None  # of contacts
     begun: Any = None  # where motions begin here
 
@@ -138,7 +152,8 @@ class Step:
         t, y, still = undifferentiated((t0, y0, args))
         equations = solver.equations
         assert isinstance(equations, EquationsOfMotion)  # as `has_one_evaluation` has it
-        return cls(solver, t0, t1, y0, args, time_dependence(lambda t, y: margins(equations, t, y, still, y), t, y), begins)
+        of_time = time_dependence(lambda t, y: margins(equations, t, y, still, y), t, y) if equations.follows_time else None
+        return cls(solver, t0, t1, y0, args, of_time, begins)
 
     @property
     def equations(self) -> EquationsOfMotion:
@@ -167,22 +182,22 @@ class Step:
         return jax.lax.while_loop(lambda turn: turn.kind != DONE, self._turned, self._start(rate, made_jump))
 
     def _start(self, rate, made_jump) -> Turn:
-        y0, no, none = self.y0, jnp.array(False), jnp.zeros(self.equations.elements, bool)
-        modes = self.equations.modes
+        y0, no, none, modes = self.y0, jnp.array(False), jnp.zeros(self.equations.elements, bool), self.equations.modes
         t0, t1 = (jnp.asarray(t, y0.dtype) for t in (self.t0, self.t1))
         size, rows, margins = len(self.scheme.tableau.c), self.equations.rows, jnp.zeros(modes, y0.dtype)
         stages = jnp.concatenate([rate[None], jnp.zeros((size - 1, *rate.shape), rate.dtype)])
-        piece = zeros(jax.eval_shape(self._finished, y0, stages, t1 - t0))
+        piece = zeros_like(jax.eval_shape(self._finished, y0, stages, t1 - t0))
         start, end, stages, piece = _moving((t0, t1, stages, piece), y0)
         yes = jnp.array(True)
         split = Split(piece, piece, Cut(end, end, y0, no, yes, yes, no), Seen(no, no, no, t1, margins))
         looks, steepness = jnp.zeros((LOOKS + 1, 2 * modes), y0.dtype), jax.eval_shape(self._steepness, piece, t0, t1)
-        watch = Watch(self._monitor(t0, t1).start(y0.dtype), jnp.zeros(LOOKS + 1, y0.dtype), looks, (t0, t1, looks), zeros(steepness))
-        search = zeros(jax.eval_shape(lambda: self._begun(y0, t0)))
+        watch = Watch(self._monitor(t0, t1).start(y0.dtype), jnp.zeros(LOOKS + 1, y0.dtype), looks, (t0, t1, looks), zeros_like(steepness))
+        search = zeros_like(jax.eval_shape(lambda: self._begun(y0, t0)))
         slip_rates = jnp.zeros((rows + 1 if self.may_turn else 0, rows), y0.dtype)
-        choice = Choice(search, none, none, zeros(self._like().friction), slip_rates)
-        first = jnp.where(made_jump, 0, 1)
-        turn = Turn(jnp.array(STAGE), first, jnp.array(0), start, end, y0, stages, piece, split, watch, choice, self._unchanged())
+        choice = Choice(search, none, none, zeros_like(self._like().friction), slip_rates)
+        first, stage = jnp.where(made_jump, 0, 1), jnp.array(STAGE)
+        back = Back(start, y0, y0, stage, stage, jnp.array(0))
+        turn = Turn(stage, first, jnp.array(0), start, end, y0, stages, piece, split, watch, choice, back, self._unchanged())
         if self.begins is None:
             return turn
         kind, phase, first = (jnp.where(self.begins, a, b) for a, b in ((END, STAGE), (BEGIN, 0), (0, first)))
@@ -195,45 +210,50 @@ class Step:
         none = jnp.zeros(self.equations.elements, bool)
         return self.selection(y, t, none, none)[0].start()
 
+    @property
+    def no_impulse(self) -> Impulse | None:
+        """An impact that does not happen, if there are contacts."""
+
     def _unchanged(self) -> Any:
         """What is known of contacts before any changes: there are none."""
 
     def _like(self) -> Point:
         """What an evaluation gives, in shapes."""
-        return jax.eval_shape(lambda: Point(*self.equations.rates_and_friction(self.t0, self.equations.parts(self.y0), self.args)))
+        given = self.equations.parts(self.y0), self.args, self.no_impulse, self.equations.correction(-1)
+        return jax.eval_shape(lambda: Point(*self.equations.rates_and_friction(self.t0, *given)))
 
     def _turned(self, turn: Turn) -> Turn:
-        """The points up to the next decision, the decision, and what it puts back on the constraints."""
+        """The points up to the next decision, and the decision; what is to be put back on the constraints, comes first."""
         turn, point = self._evaluated(turn)
         kind = jnp.where(turn.kind == TURN, SELECT, turn.kind)
         turn, projects, t, y = jax.lax.switch(kind, self.decisions, turn, point)
-        projected = self.solver.projected
-        assert projected is not None  # there is friction
-        y = jax.lax.cond(projects, lambda: projected(t, y, self.args), lambda: y)
-        of_piece, of_cut = projects & (kind == STAGE), projects & (kind == SELECT)
-        if turn.begun is not None:
-            begins = of_cut & (turn.phase == BEGIN + 1)
-            y = jnp.where(begins, self._without_works(y), y)
-            turn = turn._replace(begun=turn.begun._replace(y=jnp.where(begins, y, turn.begun.y)))
-        piece, cut = turn.piece, turn.split.cut
-        piece = piece._replace(
-            y=jnp.where(of_piece, y, piece.y),
-            error=jnp.where(of_piece & ~jnp.all(jnp.isfinite(y)), jnp.inf, piece.error),  # it is rejected, and tried again shorter
-            dense=piece.dense | {"y1": jnp.where(of_piece, y, piece.dense["y1"])},
-        )
-        split = turn.split._replace(cut=cut._replace(y=jnp.where(of_cut, y, cut.y)))
-        turn = turn._replace(piece=piece, split=split, y0=jnp.where(of_cut, y, turn.y0))
-        turn = self.put(turn, projects & (kind == END), y)
-        return self.unless_far(turn, (kind == STAGE) & (turn.kind == LOOK))
+        back = Back(t, y, y, kind, turn.kind, turn.first)
+        back = jax.tree.map(lambda new, old: jnp.where(projects, new, old), back, turn.back)
+        kind, first = jnp.where(projects, BACK, turn.kind), jnp.where(projects, 0, turn.first)
+        return turn._replace(kind=kind, first=first, back=back)
 
-    def _without_works(self, y):
-        """y with works that are counted from here on."""
-        return self.equations.parts(y)._replace(works=jnp.zeros(len(self.equations.works), y.dtype)).y
+    def _put_back(self, turn: Turn, point: Point) -> Decision:
+        """A state is back on its constraints, and what was decided before follows."""
+        t, before, there, kind, *onward = turn.back
+        y, of_cut = self._there(t, before, there), kind == SELECT
+        if turn.begun is not None:  # works are counted from here on
+            begins = of_cut & (turn.phase == BEGIN + 1)
+            without = self.equations.parts(y)._replace(works=jnp.zeros(len(self.equations.works), y.dtype)).y
+            y = jnp.where(begins, without, y)
+            turn = turn._replace(begun=turn.begun._replace(y=jnp.where(begins, y, turn.begun.y)))
+        split = turn.split._replace(cut=turn.split.cut._replace(y=jnp.where(of_cut, y, turn.split.cut.y)))
+        turn = turn._replace(kind=onward[0], first=onward[1], split=split, y0=jnp.where(of_cut, y, turn.y0))
+        return Decision(self.put(turn, kind == END, y), jnp.array(False), t, y)
+
+    def _there(self, t, before, there) -> Array:
+        """y with the state to which corrections have come."""
+        there = self.equations.parts(there)
+        return self.equations.put_back(t, self.equations.parts(before), there.q, there.v, self.args)
 
     @property
     def decisions(self) -> list[Callable]:
         """What is decided where points have been evaluated, in the order of their kinds."""
-        return [self._stages_done, self._looked, self._at_end, self._selected]
+        return [self._stages_done, self._looked, self._at_end, self._selected, self._put_back]
 
     def put(self, turn: Turn, there, y) -> Turn:
         """With y, if it was put on the constraints where a mode ends."""
@@ -244,34 +264,52 @@ class Step:
         return turn
 
     def _evaluated(self, turn: Turn) -> tuple[Turn, Point]:
-        """The rates at stages, margins along a piece, or the friction at its end in a mode that is asked about; and the last point."""
+        """The rates at stages and what takes the end of their piece back to its constraints, margins along a piece, or the friction at its
+        end in a mode that is asked about; and the last point.
+        """
         _, c, weights = map(jnp.asarray, self.scheme.stages(turn.y0.dtype))
-        count = jnp.array([len(c), LOOKS + 1, 1, 1, 1, 1, self.equations.rows + 1])[turn.kind]
+        of_stages, last, corrections = len(c), self.scheme.tableau.stages - 1, self.corrections(turn)
+        count = jnp.array([of_stages, LOOKS + 1, 1, 1, 0, 1, 1, self.equations.rows + 1])[turn.kind]
         h, path, ts, asks = turn.end - turn.start, self.path(turn.piece, turn.start, turn.end), turn.watch.ts, turn.kind >= SELECT
-        asked, impulse = self.asked(turn), self.impulse(turn)
+        asked, impulse, is_stage, is_back = self.asked(turn), self.impulse(turn), turn.kind == STAGE, turn.kind == BACK
+        count += jnp.where(is_stage | is_back, corrections, 0)
 
         def evaluated(carry):
-            k, stages, values, slip_rates, _ = carry
-            i, j = jnp.minimum(k, len(c) - 1), jnp.minimum(k, LOOKS)
+            k, stages, values, slip_rates, back, _ = carry
+            number = jnp.where(is_stage, k - of_stages, jnp.where(is_back, k, -1))  # of a correction
+            i, j = jnp.where(number >= 0, last, jnp.minimum(k, of_stages - 1)), jnp.minimum(k, LOOKS)
             at_stage = jnp.where(c[i] == 1, turn.end, turn.start + c[i] * h), turn.y0 + h * weighted(weights[i], stages)
-            of_three = zip(at_stage, (ts[j], path(ts[j])), (turn.end, jnp.where(asks, asked(k), turn.piece.y)), strict=True)
-            t, y = (jnp.where(turn.kind == STAGE, a, jnp.where(turn.kind == LOOK, b, c)) for a, b, c in of_three)
+            asked_for = jnp.where(is_back, turn.back.t, turn.end), jnp.where(is_back, back, jnp.where(asks, asked(k), turn.piece.y))
+            of_three = zip((at_stage[0], jnp.where(number > 0, back, at_stage[1])), (ts[j], path(ts[j])), asked_for, strict=True)
+            t, y = (jnp.where(is_stage, a, jnp.where(turn.kind == LOOK, b, c)) for a, b, c in of_three)
             t, y = computed_first_with_changes((t, y), turn.end)
-            parts = self.equations.parts(y)
-            point = computed_first_with_changes(
-                Point(*self.equations.rates_and_friction(t, parts, self.args, impulse, turn.kind != STAGE)), t
-            )
+            parts, correction, shares = self.equations.parts(y), self.equations.correction(number), ~is_stage & ~is_back
+            found = self.equations.rates_and_friction(t, parts, self.args, impulse, correction, shares)
+            point = computed_first_with_changes(Point(*found), t)
+            back = jnp.where(number >= 0, self.equations.corrected(t, parts, self.args, point.friction, number).y, back)
             seen, slip_rate = jax.lax.stop_gradient((self._margins(t, parts, point.friction), point.friction.slip_rate))
-            stages = jnp.where(turn.kind == STAGE, with_row(stages, point.rates, k), stages)
+            stages = jnp.where(is_stage & (number < 0), with_row(stages, point.rates, k), stages)
             values = jnp.where(turn.kind == LOOK, with_row(values, seen, k), values)
             if self.may_turn:
                 slip_rates = jnp.where(asks, with_row(slip_rates, slip_rate, k), slip_rates)
-            return k + 1, stages, values, slip_rates, point
+            after = self.equations.next_correction(parts, point.friction, number) - number
+            return k + after, stages, values, slip_rates, back, point
 
-        start = turn.first, turn.stages, turn.watch.values, turn.choice.slip_rates, _moving(zeros(self._like()), turn.y0)
-        _, stages, values, slip_rates, point = jax.lax.while_loop(lambda carry: carry[0] < count, evaluated, start)
+        start = (
+            turn.first,
+            turn.stages,
+            turn.watch.values,
+            turn.choice.slip_rates,
+            turn.back.there,
+            _moving(zeros_like(self._like()), turn.y0),
+        )
+        _, stages, values, slip_rates, back, point = jax.lax.while_loop(lambda carry: carry[0] < count, evaluated, start)
         watch, choice = turn.watch._replace(values=values), turn.choice._replace(slip_rates=slip_rates)
-        return turn._replace(stages=stages, watch=watch, choice=choice), point
+        return turn._replace(stages=stages, watch=watch, choice=choice, back=turn.back._replace(there=back)), point
+
+    def corrections(self, turn: Turn) -> Any:
+        """How many points put a state back."""
+        return self.equations.corrections[1]
 
     def impulse(self, turn: Turn) -> Impulse | None:
         """The impact that is asked about, if there are contacts."""
@@ -300,7 +338,7 @@ class Step:
         bounded = self.of_time_alone is None or self.of_time_alone.is_bounded
         return Monitor(self.equations.modes, self.args.scales, *jax.lax.stop_gradient((start, end)), bounded, nodes=CHEBYSHEV)
 
-    def arriving(self, path: Callable, start, end) -> Callable | None:
+    def arriving(self, piece: Piece, start, end) -> Callable | None:
         """Which modes may end between two times along a path, for all that is known of what may be rough."""
 
     def _steepness(self, piece: Piece, start, end):
@@ -327,11 +365,15 @@ class Step:
     def _stages_done(self, turn: Turn, point: Point) -> Decision:
         """Stages have become a piece: it is looked along, or the mode may end at its end."""
         piece = self._finished(turn.y0, turn.stages, turn.end - turn.start)
+        y = jnp.where(self.corrections(turn) > 0, self._there(turn.end, piece.y, turn.back.there), piece.y)
+        error = jnp.where(jnp.all(jnp.isfinite(y)), piece.error, jnp.inf)  # it is rejected, and tried again shorter
+        piece = piece._replace(y=y, error=error, dense=piece.dense | {"y1": y})
         phase, monitor = self.phases[turn.phase], self._monitor(turn.start, turn.end)
         search, looks_along = monitor.start(piece.y.dtype), jnp.where(turn.start < turn.end, LOOK, DONE)
         kind = jnp.where((phase == WHOLE) | (phase == REST), looks_along, END)
         watch = turn.watch._replace(search=search, ts=monitor.times(search))
-        return Decision(turn._replace(kind=kind, first=jnp.array(0), piece=piece, watch=watch), jnp.array(True), turn.end, piece.y)
+        turn = turn._replace(kind=kind, first=jnp.array(0), piece=piece, watch=watch)
+        return Decision(self.unless_far(turn, turn.kind == LOOK), jnp.array(False), turn.end, y)
 
     def _looked(self, turn: Turn, point: Point) -> Decision:
         """It was looked along a piece: at other times next, or what was seen is known."""
@@ -344,7 +386,7 @@ class Step:
             anew = lambda: self._steepness(jax.lax.stop_gradient(turn.piece), start, end)
             steepness = jax.lax.cond(search.rounds == 0, anew, lambda: steepness)
         looks = Looks(values, slopes_of_interpolant(low, high, nodes, ts), changes_by_time(self.of_time_alone, steepness, ts))
-        hides = self.arriving(self.path(turn.piece, start, end), start, end)
+        hides = self.arriving(turn.piece, start, end)
         search = dataclasses.replace(monitor, hides=hides).closer(search, ts, looks)
         more, seen = monitor.going_on(search, ~rest), monitor.seen(search)
         fine = more | ~rest | ~(seen.ended | seen.unsure | seen.negative)
@@ -450,10 +492,6 @@ class Step:
             end=jnp.where(done, self.t1, turn.end),
             split=turn.split._replace(first=turn.piece),
         )
-
-
-def zeros(like):
-    return jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), like)
 
 
 def _moving(tree, y):

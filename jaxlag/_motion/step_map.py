@@ -83,7 +83,7 @@ class StepMap:
         equations, params = self.equations, SinceOrigin.of(inputs.params, inputs.t0)
         args = self.arguments(inputs.params, inputs.t0, ts, inputs.tolerances, *self._moving(inputs.y), inputs.going.loads)
         may_jump, fine = inputs.jumps is not None, jnp.array(True)
-        begins = may_jump and begins_in_steps(equations, self.options, params, reverse, bool(directions))
+        begins = may_jump and begins_in_steps(equations, self.options, params, reverse)
         if may_jump and not begins and equations.projection is not None:
             y0, fine = self._behind_jump(inputs, y0, ts, args, directions)
         along, steps = tuple((SinceOrigin(of_order.params, None), None) for of_order in directions), inputs.going.steps

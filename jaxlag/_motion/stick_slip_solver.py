@@ -7,6 +7,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
+from .._program.conditions import zeros_like
 from .._program.jit import jitted
 from .event_record import overflows
 from .events import behind_end, behind_step
@@ -42,17 +43,16 @@ class StickSlipSolver(ProjectedSolver):
 
     def init(self, terms, t0, t1, y0, args):
         """The state of the solver, and whether it has yet to be made: the loop over the first step's stages does, which is there anyway."""
-        make = lambda: self.solver.init(terms, t0, t1, y0, args)
         if not isinstance(self.solver, ExplicitRungeKutta):
-            return make(), jnp.array(False)
-        return jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), jax.eval_shape(make)), jnp.array(True)
+            return self.solver.init(terms, t0, t1, y0, args), jnp.array(False)
+        return jax.tree.map(jnp.zeros_like, y0), jnp.array(True)
 
     def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
         solver_state, is_new = solver_state
         made_jump = made_jump | is_new
         piece = lambda *given: Piece(*self.projected_step(terms, *given[:3], args, *given[3:]))
         given = t0, t1, y0, solver_state, jnp.asarray(made_jump)
-        nothing = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), jax.eval_shape(piece, *given))
+        nothing = zeros_like(jax.eval_shape(piece, *given))
         no, zeros = jnp.array(False), jnp.zeros(self.equations.modes, y0.dtype)
         uncut = Split(nothing, nothing, Cut(t1, t1, y0, no, no, no, no), Seen(no, no, no, jnp.asarray(t1, y0.dtype), zeros))
 
@@ -132,11 +132,12 @@ class StickSlipSolver(ProjectedSolver):
     @jitted
     def _seen(self, t0, t1, dense, args, exactly):
         """What is seen of the margins along a piece, on its dense output; not differentiated."""
-        path = self.solver.interpolation_cls(t0=t0, t1=t1, **dense)
+        make, zero = self.solver.interpolation_cls, jnp.zeros_like(t0)
+        path = make(t0=t0, t1=t1, **dense)
         of, modes = lambda t, y, start: margins(self.equations, t, y, args, start), self.equations.modes
         if not (self.equations.contacts or self.equations.events):
             return first_end(of, path.evaluate, t0, t1, modes, args.scales, exactly)
-        between = approach(self.equations, path.evaluate, t0, t1, args)
+        between = approach(self.equations, make(t0=zero, t1=zero + 1, **dense).evaluate, t0, t1, args)
         watched = lambda: first_end(of, path.evaluate, t0, t1, modes, args.scales, exactly, between.may_arrive)
         if between.stays_away is None:
             return watched()

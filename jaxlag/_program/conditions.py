@@ -9,6 +9,11 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 
+def zeros_like(shapes: Any) -> Any:
+    """Zeros in the shapes of a pytree, as `jax.eval_shape` gives them."""
+    return jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
+
+
 @jax.custom_batching.custom_vmap
 def everywhere(condition: Bool[Array, ""]) -> Bool[Array, ""]:
     """A condition; in a batch, whether it holds for all members, so that a `cond` on it stays one and not the work of both branches."""

@@ -9,7 +9,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float
 
-from .conditions import repeated
+from .conditions import repeated, zeros_like
 
 SHIFT = 0.35  # exponent of eps: what is added then, in units in which the matrix has numbers near one
 GROWTH = 0.85  # exponent of 1/eps: what the inverse makes of a number then; that of a straight chain of m links makes m²/8 of it
@@ -32,7 +32,7 @@ def shifted_where_singular(factored: Callable, probed: Callable, shift: Array, i
         again = is_singular(factors) & ~shifted
         return factors, again, again | shifted
 
-    nothing = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), jax.eval_shape(factored, shift))
+    nothing = zeros_like(jax.eval_shape(factored, shift))
     start = nothing, jnp.array(True), jnp.array(False)
     factors, _, shifted = lax.while_loop(lambda carry: carry[1], attempt, start)
     return factors, shifted

@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import scipy.sparse
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from .jit import jitted
 
@@ -175,6 +175,13 @@ def _row_by_row(by_row: np.ndarray, term: Callable) -> Array:
 def row_sums(matrix: Any) -> Float[Array, " m"]:
     """Σⱼ |aᵢⱼ|."""
     return summed_by(matrix.pattern, jnp.abs(matrix.values)) if isinstance(matrix, SparseMatrix) else jnp.sum(jnp.abs(matrix), axis=1)
+
+
+def with_rows_alone(matrix: Any, which: Bool[Array, " m"]) -> Any:
+    """The matrix with zeros for its other rows."""
+    if isinstance(matrix, SparseMatrix):
+        return SparseMatrix(jnp.where(which[matrix.pattern.rows], matrix.values, 0), matrix.pattern)
+    return jnp.where(which[:, None], matrix, 0)
 
 
 def dense(matrix: Any) -> Float[Array, "m n"]:

@@ -41,7 +41,7 @@ def time_dependence(function: Callable, t: Array, y: Array) -> TimeDependence | 
         return [found[x] for x in frontier]
 
     def bounds(start, end):
-        found = bounds_of_steps(before_y, constants, start, end)
+        found = bounds_of_steps(before_y, constants, [(start, end)])
         return [found[x] for x in frontier]
 
     def rest(phi, y):
@@ -51,12 +51,13 @@ def time_dependence(function: Callable, t: Array, y: Array) -> TimeDependence | 
     return TimeDependence(phi, bounds, rest, all(has_bounds(step.equation) for step in before_y if of_t.intersection(step.results)))
 
 
-def bounds_over_time(function: Callable, t: Array) -> Callable[..., Interval] | None:
-    """Bounds of `function(t)`, an array, from one time to another; None where part of it has none."""
-    found = time_dependence(lambda t, _: function(t), t, t)
-    if found is None:
-        return lambda start, end: (function(start), function(start))
-    return (lambda start, end: found.bounds(start, end)[0]) if found.is_bounded else None
+def bounds_over_boxes(function: Callable, *arguments: Array) -> Callable[..., Interval] | None:
+    """Bounds of an array `function(*arguments)` from an interval for each argument; None where part of it has none."""
+    steps, constants, (output,) = inlined_steps(without_unused(jax.make_jaxpr(function)(*arguments)))
+    depending = set().union(*(dependents(steps, x) for x in range(len(arguments))))
+    if not all(has_bounds(step.equation) for step in steps if depending.intersection(step.results)):
+        return None
+    return lambda *intervals: bounds_of_steps(steps, constants, intervals)[output]
 
 
 MAX_ITERATIONS = 100  # of a loop that is bounded; a search in a table takes twenty for a million elements
@@ -73,7 +74,8 @@ class Step(NamedTuple):
 
 def inlined_steps(closed, calls=CALLS) -> tuple[list[Step], dict[int, Any], list[int]]:
     """The equations of a program with calls inlined, equal ones once; its constants, and the numbers of its outputs."""
-    numbers, constants = itertools.count(2), {}
+    arguments = len(closed.jaxpr.invars)
+    numbers, constants = itertools.count(arguments), {}
     steps: list[Step] = []
     cache: dict[Any, Any] = {}
 
@@ -96,7 +98,7 @@ def inlined_steps(closed, calls=CALLS) -> tuple[list[Step], dict[int, Any], list
     def evaluate(equation, operands):
         return cached((equation.primitive, tuple(equation.params.items()), tuple(operands)), lambda: step(equation, operands))
 
-    return steps, constants, walk(closed, (T, Y), evaluate, constant, opened=calls)
+    return steps, constants, walk(closed, tuple(range(arguments)), evaluate, constant, opened=calls)
 
 
 def dependents(steps: list[Step], start: int) -> set[int]:
@@ -117,9 +119,9 @@ def ancestors(steps: list[Step], ends: list[int]) -> set[int]:
     return found
 
 
-def bounds_of_steps(steps, constants, start, end):
-    """The intervals of all quantities from one time to another."""
-    found = {x: (value, value) for x, value in constants.items()} | {T: (start, end)}
+def bounds_of_steps(steps, constants, intervals):
+    """The intervals of all quantities, from those of the first arguments."""
+    found = {x: (value, value) for x, value in constants.items()} | dict(enumerate(intervals))
     for step in steps:
         found |= dict(zip(step.results, _evaluate_intervals(step.equation, [found[x] for x in step.operands]), strict=True))
     return found

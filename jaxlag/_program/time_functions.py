@@ -65,7 +65,7 @@ def time_functions(function: Callable, t: Array, y: Array) -> TimeFunctions | No
     to_bounded, to_read = _leading_to(steps, bounded), _leading_to(steps, [*read, *places])
 
     def bounds(start, end):
-        every = bounds_of_steps(to_bounded, constants, start, end)
+        every = bounds_of_steps(to_bounded, constants, [(start, end)])
         low, high = ({x: every[x][k] for x in bounded} for k in (0, 1))
         return joined(low, bounded), joined(high, bounded)
 

@@ -483,6 +483,8 @@ def test_ratios_are_named_in_single_precision(single_precision):
     found = fit(osc.record(0), osc.START | {"m": 1.3}, free=("b", "c", "m"))
     (said,) = found.remarks
     assert re.fullmatch(r"only b/m = 0\.\d+ ± 0\.\d+ and c/m = \d\.\d+ ± 0\.\d+ are determined; their common factor is not", said)
+    with pytest.raises(ValueError, match="`free` must leave a known term in the equations of motion"):
+        jl.regress(osc.SYSTEM, osc.record(0), osc.START | {"m": 1.3}, free=("b", "c", "m"))
 
 
 def test_a_direction_that_is_known_to_be_hidden_is_found_beneath_the_error_of_integration():

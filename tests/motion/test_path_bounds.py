@@ -1,0 +1,39 @@
+"""Bounds of polynomial paths and of their rates, beside what is seen at many times."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxlag._motion.path_bounds import DEGREE, PathBounds
+
+
+@pytest.mark.parametrize(("scale", "start"), [(1.0, 0.0), (1e-9, 1e6), (1e6, -1e-3)])
+def test_paths_and_rates_lie_within_their_bounds(scale, start):
+    """Also far from zero, beside which a step is small; and bounds are no wider than they have to be where parts are short."""
+    rng, share = np.random.default_rng(3), np.linspace(0, 1, 400)
+
+    @jax.jit
+    def bounds(coefficients, offset, between, part):
+        path = lambda share: offset + jnp.sum(coefficients * share ** np.arange(DEGREE + 1)[:, None], axis=0)
+        return PathBounds.of(path, *between).between(*part)
+
+    for k in range(200):
+        coefficients = scale * rng.normal(size=(DEGREE + 1, 3)) * rng.integers(2, size=(DEGREE + 1, 3))
+        length, offset = 10.0 ** rng.uniform(-4, 3), scale * 10.0 ** rng.uniform(-1, 3)
+        (low, high) = np.sort(rng.uniform(size=2)) if k % 4 else (0.0, 1.0)
+        between = np.array([start, start + length])
+        length = between[1] - between[0]
+        part = between[0] + length * np.array([low, high])
+        at = (part[0] - between[0]) / length + share * (part[1] - part[0]) / length
+        y = [offset + np.polynomial.polynomial.polyval(at, column) for column in coefficients.T]
+        rates = [np.polynomial.polynomial.polyval(at, np.polynomial.polynomial.polyder(column)) / length for column in coefficients.T]
+        of_y, of_rates = jax.tree.map(np.asarray, bounds(coefficients, offset, between, part))
+        sizes = np.sum(np.abs(coefficients), axis=0)
+        for seen, (least, most), rounding in ((y, of_y, 0.0), (rates, of_rates, 1e-8 * sizes / (length * (high - low)))):
+            seen = np.array(seen).T
+            assert np.all(seen >= least - rounding - 1e-15 * offset)
+            assert np.all(seen <= most + rounding + 1e-15 * offset)
+        if high - low < 0.05:
+            spread = np.ptp(np.array(y), axis=1)
+            assert np.all(of_y[1] - of_y[0] <= 1.5 * spread + 40 * (high - low) ** 2 * sizes + 1e-9 * sizes)
