@@ -32,9 +32,8 @@ REFERENCE = {  # names in `jaxlag`
     "At one state": "acceleration results.Acceleration mass_matrix momentum energy constraint_jacobian constraint_residual "
     "constraint_force powers results.Residual consistent_state examine results.Examination",
     "Motions": "simulate simulate_many results.Trajectory results.FrictionState results.ContactState results.EventState "
-    "stepper results.Stepper results.StepState results.RESULTS results.Instant results.Interpolated load Dop853 Dopri5 stabilisation.Projection "
-    "stabilisation.Baumgarte stabilisation.NoStabilisation StickSlip Regularised "
-    "keep_compiled",
+    "stepper results.Stepper results.StepState results.RESULTS results.Instant results.Interpolated load Dop853 Dopri5 "
+    "stabilisation.Projection stabilisation.Baumgarte stabilisation.NoStabilisation StickSlip Regularised keep_compiled",
     "Near a steady state": "equilibrium steady results.Equilibrium linearise results.LinearSystem results.Modes lowest_modes root_locus "
     "results.RootLocus results.Crossing periodic results.PeriodicOrbit stability_map results.StabilityMap",
     "Identification": "Experiment Measurement ModalTest FrequencyResponseTest fit fit_each results.Fit results.Channel results.Interval "

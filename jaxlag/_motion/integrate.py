@@ -163,8 +163,10 @@ def states_at(
     args: Arguments,
     tolerances,
     begins: bool = False,
+    rows: bool = False,
 ) -> tuple[Array, RESULTS, dict]:
-    """States at the samples of a single motion, the reason it stopped, and, among the counts, the `last` time and state that it reached.
+    """States at the samples of a single motion, or `rows`, the reason it stopped, and, among the counts, the `last` time and state that it
+    reached.
 
     By diffrax's own loop what has no nodes and is differentiated in reverse mode, or by an adjoint that the user has chosen.
     """
@@ -172,7 +174,7 @@ def states_at(
     if nodes:
         _refuse_adjoint(options.adjoint)
     if nodes or not (reverse or options.adjoint):
-        return in_one_loop(equations, options, t0, y0, ts, args, tolerances, reverse=reverse, begins=begins)
+        return in_one_loop(equations, options, t0, y0, ts, args, tolerances, reverse=reverse, begins=begins, rows=rows)
     return by_diffrax(equations, options, adjoint, t0, y0, ts, args, tolerances)
 
 
@@ -187,7 +189,7 @@ def begins_in_steps(equations: FirstOrderSystem, options: SolverOptions, params:
 
 
 def in_rows(equations: EquationsOfMotion, options: SolverOptions, params: PyTree, reverse: bool) -> bool:
-    """Whether samples are between steps, and come from these as rows of `evaluated_samples`."""
+    """Whether samples are between steps whose evaluation tells the friction there as well: they come as rows of `evaluated_samples`."""
     return not (options.adjoint or has_nodes(equations, params)) and has_one_evaluation(equations, options.solver, reverse)
 
 
@@ -269,10 +271,12 @@ def in_one_loop(
     directions=(),
     reverse=False,
     begins=False,
+    rows=False,
     resumed: Resumed | None = None,
 ) -> tuple[Array, RESULTS, dict]:
-    """States at the samples as `states_at`, with their variations along directions of (params, t0) for each order; where they
-    are `in_rows`, with friction. A motion that is `resumed` has been told of its loads.
+    """States at the samples, or `rows`, as `states_at`, with their variations along directions of (params, t0) for each order.
+
+    A motion that is `resumed` has been told of its loads.
     """
     adjoint = dfx.RecursiveCheckpointAdjoint() if reverse else dfx.ForwardMode()
     meter, dense = Meter() if options.progress else dfx.NoProgressMeter(), not (has_nodes(equations, args.params) or resumed)
@@ -284,7 +288,7 @@ def in_one_loop(
     kind = {"variations": _variations(equations), "reverse": reverse, "dense": dense, "resumed": resumed}
     ys, (result, stats) = integrated(equations, solver, options.max_steps, meter, *numbers, directions, **kind)
     of_params = tuple(of_params for of_params, _ in directions)
-    if dense and isinstance(solver, OneEvaluationSolver):
+    if rows:
         ys, last_y = rows_of(solver.equations, ts, ys, stats["last"], args._replace(scales=None), of_params)
         stats = stats | {"last": jax.lax.stop_gradient((stats["last"][0], last_y))}
     elif dense and equations.projection:

@@ -93,14 +93,13 @@ class SolutionMap:
         equations, at = self.equations(inputs, ts)
         params, times, tolerances = _counted(inputs, ts), ts - ts[0], inputs.tolerances
         args, reverse = self._arguments(equations, at, inputs, ts), not isinstance(adjoint, dfx.ForwardMode)
-        begins = begins_in_steps(equations, self.options, params, reverse)
+        begins, rows = (asks(equations, self.options, params, reverse) for asks in (begins_in_steps, in_rows))
         start = initialised(equations, at, args.params, args.scales, self.search, begins)
         if isinstance(adjoint, dfx.ForwardMode) or self.options.adjoint or not is_variational(equations, self.options, None, params):
-            ys, result, stats = states_at(equations, self.options, adjoint, at.t, start.y, times, args, tolerances, begins)
+            ys, result, stats = states_at(equations, self.options, adjoint, at.t, start.y, times, args, tolerances, begins, rows)
         else:
             ys, result, stats = self._accompanied(equations, adjoint, start.y, inputs, ts, args)
         ys, result = with_status(ys, result, start.conditions, (inputs, ts))
-        rows = in_rows(equations, self.options, params, reverse)
         return samples_at(equations, times, ys, params, result, stats | {"start_moved": start.moved}, tolerances, rows)
 
     def _accompanied(self, equations, adjoint, y0, inputs: Inputs, ts: Array, args: Arguments):
@@ -151,6 +150,7 @@ class SolutionMap:
         args, tolerances = self._arguments(equations, at, inputs, ts), inputs.tolerances
         shares = tuple(_shares(inputs, of_order, args.scales.duration) for of_order in directions)
         args = args._replace(scales=args.scales._replace(shares=shares))
+        rows = in_rows(equations, self.options, args.params, False)
         if is_variational(equations, self.options, varying, inputs.params):
             args = args._replace(directions=variations.directions)
             ys, result, stats = in_one_loop(variations.equations, self.options, at.t, y0, times, args, tolerances)
@@ -159,14 +159,13 @@ class SolutionMap:
         else:
             along = tuple((SinceOrigin(of_order.params, None), of_order.t0) for of_order in directions)
             given, begins = (equations, self.options, at.t, y0, times, args, tolerances), self._begins(equations, inputs, directions, ts)
-            ys, result, stats = in_one_loop(*given, directions=along, begins=begins)
-        return self._samples_and_variations(equations, inputs, directions, ts, ys, result, stats, start)
+            ys, result, stats = in_one_loop(*given, directions=along, begins=begins, rows=rows)
+        return self._samples_and_variations(equations, inputs, directions, ts, ys, result, stats, start, rows)
 
-    def _samples_and_variations(self, equations, inputs, directions, ts, ys, result, stats, start):
+    def _samples_and_variations(self, equations, inputs, directions, ts, ys, result, stats, start, rows):
         motion = lambda ys: ys[(..., *[0] * len(directions))]  # without variations
         stats = stats | {"start_moved": start.moved}
         states, result = with_status(motion(ys), result, start.conditions, (inputs, ts))
-        rows = in_rows(equations, self.options, _counted(inputs, ts), False)
         known = jnp.isfinite(states).reshape(*states.shape, *[1] * len(directions))
 
         def samples(ys_and_params):

@@ -1,10 +1,12 @@
 """Bounds of polynomial paths and of their rates, beside what is seen at many times."""
 
+import diffrax as dfx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
+import jaxlag as jl
 from jaxlag._motion.path_bounds import DEGREE, PathBounds
 
 
@@ -18,6 +20,7 @@ def test_paths_and_rates_lie_within_their_bounds(scale, start):
         path = lambda share: offset + jnp.sum(coefficients * share ** np.arange(DEGREE + 1)[:, None], axis=0)
         return PathBounds.of(path, *between).between(*part)
 
+    short = 0
     for k in range(200):
         coefficients = scale * rng.normal(size=(DEGREE + 1, 3)) * rng.integers(2, size=(DEGREE + 1, 3))
         length, offset = 10.0 ** rng.uniform(-4, 3), scale * 10.0 ** rng.uniform(-1, 3)
@@ -35,5 +38,29 @@ def test_paths_and_rates_lie_within_their_bounds(scale, start):
             assert np.all(seen >= least - rounding - 1e-15 * offset)
             assert np.all(seen <= most + rounding + 1e-15 * offset)
         if high - low < 0.05:
+            short += 1
             spread = np.ptp(np.array(y), axis=1)
             assert np.all(of_y[1] - of_y[0] <= 1.5 * spread + 40 * (high - low) ** 2 * sizes + 1e-9 * sizes)
+    assert short > 5
+
+
+SOLVERS = {
+    **{name: getattr(dfx, name)() for name in ("Heun", "Bosh3", "Tsit5", "Dopri5", "Dopri8")},
+    **{name: getattr(dfx, name)(root_finder=dfx.VeryChord(1e-10, 1e-10)) for name in ("Kvaerno3", "Kvaerno4", "Kvaerno5")},
+    "Dop853": jl.Dop853(),
+}
+
+
+@pytest.mark.parametrize("name", SOLVERS)
+def test_the_path_of_every_solver_is_known_by_its_values_at_the_nodes(name):
+    """Its dense output is a polynomial of no higher degree: the bounds of parts with no length are its values."""
+    solver = SOLVERS[name]
+    term = dfx.ODETerm(lambda t, y, _: jnp.stack([y[1], -4 * jnp.sin(y[0]) + jnp.cos(3 * t), y[0] * y[1]]))
+    y0, none, step = jnp.array([1.0, 0.5, -0.3]), None, (jnp.array(0.0), jnp.array(0.8))
+    with jax.numpy_rank_promotion("allow"):  # as diffrax has it
+        state = solver.init(term, *step, y0, none)
+        *_, dense, _, _ = solver.step(term, *step, y0, none, state, made_jump=False)
+    path = solver.interpolation_cls(t0=0.0, t1=1.0, **dense).evaluate
+    for share in np.linspace(0.013, 0.977, 23):
+        (low, high), _ = PathBounds.of(path, jnp.array(0.0), jnp.array(1.0)).between(share, share)
+        np.testing.assert_allclose([low, high], [path(share)] * 2, atol=1e-12)
