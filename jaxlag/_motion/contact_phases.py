@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from .._mechanics.constrained_acceleration import Impulse
@@ -22,10 +23,11 @@ from .._mechanics.stick_slip import Friction, ModeSelection
 from .._mechanics.stick_slip import Search as ModeSearch
 from .._model.flat import rows_by_name
 from .._program.conditions import zeros_like
-from .mode_changes import Approach, Touch, approach, behind_impact, friction_at, resting_at, touching_at, with_closed
-from .split import Piece
+from .mode_changes import Touch, behind_impact, friction_at, resting_at, touching_at, with_closed
 from .state_vector import Parts
-from .step_machine import ALONE, BACK, DONE, SELECT, STAGE, STRIKE, Decision, Point, Step, Turn
+from .step_machine import Step
+from .step_turn import ALONE, BACK, SELECT, STAGE, STRIKE, Decision, Point, Turn
+from .witnesses import beyond
 
 MOTION, COMPRESSION, EXPANSION = range(3)
 
@@ -76,7 +78,7 @@ class ContactStep(Step):
         loose = jnp.stack([number, number])
         return Change(jnp.array(MOTION), y, jnp.zeros(modes, bool), jnp.zeros(modes, y.dtype), touch, self.no_impulse, loose, total)
 
-    def _begun(self, y, t) -> ModeSearch:
+    def new_search(self, y, t) -> ModeSearch:
         none = jnp.zeros(self.equations.elements, bool)
         selection, _ = self.selection(y, t, none, none)
         number = jnp.zeros(self.equations.contacts, y.dtype)
@@ -92,15 +94,6 @@ class ContactStep(Step):
         closed = self.equations.parts(jnp.where(turn.kind == STAGE, turn.y0, turn.back.there)).closed
         return self.equations.corrections[1] if holds else jnp.where(jnp.any(closed > 0.5), self.equations.corrections[1], 0)
 
-    def arriving(self, piece: Piece, start, end):
-        """Which gaps may close, by bounds of them along the path."""
-        return self._approach(piece, start, end).may_arrive
-
-    def _approach(self, piece: Piece, start, end) -> Approach:
-        """What is known of gaps along a piece."""
-        by_share = self.path(piece, jnp.zeros_like(start), jnp.ones_like(start))
-        return approach(self.equations, by_share, start, end, self.args)
-
     def asked(self, turn: Turn):
         """y on its way, in the mode and with the contacts that are asked about; alone, without friction and contacts."""
         search, kind = turn.choice.search, turn.kind
@@ -112,7 +105,8 @@ class ContactStep(Step):
         freed, *_ = selection.kinds(search)
         alone, none = (kind == ALONE) & jnp.ones_like(freed), jnp.zeros_like(there.closed)
         sigma = without_force(selection.elements, search.mode.sigma, jnp.where(kind == STRIKE, False, freed | alone))
-        there = moving._replace(q=q, v=v, closed=jnp.where(kind == ALONE, none, search.contacts.closed))
+        closed, sign = jnp.where(kind == ALONE, none, search.contacts.closed), beyond(there.sign, turn.choice.passed)
+        there = moving._replace(q=q, v=v, closed=closed, sign=sign)
         return lambda k: there._replace(sigma=self.changed(sigma, k)).y
 
     def _selection_in(self, turn: Turn) -> tuple[ModeSelection, Parts]:
@@ -130,10 +124,11 @@ class ContactStep(Step):
         of_positions, at_start = self.args.scales.of_positions(parts.q), self.at_start(turn)
         if self.begins is not None:
             closing = (flat.gaps(turn.end, parts.q) <= 0) & (parts.closed < 0.5)
-            touching = jnp.concatenate([jnp.zeros(self.equations.elements, bool), closing])
+            others = (jnp.zeros(size, bool) for size in (self.equations.elements, self.equations.events))
+            touching = jnp.concatenate([next(others), closing, next(others)])
             ended, moved = jnp.where(at_start, touching, ended), jnp.where(at_start, 0, moved)
             of_positions = jnp.where(at_start, roundings_beside(flat, turn.end, parts.q, parts.v)[0], of_positions)
-        _, of_contact = jnp.split(ended, [self.equations.elements])
+        _, of_contact, passed = jnp.split(ended, np.cumsum([self.equations.elements, self.equations.contacts]))
         touch = touching_at(self.equations, flat, turn.end, parts, self.args, of_contact, of_positions)
         is_impact = jnp.any(touch.hits)
         impulse = of_compression(flat, turn.end, parts.q, parts.v, touch.e)._replace(happens=is_impact)
@@ -142,9 +137,10 @@ class ContactStep(Step):
         phase = jnp.where(is_impact, COMPRESSION, MOTION)
         change = Change(phase, turn.piece.y, ended, moved, touch, impulse, loose, nothing)
         change = jax.tree.map(lambda new, old: jnp.where(last, new, old), change, turn.change)
-        search = jax.tree.map(lambda new, old: jnp.where(last, new, old), self._begun(parts.y, turn.end), turn.choice.search)
+        search = jax.tree.map(lambda new, old: jnp.where(last, new, old), self.new_search(parts.y, turn.end), turn.choice.search)
         turn = turn._replace(kind=jnp.where(last, ALONE, turn.kind), first=jnp.where(last, 0, turn.first), change=change)
-        turn = turn._replace(choice=turn.choice._replace(search=search))
+        passed = jnp.where(last, passed, turn.choice.passed)
+        turn = turn._replace(choice=turn.choice._replace(search=search, passed=passed))
         on_contacts = parts._replace(closed=jnp.maximum(parts.closed, touch.hits.astype(parts.closed.dtype)))
         return Decision(turn, last & is_impact, turn.end, on_contacts.y)
 
@@ -154,21 +150,12 @@ class ContactStep(Step):
         q = jnp.where(there, self.equations.parts(y).q, parts.q)
         return turn._replace(change=turn.change._replace(y=parts._replace(q=q).y))
 
-    def unless_far(self, turn: Turn, looks) -> Turn:
-        """Done, where bounds say that all gaps stay open along a piece."""
-        start, end = jax.lax.stop_gradient((turn.start, turn.end))
-        stays_away = self._approach(turn.piece, start, end).stays_away
-        if stays_away is None:
-            return turn
-        is_far = jax.lax.cond(looks, lambda: stays_away(start, end), lambda: jnp.array(False))
-        return turn._replace(kind=jnp.where(is_far, DONE, turn.kind))
-
     def _alone(self, turn: Turn, point: Point) -> Decision:
         """What the motion is without contact says what is rounding of forces; with that a selection begins."""
         change, t, equations = turn.change, turn.end, self.equations
         parts, before = jax.lax.stop_gradient((equations.parts(change.y), equations.parts(turn.piece.y)))
         flat, elements = self.contents(t, parts)
-        of_friction, of_contact = jnp.split(change.ended, [equations.elements])
+        of_friction, of_contact, _ = jnp.split(change.ended, np.cumsum([equations.elements, equations.contacts]))
         anew = jnp.any(change.touch.hits) | jnp.any(of_contact & (before.closed < 0.5))
         behind = before._replace(q=parts.q, v=parts.v)
         errors, moved = self.args.scales.of_velocities(parts.v), change.moved[: equations.elements]
@@ -206,7 +193,7 @@ class ContactStep(Step):
         contacts = search.contacts._replace(impulse=None)
         turn = turn._replace(choice=turn.choice._replace(search=search._replace(contacts=contacts), found=found))
         parts = self.in_mode(turn, selection.elements, search)
-        modes = {"sigma": parts.sigma, "held": parts.held, "transitions": parts.transitions}
+        modes = {"sigma": parts.sigma, "held": parts.held, "transitions": parts.transitions, "sign": parts.sign}
         parts = with_closed(turn.end, equations.parts(change.y)._replace(**modes), change.touch, contacts.closed)
         goes_on, strikes, cut = done & ~change.is_impact, done & change.is_impact, turn.split.cut
         struck = change.total.found

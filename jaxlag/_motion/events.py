@@ -7,17 +7,17 @@ from jaxtyping import Array, Bool, Float
 
 from .._mechanics.consistent_state import nearest_state
 from .._mechanics.contact import gap_rates, gap_scales, outside
-from .._model.event import Negative
 from .._model.flat import Flat
 from .._model.state_values import ravelled
 from .._program.jit import jitted
 from .first_order import EquationsOfMotion
+from .held_sides import on_held_sides
 from .jumps import after_jump
 from .mode_changes import Change, changed
 from .protocol import Arguments
 from .scales import Scales
 from .state_vector import Parts
-from .witnesses import matching, sides, signs_behind_step
+from .witnesses import brought_to_zero, changes_states, passing, signs_behind_step, struck, with_seen
 
 
 def behind_end(equations: EquationsOfMotion, t, y, args: Arguments, ended: Bool[Array, " m"], moved: Float[Array, " m"]) -> Change:
@@ -28,7 +28,7 @@ def behind_end(equations: EquationsOfMotion, t, y, args: Arguments, ended: Bool[
     modes, passed = jnp.split(ended, [count])
     same = lambda: Change(y, yes, yes, yes, yes)
     change = jax.lax.cond(jnp.any(modes), lambda: changed(equations, t, y, args, modes, moved[:count]), same) if count else same()
-    after, consistent = _settled(equations, t, y, change.y, args, passed | _struck(equations, y, change.y))
+    after, consistent = _settled(equations, t, y, change.y, args, passed | struck(equations, y, change.y))
     return change._replace(y=after, consistent=change.consistent & consistent)
 
 
@@ -37,7 +37,7 @@ def behind_jump(equations: EquationsOfMotion, t, y0, y, before: Arguments, args:
     after, consistent = after_jump(equations, t, y0, y, before, args)
     if not equations.events:
         return after, consistent
-    after, also = _settled(equations, t, y, after, args, _struck(equations, y, after))
+    after, also = _settled(equations, t, y, after, args, struck(equations, y, after))
     return after, consistent & also
 
 
@@ -53,15 +53,7 @@ def begun(equations: EquationsOfMotion, t, y, args: Arguments) -> tuple[Float[Ar
     """y at the start, behind the events of witnesses that are `Negative` already and of impacts there; and whether a mode of friction and
     contact is consistent there.
     """
-    return _settled(equations, t, y, y, args, _struck(equations, None, y), at_start=True)
-
-
-def _struck(equations: EquationsOfMotion, before, y) -> Bool[Array, " w"]:
-    """Which events are those of contacts that had an impact between two states."""
-    impacts = equations.parts(y).impacts - (0 if before is None else equations.parts(before).impacts)
-    names = [name for name, _ in equations.system.unilateral]
-    of = [event.when for _, event in equations.system.events]
-    return jnp.stack([impacts[names.index(when)] > 0 if isinstance(when, str) else jnp.array(False) for when in of])
+    return _settled(equations, t, y, y, args, struck(equations, None, y), at_start=True)
 
 
 @jitted
@@ -74,35 +66,35 @@ def _settled(equations: EquationsOfMotion, t, seen, y, args: Arguments, passed: 
     def turn(carry):
         y, consistent, passed, done, _ = carry
         parts = equations.parts(y)
-        side, is_far = sides(equations, t, parts, args)
-        is_new = parts.sign == 0
-        before = jnp.where(is_new, 1, parts.sign)
-        passed = (passed | (is_new & _due(equations) & (side < 0)) | (~is_new & is_far & (side != parts.sign))) & ~done
-        done = done | passed
-        happens = passed & matching(equations, before)
-        stops = jnp.any(happens & np.array([event.stop for _, event in equations.system.events]))
-        sign, stopped = jnp.where(done | (is_new & at_start), side, parts.sign), jnp.maximum(parts.stopped, stops)
-        parts = parts._replace(sign=sign, happened=parts.happened + happens, stopped=stopped)
+        brought = brought_to_zero(equations, t, seen, parts, args)
+        parts, happens, done = passing(equations, t, parts, args, passed, brought, done, at_start)
         changing = np.array([event.then is not None for _, event in equations.system.events])
         unmoved = lambda: (parts.y, jnp.array(True))
         move = (lambda: _moved(equations, t, parts, args, happens)) if changing.any() else unmoved
         moves = jnp.any(happens & changing)
         y, fine = jax.lax.cond(moves, move, unmoved)
-        return y, consistent & fine, _struck(equations, parts.y, y), done, moves
+        consistent &= fine
+        if equations.sided and equations.elements:  # where forces jump, what sticks may break away
+            selected = lambda: _on_new_sides(equations, t, y, args)
+            y, fine = jax.lax.cond(jnp.any(happens), selected, lambda: (y, jnp.array(True)))
+            consistent &= fine
+        return y, consistent, struck(equations, parts.y, y), done, moves
 
-    before = equations.parts(seen)
-    there = jnp.concatenate([t[None], before.q, before.v, before.z, before.u])
     yes, none = jnp.array(True), jnp.zeros_like(passed)
-    carry = equations.parts(y)._replace(seen=there).y, yes, passed, none, yes
-    most = equations.events if any(event.then for _, event in equations.system.events) else 0
+    carry = with_seen(equations, t, seen, equations.parts(y)).y, yes, passed, none, yes
+    most = equations.events if changes_states(equations) else 0
     maybe = lambda _, carry: jax.lax.cond(carry[-1], turn, lambda carry: carry, carry)
     y, consistent, *_ = jax.lax.fori_loop(0, most + 1, maybe, carry)
     return y, consistent
 
 
-def _due(equations):
-    """Which events happen where their witness is negative at the start."""
-    return np.array([isinstance(event.direction, Negative) for _, event in equations.system.events])
+def _on_new_sides(equations: EquationsOfMotion, t, y, args: Arguments):
+    """y in the mode of friction that holds on the sides where witnesses are now."""
+    parts = equations.parts(y)
+    flat, _ = equations.contents(t, parts, args)
+    held = on_held_sides(flat, t, parts, args)
+    after, consistent = after_jump(equations, t, held.y, held.y, args, args)
+    return equations.parts(after)._replace(q=parts.q, v=parts.v).y, consistent
 
 
 def _moved(equations: EquationsOfMotion, t, parts: Parts, args: Arguments, happens):

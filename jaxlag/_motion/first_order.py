@@ -242,22 +242,24 @@ class EquationsOfMotion:
         that happens, the friction of an impact; or of a `correction`, that. For rates alone, loads need not be shared.
         """
         correction, shares = jax.tree.map(lambda x: jnp.asarray(x, bool), (correction, shares))  # so that it is traced once
-        return _rates_and_friction(self, t, parts, self._without_scales(args), impulse, correction, shares)
+        args = args if self.sided else self._without_scales(args)
+        return _rates_and_friction(self, t, parts, args, impulse, correction, shares)
 
     @property
     def corrections(self) -> tuple[int, int]:
         """How many evaluations put positions back on their constraints, and how many all of a state: behind positions stand velocities,
         and those that follow from the rest.
         """
-        assert self.projection is not None  # asked where there is something to keep
+        if self.projection is None:
+            return 0, 0
         holds = self.system.holonomic or self.contacts or self.light
         of_positions = self.projection.iterations if holds else 0
         return of_positions, of_positions + 1 + bool(self.light)
 
-    def correction(self, k) -> Correction:
-        """The one of this number, none of a negative one."""
+    def correction(self, k) -> Correction | None:
+        """The one of this number, none of a negative one, if there is anything to keep."""
         of_positions, _ = self.corrections
-        return Correction((k >= 0) & (k < of_positions), k == of_positions)
+        return Correction((k >= 0) & (k < of_positions), k == of_positions) if self.projection else None
 
     def next_correction(self, parts: Parts, found: Friction, k) -> Any:
         """The number of the one behind that of this number: Newton's steps square what is left, so that a small one is the last."""
@@ -339,6 +341,11 @@ def _rates(equations: EquationsOfMotion, t, y, args):
 def _rates_and_friction(
     equations: EquationsOfMotion, t, parts: Parts, args, impulse: Impulse | None, correction: Correction | None, shares
 ) -> tuple[Array, Friction]:
+    moving = parts.v
+    if equations.sided:
+        held = on_held_sides(equations.contents(t, parts, args)[0], t, parts, args)
+        is_back = False if correction is None else correction.happens
+        parts = jax.tree.map(lambda held, there: jnp.where(is_back, there, held), held, parts)
     q, v = parts.q, parts.v
     flat, elements = equations.rubbing(t, parts, args)
     if equations.elements:
@@ -346,7 +353,7 @@ def _rates_and_friction(
     there, rubbing = (flat, elements) if impulse is None else of_impulses(flat, elements, t, q, v, impulse)
     assert rubbing is not None  # as many as there are elements
     found = friction(there, rubbing, parts.sigma, t, q, v, impulse=impulse, correction=correction, shares=shares)
-    v, qddot = found.qdot, found.qddot.at[np.array(equations.light, int)].set(0)
+    v, qddot = moving if equations.sided else found.qdot, found.qddot.at[np.array(equations.light, int)].set(0)
     powers = listed_powers(in_mode(flat, elements, parts.sigma), t, q, v) if equations.works else parts.works
     stuck = jnp.maximum(sticking(elements, parts.sigma).astype(q.dtype), parts.held)
     resting = Parts(*(jnp.zeros_like(part) for part in parts))

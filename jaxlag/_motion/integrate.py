@@ -38,6 +38,7 @@ from .sparse_implicit import in_structure
 from .step_size import StepControl, with_tolerances
 from .stick_slip_solver import StickSlipSolver
 from .variational import VariationalEquations, derived, varied_along, with_variations
+from .witnesses import may_be_due
 from .wrapped_solver import ProjectedSolver, SamplingAdjoint
 
 CHOICES: dict[str, tuple[tuple[type, ...], str]] = {  # what may be chosen; the usual kinds first, since diffrax takes long to tell its own
@@ -117,7 +118,7 @@ def initialised(
         (nearest.defined, RESULTS.undefined),
     )
     y = start.y
-    if equations.events:
+    if equations.events and not begins:
         given = Arguments(params, scales)
         args = told_of_loads(equations, t0, y, given) if equations.elements else given
         y, consistent = begun(equations, t0, y, args)
@@ -180,12 +181,12 @@ def states_at(
 
 def begins_in_steps(equations: FirstOrderSystem, options: SolverOptions, params: PyTree, reverse: bool) -> bool:
     """Whether the first step finds the mode of friction and contact at the start, by the evaluation of all others: not where slip begins in
-    a plane, whose direction turns with all that it depends on.
+    a plane, whose direction turns with all that it depends on, nor where events may happen there.
     """
     if not isinstance(equations, EquationsOfMotion) or (options.adjoint and not has_nodes(equations, params)):
         return False
     one = has_one_evaluation(equations, options.solver, reverse)
-    return one and equations.rows == equations.elements
+    return one and equations.rows == equations.elements and not may_be_due(equations)
 
 
 def in_rows(equations: EquationsOfMotion, options: SolverOptions, params: PyTree, reverse: bool) -> bool:

@@ -28,10 +28,11 @@ from .._model.flat import Flat, StatesAt
 from .._program.jit import jitted
 from .._program.time_bounds import bounds_over_boxes
 from .first_order import EquationsOfMotion
+from .held_sides import on_held_sides
 from .path_bounds import PathBounds
 from .protocol import Arguments
 from .state_vector import Parts, Start
-from .witnesses import plain_witnesses, witness_margins
+from .witnesses import margins_at, plain_witnesses, witness_margins
 
 CONVERGED = 1e-9  # of the motion, the time that infinitely many impacts may yet take when they are summed up,
 OFTEN = 64  # parts of a step, in each of which what has no bounds is looked at
@@ -71,7 +72,8 @@ def _margins(equations: EquationsOfMotion, t, parts: Parts, args):
         pressing = lambda: contact_rows(flat, equations.acceleration(mode, t, q, v).multipliers)
         forces = jax.lax.cond(jnp.any(closed), pressing, none) if equations.contacts else none()
         return jnp.concatenate([_contact_margins(flat, t, q, closed, forces, args), of_events, *unbounded])
-    return margins_of(equations, t, parts, args, equations.friction(t, parts, args), of_events)
+    there = on_held_sides(flat, t, parts, args) if equations.sided else parts
+    return margins_of(equations, t, parts, args, equations.friction(t, there, args), of_events)
 
 
 def margins_of(equations: EquationsOfMotion, t, parts: Parts, args: Arguments, found: Friction, of_events: Array | None = None) -> Array:
@@ -161,9 +163,17 @@ def at_end(equations: EquationsOfMotion, t, y, args: Arguments, slopes: Float[Ar
     return exactly(equations, t, equations.parts(y), args, found, slopes)
 
 
-def exactly(equations: EquationsOfMotion, t, parts: Parts, args: Arguments, found: Float[Array, " m"], slopes: Float[Array, " m"]) -> AtEnd:
+def exactly(
+    equations: EquationsOfMotion,
+    t,
+    parts: Parts,
+    args: Arguments,
+    found: Float[Array, " m"],
+    slopes: Float[Array, " m"],
+    decided: bool = False,
+) -> AtEnd:
     """With the margins `found` and their `slopes`, those of open contacts apart, which are g and ġ as they are: among many impacts a gap is
-    hardly more than its rounding, and its rate is no difference of gaps.
+    hardly more than its rounding, and its rate is no difference of gaps. `decided`: whether velocities that follow from the rest do.
     """
     flat, _ = equations.contents(t, parts, args)
     first = [equations.elements, equations.elements + equations.contacts]
@@ -171,7 +181,8 @@ def exactly(equations: EquationsOfMotion, t, parts: Parts, args: Arguments, foun
     is_closed = parts.closed > 0.5
     gaps = jnp.where(is_closed, of_contacts, flat.gaps(t, parts.q))
     rates = jnp.where(is_closed, rises, gap_rates(flat, t, parts.q, parts.v))
-    witnesses, rounding = witness_margins(equations, t, parts, args)
+    witnesses, rounding = (margins_at if decided else witness_margins)(equations, t, parts, args)
+    passes = jnp.where(parts.sign == 0, 0, passes)  # what stays at zero does not pass through it
     value, slope = jnp.concatenate([of_elements, gaps, witnesses]), jnp.concatenate([falls, rates, passes])
     is_exact = jnp.concatenate([jnp.zeros_like(falls, bool), ~is_closed, jnp.ones_like(passes, bool)])
     beside = jnp.concatenate([jnp.zeros_like(falls), of_contacts - gaps, rounding])

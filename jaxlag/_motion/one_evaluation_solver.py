@@ -8,20 +8,22 @@ import jax
 import jax.numpy as jnp
 
 from .contact_phases import ContactStep
+from .event_phases import EventStep
 from .first_order import EquationsOfMotion
 from .results import RESULTS, under_diffrax
 from .runge_kutta import ExplicitRungeKutta
 from .step_machine import Step
 from .stick_slip_solver import StickSlipSolver
+from .witnesses import asks_for_forces, changes_states
 
 AT_START = RESULTS.no_friction, RESULTS.negative_bound, RESULTS.energy_gained, RESULTS.not_impulsive  # what `Begun` says in this order
 
 
 def has_one_evaluation(equations: EquationsOfMotion, solver: Any, reverse: bool) -> bool:
-    """Whether one evaluation serves all: of an explicit scheme, where nothing but friction and contact changes modes, and neither shares of
-    it nor slips that constraints turn or drive are to be found beside.
+    """Whether one evaluation serves all: of an explicit scheme, where events change no state and ask for no constraint forces, and neither
+    shares of friction nor slips that constraints turn or drive are to be found beside.
     """
-    other = equations.events or equations.sided or (equations.contacts and equations.light)
+    other = asks_for_forces(equations) or changes_states(equations) or (equations.light and (equations.contacts or equations.sided))
     plain = equations.formulation.stabilisation.feedback() is None and (equations.contacts or not equations.entangled)
     return bool(isinstance(solver, ExplicitRungeKutta) and equations.modes and plain and not other and not reverse)
 
@@ -50,7 +52,7 @@ class OneEvaluationSolver(StickSlipSolver):
 
     def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
         rate, is_new, start = solver_state
-        kind = ContactStep if self.equations.contacts else Step
+        kind = ContactStep if self.equations.contacts else Step if self.equations.elements else EventStep
         done = kind.of(self, t0, t1, y0, args, ~start.known if self.begins else None).run(rate, made_jump | is_new)
         ended, ok = done.split.seen.ended, dfx.RESULTS.successful
         first = jax.tree.map(lambda cut, whole: jnp.where(ended, cut, whole), done.split.first, done.piece)

@@ -52,7 +52,7 @@ def _from(s, coefficients):
     """Those from s to 1 (de Casteljau)."""
 
     def turn(r, b):
-        return jnp.where((DEGREE - r >= EVERY)[:, None], (1 - s) * b + s * jnp.roll(b, -1, axis=0), b)
+        return jnp.where((DEGREE - r >= EVERY.astype(r.dtype))[:, None], (1 - s) * b + s * jnp.roll(b, -1, axis=0), b)
 
     return jax.lax.fori_loop(1, DEGREE + 1, turn, coefficients)
 
@@ -61,6 +61,6 @@ def _until(s, coefficients):
     """Those from 0 to s."""
 
     def turn(r, b):
-        return jnp.where((r <= EVERY)[:, None], (1 - s) * jnp.roll(b, 1, axis=0) + s * b, b)
+        return jnp.where((r <= EVERY.astype(r.dtype))[:, None], (1 - s) * jnp.roll(b, 1, axis=0) + s * b, b)
 
     return jax.lax.fori_loop(1, DEGREE + 1, turn, coefficients)

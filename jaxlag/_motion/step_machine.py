@@ -7,6 +7,7 @@ at the margins of a mode, as the end of a mode, and in the selection of the next
     SELECT  the friction in a mode that may follow            then another one, or y in that mode, put on its constraints
     TURN    slip rates with each row of σ changed             then the same
     BACK    what takes a state back to its constraints        then what follows with that state there
+    COUNT   the accelerations behind an event                 then the rest of the step, with what has happened
 
 and, where there are contacts (`contact_phases`), before each selection
 
@@ -18,7 +19,7 @@ A turn of the loop evaluates points of one kind, and decides what is next, which
 
 import dataclasses
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -36,103 +37,15 @@ from .._program.conditions import computed_first_with_changes, zeros_like
 from .._program.time_bounds import TimeDependence, time_dependence
 from .first_order import EquationsOfMotion
 from .loads import loads_within
-from .mode_changes import AtEnd, at_rest_within, exactly, in_other_mode, margins, margins_of
+from .mode_changes import Approach, AtEnd, approach, at_rest_within, exactly, in_other_mode, margins, margins_of
 from .protocol import Arguments, undifferentiated
 from .runge_kutta import ExplicitRungeKutta, weighted, with_row
 from .split import CHANGE, PHASES, REST, SEEN_LATE, WHOLE, Cut, Piece, Split, next_estimate
 from .state_vector import Parts
-from .step_monitor import CHEBYSHEV, LOOKS, Looks, Monitor, Search, Seen, changes_by_time, reach_of_time, slopes_of_interpolant
+from .step_monitor import CHEBYSHEV, LOOKS, Looks, Monitor, Seen, changes_by_time, reach_of_time, slopes_of_interpolant
+from .step_turn import BACK, BEGIN, COUNT, DONE, END, LOOK, SELECT, STAGE, TURN, Back, Begun, Choice, Decision, Point, Turn, Watch
+from .witnesses import behind_mode, beyond, margins_at
 from .wrapped_solver import ProjectedSolver
-
-STAGE, LOOK, END, SELECT, BACK, ALONE, STRIKE, TURN, DONE = range(9)
-BEGIN = -1  # the phase before those of a step, in which the motion has no mode yet
-
-
-class Point(NamedTuple):
-    """What is evaluated at one point."""
-
-    rates: Array
-    friction: Friction
-
-
-class Watch(NamedTuple):
-    """The search for an end along a piece: the times of its next look, and the margins there; what was looked at before there was an end
-    in it, whose interpolant tells slopes; and how steeply margins follow what follows the time alone.
-    """
-
-    search: Search
-    ts: Any
-    values: Any
-    smooth: tuple[Any, Any, Any]  # from one time to another, the values at its nodes
-    steepness: Any
-
-
-class Choice(NamedTuple):
-    """The selection of the mode that follows: of what is at rest, and what breaks away; in the mode that is asked about, the friction, and
-    slip rates, with each row of σ changed as well.
-    """
-
-    search: ModeSearch
-    at_rest: Any
-    breaking: Any
-    found: Friction
-    slip_rates: Any
-
-
-class Back(NamedTuple):
-    """A state that is put back on its constraints at some time: y before, and y on its way; what it is of, and what follows: the kind of
-    the next points, and the number of the first.
-    """
-
-    t: Any
-    y: Array
-    there: Array
-    of: Any
-    kind: Any
-    first: Any
-
-
-class Turn(NamedTuple):
-    """What the loop carries: the kind of its next points, and the number of the first; the phase of the step; the piece of it that is
-    made, from y0 at its start to its end; the step so far.
-    """
-
-    kind: Any
-    first: Any
-    phase: Any
-    start: Any
-    end: Any
-    y0: Any
-    stages: Any
-    piece: Piece
-    split: Split
-    watch: Watch
-    choice: Choice
-    back: Back
-    change: Any = None  # of contacts
-    begun: Any = None  # where motions begin here
-
-
-class Begun(NamedTuple):
-    """The start of a motion in the mode that holds there, and what loads make of velocities; whether the mode is consistent, no bound is
-    negative, and an impact there takes energy and follows from impulses.
-    """
-
-    y: Array
-    loads: Array
-    consistent: Any
-    bounded: Any
-    dissipates: Any
-    impulsive: Any
-
-
-class Decision(NamedTuple):
-    """The turn that follows; and whether y is to be put on the constraints at some time, and given to it."""
-
-    turn: Turn
-    projects: Any
-    t: Any
-    y: Any
 
 
 @dataclasses.dataclass(frozen=True)
@@ -170,7 +83,7 @@ class Step:
     @property
     def phases(self) -> Array:
         """Those of a step."""
-        return jnp.asarray(SEEN_LATE if self.equations.contacts else PHASES)
+        return jnp.asarray(SEEN_LATE if self.equations.contacts or self.equations.events else PHASES)
 
     @property
     def may_turn(self) -> bool:
@@ -192,9 +105,9 @@ class Step:
         split = Split(piece, piece, Cut(end, end, y0, no, yes, yes, no), Seen(no, no, no, t1, margins))
         looks, steepness = jnp.zeros((LOOKS + 1, 2 * modes), y0.dtype), jax.eval_shape(self._steepness, piece, t0, t1)
         watch = Watch(self._monitor(t0, t1).start(y0.dtype), jnp.zeros(LOOKS + 1, y0.dtype), looks, (t0, t1, looks), zeros_like(steepness))
-        search = zeros_like(jax.eval_shape(lambda: self._begun(y0, t0)))
+        search = zeros_like(jax.eval_shape(lambda: self.new_search(y0, t0)))
         slip_rates = jnp.zeros((rows + 1 if self.may_turn else 0, rows), y0.dtype)
-        choice = Choice(search, none, none, zeros_like(self._like().friction), slip_rates)
+        choice = Choice(search, none, none, jnp.zeros(self.equations.events, bool), zeros_like(self._like().friction), slip_rates)
         first, stage = jnp.where(made_jump, 0, 1), jnp.array(STAGE)
         back = Back(start, y0, y0, stage, stage, jnp.array(0))
         turn = Turn(stage, first, jnp.array(0), start, end, y0, stages, piece, split, watch, choice, back, self._unchanged())
@@ -205,7 +118,7 @@ class Step:
         end, begun = jnp.where(self.begins, start, end), Begun(y0, jnp.zeros(self.equations.size, y0.dtype), yes, yes, yes, yes)
         return turn._replace(kind=kind, phase=phase, first=first, end=end, piece=piece, begun=begun)
 
-    def _begun(self, y, t) -> ModeSearch:
+    def new_search(self, y, t) -> ModeSearch | None:
         """A search for the mode at a state, in shapes."""
         none = jnp.zeros(self.equations.elements, bool)
         return self.selection(y, t, none, none)[0].start()
@@ -235,15 +148,25 @@ class Step:
     def _put_back(self, turn: Turn, point: Point) -> Decision:
         """A state is back on its constraints, and what was decided before follows."""
         t, before, there, kind, *onward = turn.back
-        y, of_cut = self._there(t, before, there), kind == SELECT
+        y = self._there(t, before, there)
+        turn = self.with_cut(turn._replace(kind=onward[0], first=onward[1]), kind == SELECT, y)
+        return Decision(self.put(turn, kind == END, y), jnp.array(False), t, y)
+
+    def with_cut(self, turn: Turn, here, y) -> Turn:
+        """With the rest of the step from this y on, where it is `here` that a mode has ended."""
         if turn.begun is not None:  # works are counted from here on
-            begins = of_cut & (turn.phase == BEGIN + 1)
+            begins = here & (turn.phase == BEGIN + 1)
             without = self.equations.parts(y)._replace(works=jnp.zeros(len(self.equations.works), y.dtype)).y
             y = jnp.where(begins, without, y)
+        return self._from_here(turn, here, y)
+
+    def _from_here(self, turn: Turn, here, y) -> Turn:
+        """With this y, where it is `here`."""
+        if turn.begun is not None:
+            begins = here & (turn.phase == BEGIN + 1)
             turn = turn._replace(begun=turn.begun._replace(y=jnp.where(begins, y, turn.begun.y)))
-        split = turn.split._replace(cut=turn.split.cut._replace(y=jnp.where(of_cut, y, turn.split.cut.y)))
-        turn = turn._replace(kind=onward[0], first=onward[1], split=split, y0=jnp.where(of_cut, y, turn.y0))
-        return Decision(self.put(turn, kind == END, y), jnp.array(False), t, y)
+        split = turn.split._replace(cut=turn.split.cut._replace(y=jnp.where(here, y, turn.split.cut.y)))
+        return turn._replace(split=split, y0=jnp.where(here, y, turn.y0))
 
     def _there(self, t, before, there) -> Array:
         """y with the state to which corrections have come."""
@@ -253,15 +176,22 @@ class Step:
     @property
     def decisions(self) -> list[Callable]:
         """What is decided where points have been evaluated, in the order of their kinds."""
-        return [self._stages_done, self._looked, self._at_end, self._selected, self._put_back]
+        return [self._stages_done, self._looked, self._at_end, self._selected, self._put_back, self._counted]
 
     def put(self, turn: Turn, there, y) -> Turn:
         """With y, if it was put on the constraints where a mode ends."""
         return turn
 
     def unless_far(self, turn: Turn, looks) -> Turn:
-        """Done, where it is known without looking along a piece that no mode ends on it."""
-        return turn
+        """Done, where bounds say, without looking along a piece, that no gap closes and nothing passes through zero on it."""
+        if not self.is_rough:
+            return turn
+        start, end = jax.lax.stop_gradient((turn.start, turn.end))
+        stays_away = self._approach(turn.piece, start, end).stays_away
+        if stays_away is None:
+            return turn
+        is_far = jax.lax.cond(looks, lambda: stays_away(start, end), lambda: jnp.array(False))
+        return turn._replace(kind=jnp.where(is_far, DONE, turn.kind))
 
     def _evaluated(self, turn: Turn) -> tuple[Turn, Point]:
         """The rates at stages and what takes the end of their piece back to its constraints, margins along a piece, or the friction at its
@@ -269,7 +199,7 @@ class Step:
         """
         _, c, weights = map(jnp.asarray, self.scheme.stages(turn.y0.dtype))
         of_stages, last, corrections = len(c), self.scheme.tableau.stages - 1, self.corrections(turn)
-        count = jnp.array([of_stages, LOOKS + 1, 1, 1, 0, 1, 1, self.equations.rows + 1])[turn.kind]
+        count = jnp.array([of_stages, LOOKS + 1, 1, 1, 0, 1, 1, 1, self.equations.rows + 1])[turn.kind]
         h, path, ts, asks = turn.end - turn.start, self.path(turn.piece, turn.start, turn.end), turn.watch.ts, turn.kind >= SELECT
         asked, impulse, is_stage, is_back = self.asked(turn), self.impulse(turn), turn.kind == STAGE, turn.kind == BACK
         count += jnp.where(is_stage | is_back, corrections, 0)
@@ -280,19 +210,23 @@ class Step:
             i, j = jnp.where(number >= 0, last, jnp.minimum(k, of_stages - 1)), jnp.minimum(k, LOOKS)
             at_stage = jnp.where(c[i] == 1, turn.end, turn.start + c[i] * h), turn.y0 + h * weighted(weights[i], stages)
             asked_for = jnp.where(is_back, turn.back.t, turn.end), jnp.where(is_back, back, jnp.where(asks, asked(k), turn.piece.y))
+            if self.equations.events:
+                asked_for = tuple(jnp.where(turn.kind == COUNT, a, b) for a, b in zip((turn.start, turn.y0), asked_for, strict=True))
             of_three = zip((at_stage[0], jnp.where(number > 0, back, at_stage[1])), (ts[j], path(ts[j])), asked_for, strict=True)
             t, y = (jnp.where(is_stage, a, jnp.where(turn.kind == LOOK, b, c)) for a, b, c in of_three)
             t, y = computed_first_with_changes((t, y), turn.end)
             parts, correction, shares = self.equations.parts(y), self.equations.correction(number), ~is_stage & ~is_back
             found = self.equations.rates_and_friction(t, parts, self.args, impulse, correction, shares)
             point = computed_first_with_changes(Point(*found), t)
-            back = jnp.where(number >= 0, self.equations.corrected(t, parts, self.args, point.friction, number).y, back)
+            after = 1
+            if correction is not None:
+                back = jnp.where(number >= 0, self.equations.corrected(t, parts, self.args, point.friction, number).y, back)
+                after = self.equations.next_correction(parts, point.friction, number) - number
             seen, slip_rate = jax.lax.stop_gradient((self._margins(t, parts, point.friction), point.friction.slip_rate))
             stages = jnp.where(is_stage & (number < 0), with_row(stages, point.rates, k), stages)
             values = jnp.where(turn.kind == LOOK, with_row(values, seen, k), values)
             if self.may_turn:
                 slip_rates = jnp.where(asks, with_row(slip_rates, slip_rate, k), slip_rates)
-            after = self.equations.next_correction(parts, point.friction, number) - number
             return k + after, stages, values, slip_rates, back, point
 
         start = (
@@ -319,6 +253,7 @@ class Step:
         selection, there = self.selection(turn.piece.y, turn.end, turn.choice.at_rest, turn.choice.breaking)
         freed, *_ = selection.kinds(turn.choice.search)
         sigma = without_force(selection.elements, turn.choice.search.mode.sigma, freed)
+        there = there._replace(sign=beyond(there.sign, turn.choice.passed))
         return lambda k: there._replace(sigma=self.changed(sigma, k)).y
 
     def changed(self, sigma, k) -> Array:
@@ -326,8 +261,9 @@ class Step:
         return sigma + changed_row(k - 1, sigma.size, sigma.dtype) if self.may_turn else sigma
 
     def _margins(self, t, parts: Parts, found: Friction):
-        """Of elements and contacts, and bounds."""
-        return margins_of(self.equations, t, parts, self.args, found)
+        """Of elements, contacts and events, and bounds."""
+        of_events = sum(margins_at(self.equations, t, parts._replace(v=found.qdot), self.args)) if self.equations.events else None
+        return margins_of(self.equations, t, parts, self.args, found, of_events)
 
     def path(self, piece: Piece, start, end) -> Callable:
         """The dense output of a piece."""
@@ -338,8 +274,19 @@ class Step:
         bounded = self.of_time_alone is None or self.of_time_alone.is_bounded
         return Monitor(self.equations.modes, self.args.scales, *jax.lax.stop_gradient((start, end)), bounded, nodes=CHEBYSHEV)
 
+    @property
+    def is_rough(self) -> bool:
+        """Whether there are functions of the user's among the margins: gaps and witnesses."""
+        return bool(self.equations.contacts or self.equations.events)
+
     def arriving(self, piece: Piece, start, end) -> Callable | None:
         """Which modes may end between two times along a path, for all that is known of what may be rough."""
+        return self._approach(piece, start, end).may_arrive if self.is_rough else None
+
+    def _approach(self, piece: Piece, start, end) -> Approach:
+        """What is known of gaps and witnesses along a piece."""
+        by_share = self.path(piece, jnp.zeros_like(start), jnp.ones_like(start))
+        return approach(self.equations, by_share, start, end, self.args)
 
     def _steepness(self, piece: Piece, start, end):
         """How steeply margins follow what follows the time alone, along a piece."""
@@ -365,7 +312,9 @@ class Step:
     def _stages_done(self, turn: Turn, point: Point) -> Decision:
         """Stages have become a piece: it is looked along, or the mode may end at its end."""
         piece = self._finished(turn.y0, turn.stages, turn.end - turn.start)
-        y = jnp.where(self.corrections(turn) > 0, self._there(turn.end, piece.y, turn.back.there), piece.y)
+        y = piece.y
+        if self.equations.projection:
+            y = jnp.where(self.corrections(turn) > 0, self._there(turn.end, y, turn.back.there), y)
         error = jnp.where(jnp.all(jnp.isfinite(y)), piece.error, jnp.inf)  # it is rejected, and tried again shorter
         piece = piece._replace(y=y, error=error, dense=piece.dense | {"y1": y})
         phase, monitor = self.phases[turn.phase], self._monitor(turn.start, turn.end)
@@ -410,12 +359,13 @@ class Step:
         parts, found, end = self.equations.parts(turn.piece.y), point.friction, turn.end
         value, last = self._margins(end, parts, found)[: self.equations.modes], (self.phases[turn.phase] == CHANGE) | self.at_start(turn)
         (_, elements), seen = self.contents(end, parts), turn.split.seen.slope
-        seen, of_contacts = jnp.split(seen, [elements.size])
+        seen, of_others = jnp.split(seen, [elements.size])
         slides = (elements.norms(parts.sigma) > 0) & (parts.held == 0) & jnp.isfinite(seen) & ~elements.is_quasistatic
         slope = jnp.where(slides, jax.lax.stop_gradient(elements.sums(parts.sigma * found.slip_rate)), seen)  # of a slip, its rate
         given = AtEnd(value, slope, jnp.zeros_like(value))
-        if self.equations.contacts:
-            given = exactly(self.equations, end, parts, self.args, value, jnp.concatenate([slope, of_contacts]))
+        if self.is_rough:
+            witnessed = parts._replace(v=found.qdot)
+            given = exactly(self.equations, end, witnessed, self.args, value, jnp.concatenate([slope, of_others]), decided=True)
         cut, ended, moved = next_estimate(turn.split.cut, end, *given, (self.t0, self.t1), self.args)
         onward = turn._replace(
             kind=jnp.array(STAGE),
@@ -432,13 +382,14 @@ class Step:
 
     def ended(self, turn: Turn, last, parts: Parts, elements: FrictionElements, found: Friction, ended, moved) -> Decision:
         """After the last of Newton's steps, what follows a mode that has ended."""
-        at_rest, breaking, stopped = at_rest_within(elements, turn.end, parts, self.args, ended, moved, found.driven)
+        of_friction, passed = jnp.split(ended, [self.equations.elements])
+        at_rest, breaking, stopped = at_rest_within(elements, turn.end, parts, self.args, of_friction, moved, found.driven)
         if self.begins is not None:
             begins = self.at_start(turn)
             resting = sticking(elements, parts.sigma)
-            at_rest, breaking = jnp.where(begins, resting, at_rest), jnp.where(begins, False, breaking)
+            at_rest, breaking, passed = (jnp.where(begins, a, b) for a, b in ((resting, at_rest), (False, breaking), (False, passed)))
         selection, _ = self.selection(turn.piece.y, turn.end, at_rest, breaking)
-        cut, choice = turn.split.cut, turn.choice._replace(search=selection.start(), at_rest=at_rest, breaking=breaking)
+        cut, choice = turn.split.cut, turn.choice._replace(search=selection.start(), at_rest=at_rest, breaking=breaking, passed=passed)
         turn = turn._replace(
             kind=jnp.where(last, SELECT, turn.kind),
             first=jnp.where(last, 0, turn.first),
@@ -449,8 +400,7 @@ class Step:
 
     def _selected(self, turn: Turn, point: Point) -> Decision:
         """One more turn of the selection; in the mode that is found the step goes on, to be put on its constraints first."""
-        search, at_rest, breaking, kept, slip_rates = turn.choice
-        selection, _ = self.selection(turn.piece.y, turn.end, at_rest, breaking)
+        selection, _ = self.selection(turn.piece.y, turn.end, turn.choice.at_rest, turn.choice.breaking)
         search, found, more, done = self.onward(selection, turn, point)
         y = self.in_mode(turn, selection.elements, search).y
         cut = turn.split.cut
@@ -462,11 +412,23 @@ class Step:
         """The state at the end of a piece in the mode that was found; what holds at the start was not changed to."""
         before = self.equations.parts(turn.piece.y)
         after = in_other_mode(elements, before, search.mode)
-        return after._replace(transitions=jnp.where(self.at_start(turn), before.transitions, after.transitions))
+        transitions = jnp.where(self.at_start(turn), before.transitions, after.transitions)
+        return after._replace(transitions=transitions, sign=beyond(before.sign, turn.choice.passed))
+
+    def _counted(self, turn: Turn, point: Point) -> Decision:
+        """A state behind events, with those that have happened."""
+        if not self.equations.events:
+            return Decision(turn, jnp.array(False), turn.start, turn.y0)  # never asked for
+        begins, passed = turn.phase == BEGIN + 1, turn.choice.passed
+        parts = self.equations.parts(turn.y0)
+        parts = parts._replace(sign=beyond(parts.sign, passed))  # as it was before
+        y = behind_mode(self.equations, turn.start, turn.piece.y, parts, self.args, passed, point.friction, begins).y
+        turn = self._from_here(turn._replace(kind=jnp.array(STAGE), first=jnp.array(0)), jnp.array(True), y)
+        return Decision(turn, jnp.array(False), turn.start, y)
 
     def onward(self, selection: ModeSelection, turn: Turn, point: Point) -> tuple[ModeSearch, Friction, Any, Any]:
         """The search one turn on, and the friction that was found; whether it asks for slip rates first, and whether it has ended."""
-        search, _, _, kept, slip_rates = turn.choice
+        search, *_, kept, slip_rates = turn.choice
         *kinds, breaks = selection.kinds(search)
         found = jax.tree.map(lambda old, new: jnp.where(turn.kind == TURN, old, new), kept, jax.lax.stop_gradient(point.friction))
         given = selection.elements, found, search.mode.sigma
@@ -484,9 +446,14 @@ class Step:
             found = Begun(turn.begun.y, loads, cut.consistent, ~jnp.any(mode.bound < 0), cut.dissipates, cut.impulsive)
             begins = done & self.at_start(turn)
             turn = turn._replace(begun=jax.tree.map(lambda new, old: jnp.where(begins, new, old), found, turn.begun))
+        turn = turn._replace(kind=jnp.where(more, TURN, SELECT), first=jnp.where(more, 1, 0))
+        return self.onto_rest(turn, done)
+
+    def onto_rest(self, turn: Turn, done) -> Turn:
+        """The rest of the step next, if what is before is done."""
         return turn._replace(
-            kind=jnp.where(done, STAGE, jnp.where(more, TURN, SELECT)),
-            first=jnp.where(more, 1, 0),
+            kind=jnp.where(done, COUNT if self.equations.events else STAGE, turn.kind),
+            first=jnp.where(done, 0, turn.first),
             phase=turn.phase + done,
             start=jnp.where(done, turn.end, turn.start),
             end=jnp.where(done, self.t1, turn.end),

@@ -1,4 +1,4 @@
-"""Witnesses of events: functions of the state that pass through zero where something happens."""
+"""Witnesses of events: functions of the state that pass through zero where something happens; and what is then known of the event."""
 
 import jax
 import jax.numpy as jnp
@@ -6,8 +6,10 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from .._mechanics.contact import roundings
+from .._mechanics.stick_slip import Friction
 from .._model.event import Either, Negative, Rising
 from .._model.flat import Flat
+from .._model.injection import asks_for
 from .._model.signal import origin_of
 from .first_order import EquationsOfMotion
 from .protocol import Arguments
@@ -16,9 +18,13 @@ from .state_vector import Parts
 
 def witness_margins(equations: EquationsOfMotion, t, parts: Parts, args: Arguments) -> tuple[Float[Array, " w"], Float[Array, " w"]]:
     """Of each witness, its value with the sign that it has until it passes through zero, and what of it counts as rounding."""
+    return margins_at(equations, t, equations.decided(t, parts, args), args) if equations.events else (parts.sign, parts.sign)
+
+
+def margins_at(equations: EquationsOfMotion, t, parts: Parts, args: Arguments) -> tuple[Float[Array, " w"], Float[Array, " w"]]:
+    """The same where velocities that follow from the rest do."""
     if not equations.events:
         return parts.sign, parts.sign
-    parts = equations.decided(t, parts, args)
     value, _, scale_of = _value_and_scale(equations, t, parts, args)
     assert args.scales is not None  # events are located
     return parts.sign * value, scale_of(*args.scales.roundings(parts.q, parts.v))
@@ -44,23 +50,28 @@ def _value_and_scale(equations, t, parts, args):
 
 def _multipliers(equations, t, parts, args):
     """Those of the mode as a function of (t, q, v), where a witness asks for them."""
-    flat, mode, elements = equations.mode(t, parts, args)
+    flat, _ = equations.contents(t, parts, args)
     if not flat.events_need_multipliers:
         return lambda t, q, v: jnp.zeros(flat.rows, v.dtype)
+    _, mode, elements = equations.mode(t, parts, args)
     if elements is None:
         return lambda t, q, v: equations.acceleration(mode, t, q, v).multipliers
     return lambda t, q, v: equations.friction(t, parts._replace(q=q, v=v), args).multipliers
 
 
-def sides(equations: EquationsOfMotion, t, parts: Parts, args: Arguments) -> tuple[Float[Array, " w"], Bool[Array, " w"]]:
+def sides(equations: EquationsOfMotion, t, parts: Parts, args: Arguments, qddot=None) -> tuple[Float[Array, " w"], Bool[Array, " w"]]:
     """The side of zero of each witness, 1 or −1: the one to which it goes if it is zero up to the errors of the integration, and 0 if it
-    stays there, as a velocity does that friction holds. And whether it is away from zero by more than rounding.
+    stays there, as a velocity does that friction holds. And whether it is away from zero by more than rounding. Where q̈ is given,
+    velocities that follow from the rest do.
     """
     assert args.scales is not None  # events are located
-    parts = equations.decided(t, parts, args)
+    if qddot is None:
+        parts = equations.decided(t, parts, args)
+        _, mode, _ = equations.mode(t, parts, args)
+        qddot = equations.acceleration(mode, t, parts.q, parts.v).x
     value, slopes, scale_of = _value_and_scale(equations, t, parts, args)
-    flat, mode, _ = equations.mode(t, parts, args)
-    multipliers, qddot = _multipliers(equations, t, parts, args), equations.acceleration(mode, t, parts.q, parts.v).x
+    flat, _ = equations.contents(t, parts, args)
+    multipliers = _multipliers(equations, t, parts, args)
     along = lambda t, q, v: flat.witnesses(t, q, v, multipliers(t, q, v))
     rate = jax.jvp(along, (t, parts.q, parts.v), (jnp.ones_like(t), parts.v, qddot))[1]
     is_far = jnp.abs(value) > scale_of(args.scales.of_positions(parts.q), args.scales.of_velocities(parts.v))
@@ -89,6 +100,11 @@ def _may_stay(equations) -> Bool[np.ndarray, " w"]:
     return np.array([not isinstance(event.direction, Negative) for _, event in equations.system.events])
 
 
+def beyond(sign: Float[Array, " w"], passed: Bool[Array, " w"]) -> Float[Array, " w"]:
+    """The signs where some witnesses have passed through zero."""
+    return jnp.where(passed, -sign, sign)
+
+
 def matching(equations: EquationsOfMotion, sign: Float[Array, " w"]) -> Bool[Array, " w"]:
     """Which events happen where their witness had this sign and loses it."""
     of = [event.direction for _, event in equations.system.events]
@@ -100,3 +116,77 @@ def matching(equations: EquationsOfMotion, sign: Float[Array, " w"]) -> Bool[Arr
 def plain_witnesses(flat: Flat, t, q, v) -> Float[Array, " w"]:
     """Those that follow the state alone; of the others, which follow constraint forces, nothing is known."""
     return flat.witnesses(t, q, v, jnp.zeros(flat.rows, v.dtype))
+
+
+def behind_mode(equations: EquationsOfMotion, t, seen, parts: Parts, args: Arguments, passed, found: Friction, at_start) -> Parts:
+    """The state behind the end of a mode, in the next one, where friction is as it was `found`, and no event changes the state: with the
+    events whose witnesses have passed through zero, or were taken to the other side by an impact.
+    """
+    passed = passed | struck(equations, seen, parts.y)
+    brought = brought_to_zero(equations, t, seen, parts, args) if equations.contacts else jnp.zeros_like(passed)
+    there, none = with_seen(equations, t, seen, parts), jnp.zeros_like(passed)
+    decided = there._replace(v=jnp.where(np.isin(np.arange(equations.size), equations.light), found.qdot, there.v))
+    counted, _, _ = passing(equations, t, decided, args, passed, brought, none, at_start, found.qddot)
+    return counted._replace(v=there.v)
+
+
+def brought_to_zero(equations: EquationsOfMotion, t, seen, parts: Parts, args: Arguments) -> Bool[Array, " w"]:
+    """Which witnesses are at zero, up to the errors of the integration, and were not before a jump: as of a slip that an impact ends."""
+    assert args.scales is not None  # events are located
+
+    def at_zero(parts):
+        value, _, scale_of = _value_and_scale(equations, t, parts, args)
+        return jnp.abs(value) <= scale_of(args.scales.of_positions(parts.q), args.scales.of_velocities(parts.v))
+
+    return at_zero(parts) & ~at_zero(equations.parts(seen))
+
+
+def struck(equations: EquationsOfMotion, before, y) -> Bool[Array, " w"]:
+    """Which events are those of contacts that had an impact between two states."""
+    impacts = equations.parts(y).impacts - (0 if before is None else equations.parts(before).impacts)
+    names = [name for name, _ in equations.system.unilateral]
+    of = [event.when for _, event in equations.system.events]
+    return jnp.stack([impacts[names.index(when)] > 0 if isinstance(when, str) else jnp.array(False) for when in of])
+
+
+def with_seen(equations: EquationsOfMotion, t, seen, parts: Parts) -> Parts:
+    """With what is recorded of an event: the time, and the state that was `seen` before."""
+    before = equations.parts(seen)
+    return parts._replace(seen=jnp.concatenate([t[None], before.q, before.v, before.z, before.u]))
+
+
+def passing(equations: EquationsOfMotion, t, parts: Parts, args: Arguments, passed, brought, done, at_start, qddot=None):
+    """The state with each event counted whose witness `passed` through zero, or is on the other side than it was, or goes there from zero,
+    to which it was `brought`, and was not `done`; which of them happen in this direction, and all that are done. Where q̈ is given,
+    velocities that follow from the rest do.
+    """
+    side, is_far = sides(equations, t, parts, args, qddot)
+    is_new = parts.sign == 0
+    before = jnp.where(is_new, 1, parts.sign)
+    crosses = (is_far & (side != parts.sign)) | (brought & (side == -parts.sign))
+    passed = (passed | (is_new & _due(equations) & (side < 0)) | (~is_new & crosses)) & ~done
+    done = done | passed
+    happens = passed & matching(equations, before)
+    stops = jnp.any(happens & np.array([event.stop for _, event in equations.system.events]))
+    sign, stopped = jnp.where(done | (is_new & at_start), side, parts.sign), jnp.maximum(parts.stopped, stops)
+    return parts._replace(sign=sign, happened=parts.happened + happens, stopped=stopped), happens, done
+
+
+def _due(equations):
+    """Which events happen where their witness is negative at the start."""
+    return np.array([isinstance(event.direction, Negative) for _, event in equations.system.events])
+
+
+def changes_states(equations: EquationsOfMotion) -> bool:
+    """Whether any event changes the state."""
+    return any(event.then is not None for _, event in equations.system.events)
+
+
+def asks_for_forces(equations: EquationsOfMotion) -> bool:
+    """Whether any witness depends on constraint forces."""
+    return any(callable(event.when) and asks_for(event.when, "multipliers") for _, event in equations.system.events)
+
+
+def may_be_due(equations: EquationsOfMotion) -> bool:
+    """Whether events may happen at the start."""
+    return bool(np.any(_due(equations))) or any(isinstance(event.when, str) for _, event in equations.system.events)

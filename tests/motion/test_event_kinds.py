@@ -203,6 +203,36 @@ def test_an_event_that_makes_an_impact():
     np.testing.assert_allclose(motion.events["click"].qdot[0], 0.0, atol=1e-12)  # before all that happens there
 
 
+@pytest.mark.parametrize("then", [None, pytest.param(lambda q: {"q": q}, marks=pytest.mark.slow)], ids=["plain", "then"])
+def test_an_impact_that_ends_a_slip(then):
+    """Friction of the impact takes the whole slip, and a force the body back from there: its velocity passes through zero by the impact,
+    and once. Before, steps came to nothing there. Beside it, in other units and from another start of time.
+    """
+    disc = jl.System(
+        lambda q, qdot, g: 0.5 * (qdot["x"] ** 2 + qdot["y"] ** 2) - g * q["y"],
+        dissipation=lambda qdot, multipliers: multipliers["floor"] * jnp.abs(qdot["x"]),
+        force=lambda f: {"x": -f},
+        unilateral={"floor": jl.Contact(lambda q: q["y"], 0.5)},
+        events={"turn": jl.Event(lambda qdot: qdot["x"], then)},
+    )
+
+    @jax.jit
+    def found(h, length, time, t0):
+        g, f = 10.0 * length / time**2, 0.1 * length / time**2
+        start = {"x": 0 * length, "y": h * length}, {"x": length / time, "y": 0 * length}
+        motion = jl.simulate(disc, *start, t0 + jnp.array([0.0, 0.5, 0.7]) * time, {"g": g, "f": f})
+        turn = motion.events["turn"]
+        return (turn.ts[0] - t0) / time, (turn.count[-1], motion.qdot["x"][1:] * time / length, jnp.isfinite(turn.ts[1]))
+
+    first = np.sqrt(2 * 0.8 / 10)  # 0.4
+    for length, time, t0 in ((1.0, 1.0, 0.0), (1e-6, 1e-3, 0.0), (1e3, 1.0, 1e6)):
+        (t, (count, v, again)), slope = jax.value_and_grad(found, has_aux=True)(0.8, length, time, t0)
+        np.testing.assert_allclose(t, first, rtol=1e-7)
+        np.testing.assert_allclose(slope, first / (2 * 0.8), rtol=1e-7)
+        np.testing.assert_allclose(v, [-0.1 * (0.5 - first), -0.1 * (0.7 - first)], rtol=1e-5)
+        assert count == 1 and not again
+
+
 @pytest.mark.slow
 @pytest.mark.usefixtures("single_precision")
 @pytest.mark.filterwarnings("ignore:jaxlag runs in single precision")

@@ -118,6 +118,80 @@ def _compare(name, units, monkeypatch, count):
     assert sliding > count / 4  # modes have changed
 
 
+def turning(q):
+    return q[0] - 0.3 * q[1]
+
+
+WATCHED = {"turns": jl.Event(lambda qdot: qdot[0]), "passes": jl.Event(turning, direction=jl.direction.Rising()), "ticks": jl.Event([1.1])}
+STOP = jl.System(
+    spring,
+    dissipation={
+        "joint": lambda qdot, F: F * jnp.abs(qdot[1] - qdot[0]),
+        "stop": lambda q, qdot, c: jnp.where(q[0] > 0, c, 0.0) * qdot[0] ** 2,
+    },
+    force=driven,
+)
+EVENTFUL = {
+    "two elements": (SYSTEMS["two elements"], WATCHED),
+    "beside a slider": (SYSTEMS["beside a slider"], WATCHED),
+    "on a rod": (SYSTEMS["on a rod"], WATCHED),
+    "smooth": (jl.System(spring, force=driven), WATCHED),
+    "smooth, on a rod": (jl.System(spring, holonomic={"rod": lambda q: q @ q - 1}, force=driven), WATCHED),
+    "on a floor": (SYSTEMS["on a floor"], WATCHED | {"strikes": jl.Event("floor")}),
+    "between walls": (SYSTEMS["between walls"], WATCHED | {"strikes": jl.Event("left")}),
+    "beyond a stop": (STOP, {"edge": jl.Event(lambda q: q[0])}),
+}
+
+
+@pytest.mark.parametrize("name", ["two elements", "smooth, on a rod", "beyond a stop"])
+def test_events_are_those_of_a_loop_for_each_purpose(name, monkeypatch):
+    _compare_events(name, monkeypatch, 12)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", EVENTFUL)
+def test_more_events_are_those_of_a_loop_for_each_purpose(name, monkeypatch):
+    _compare_events(name, monkeypatch, 60)
+
+
+def _compare_events(name, monkeypatch, count):
+    """Times and counts of events, and the derivative of all these times by a number that moves them."""
+    system, events = EVENTFUL[name]
+    given = []
+    rng = np.random.default_rng(11)
+    for _ in range(count):
+        q, v = state(name.removeprefix("smooth, "), rng)
+        given.append((q, v, dict(zip("cFAw", rng.uniform([0.5, 0.05, 0.1, 0.3], [20, 2, 4, 6]), strict=True))))
+
+    def found(q, v, params):
+        def of(c):
+            motion = jl.simulate(system, q, v, TS, params | {"c": c}, events=events, throw=False)
+            times = {name: event.ts for name, event in motion.events.items()}
+            return sum(jnp.sum(jnp.where(jnp.isfinite(ts), ts, 0)) for ts in times.values()), (motion.q, times, motion.result)
+
+        return jax.value_and_grad(of, has_aux=True)(params["c"])
+
+    run = jax.jit(found)
+    here = [run(*numbers) for numbers in given]
+    monkeypatch.setattr(integrate, "has_one_evaluation", lambda *given: False)
+    jax.clear_caches()
+    run, happened, failed = jax.jit(lambda *numbers: found(*numbers)), 0, 0
+    for numbers, ((_, (q, times, result)), slope) in zip(given, here, strict=True):
+        (_, (other_q, other_times, other)), other_slope = run(*numbers)
+        assert result == jl.results.RESULTS.successful
+        if other != result:
+            failed += 1
+            continue
+        np.testing.assert_allclose(q, other_q, atol=1e-6 * np.max(np.abs(other_q)))
+        for event, ts in times.items():
+            np.testing.assert_allclose(ts, other_times[event], rtol=1e-6, err_msg=event)
+            happened += int(np.sum(np.isfinite(ts)))
+        np.testing.assert_allclose(slope, other_slope, rtol=1e-3, atol=1e-4)
+    jax.clear_caches()
+    assert happened > count
+    assert failed <= count / 60  # a loop for each purpose ends where a slip turns at infinitely many impacts
+
+
 def test_where_all_times_are_the_same_there_is_the_start():
     """Behind the impact there, and in the mode that holds."""
     ball = jl.System(lambda q, qdot, g: 0.5 * qdot**2 - g * q, unilateral={"floor": jl.Contact(lambda q: q, 0.8)})

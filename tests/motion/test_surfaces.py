@@ -53,6 +53,35 @@ def test_a_spring_that_one_runs_into():
     np.testing.assert_allclose(jax.grad(last, (0, 1))(0.5, 4.0), [2.0, -np.pi / 16], rtol=1e-6)
 
 
+@pytest.mark.parametrize(
+    "edge", [jl.Event(lambda q, a: q["x"] - a), jl.Event(lambda q, a: q["x"] - a, lambda q: {"q": q})], ids=["plain", "then"]
+)
+def test_what_sticks_breaks_away_where_its_load_jumps(edge):
+    """A load f on a block with friction F begins where a body, at speed 1, passes a: y(T) = (f − F)(T − a)²/2. dy/da was 0: friction
+    alone was seen to end there, at a time of its own.
+    """
+    system = jl.System(
+        lambda qdot: 0.5 * (qdot["x"] ** 2 + qdot["y"] ** 2),
+        dissipation=lambda qdot, F: F * jnp.abs(qdot["y"]),
+        force=lambda q, a, f: {"y": jnp.where(q["x"] > a, f, 0.0)},
+        events={"edge": edge},
+    )
+
+    def last(x, length, time):
+        a, f, F, T = x
+        params = {"a": a * length, "f": f * length / time**2, "F": F * length / time**2}
+        start = {"x": 0 * length, "y": 0 * length}, {"x": length / time, "y": 0 * length}
+        return jl.simulate(system, *start, jnp.stack([0 * time, T * time]), params).q["y"][-1] / length
+
+    a, f, F, T = x = jnp.array([0.7, 1.5, 0.4, 2.0])
+    exact = [-(f - F) * (T - a), (T - a) ** 2 / 2, -((T - a) ** 2) / 2, (f - F) * (T - a)]
+    derivative = jax.jit(jax.value_and_grad(last))
+    for units in ((1.0, 1.0), (1e-9, 1e-6), (1e3, 1e6)):
+        value, slope = derivative(x, *units)
+        np.testing.assert_allclose(value, (f - F) * (T - a) ** 2 / 2, rtol=1e-7)
+        np.testing.assert_allclose(slope, exact, rtol=1e-6)
+
+
 @pytest.mark.slow
 def test_the_user_is_told_where():
     """Each function and its line, the table too; neither dry friction nor guards nor what is smooth."""
