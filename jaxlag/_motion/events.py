@@ -65,7 +65,7 @@ def _settled(equations: EquationsOfMotion, t, seen, y, args: Arguments, passed: 
 
     def turn(carry):
         y, consistent, passed, done, _ = carry
-        parts = equations.parts(y)
+        parts = before = equations.parts(y)
         brought = brought_to_zero(equations, t, seen, parts, args)
         parts, happens, done = passing(equations, t, parts, args, passed, brought, done, at_start)
         changing = np.array([event.then is not None for _, event in equations.system.events])
@@ -76,7 +76,7 @@ def _settled(equations: EquationsOfMotion, t, seen, y, args: Arguments, passed: 
         consistent &= fine
         if equations.sided and equations.elements:  # where forces jump, what sticks may break away
             selected = lambda: _on_new_sides(equations, t, y, args)
-            y, fine = jax.lax.cond(jnp.any(happens), selected, lambda: (y, jnp.array(True)))
+            y, fine = jax.lax.cond(jnp.any(parts.sign != before.sign), selected, lambda: (y, jnp.array(True)))
             consistent &= fine
         return y, consistent, struck(equations, parts.y, y), done, moves
 
