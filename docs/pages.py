@@ -29,11 +29,14 @@ REFERENCE = {  # names in `jaxlag`
     "rigid.inertia.hollow_sphere rigid.inertia.ellipsoid rigid.inertia.steiner rigid.inertia.rotated "
     "rigid.inertia.principal_axes rigid.inertia.Principal rigid.inertia.matrix rigid.inertia.physical "
     "rigid.inertia.log_cholesky rigid.inertia.Body",
+    "Parts that jump or bend": "elements.gap_spring elements.end_stop elements.hunt_crossley elements.preload elements.bilinear "
+    "elements.dead_zone elements.saturation elements.table elements.table_integral",
     "At one state": "acceleration results.Acceleration mass_matrix momentum energy constraint_jacobian constraint_residual "
-    "constraint_force powers results.Residual consistent_state examine results.Examination",
+    "constraint_force powers results.Residual consistent_state examine results.Examination results.Surface",
     "Motions": "simulate simulate_many results.Trajectory results.FrictionState results.ContactState results.EventState "
     "stepper results.Stepper results.StepState results.RESULTS results.Instant results.Interpolated load Dop853 Dopri5 "
-    "stabilisation.Projection stabilisation.Baumgarte stabilisation.NoStabilisation StickSlip Regularised keep_compiled",
+    "stabilisation.Projection stabilisation.Baumgarte stabilisation.NoStabilisation StickSlip Regularised "
+    "surfaces.Located surfaces.NotLocated keep_compiled",
     "Near a steady state": "equilibrium steady results.Equilibrium linearise results.LinearSystem results.Modes lowest_modes root_locus "
     "results.RootLocus results.Crossing periodic results.PeriodicOrbit stability_map results.StabilityMap",
     "Identification": "Experiment Measurement ModalTest FrequencyResponseTest fit fit_each results.Fit results.Channel results.Interval "

@@ -5,12 +5,14 @@ from importlib import metadata as _metadata
 from . import (
     direction as direction,
     dissipation as dissipation,
+    elements as elements,
     interpolation as interpolation,
     learnt as learnt,
     plot as plot,
     results as results,
     rigid as rigid,
     stabilisation as stabilisation,
+    surfaces as surfaces,
 )
 from ._mechanics.acceleration import acceleration as acceleration, constraint_force as constraint_force
 from ._paper.equations import equations as equations

@@ -13,6 +13,7 @@ from ._linear.root_locus import Crossing as Crossing, RootLocus as RootLocus
 from ._linear.stability_map import StabilityMap as StabilityMap
 from ._mechanics.acceleration import Acceleration as Acceleration
 from ._mechanics.examine import Examination as Examination
+from ._mechanics.surfaces import Surface as Surface
 from ._mechanics.lagrange import Residual as Residual
 from ._motion.moments import ContactState as ContactState, EventState as EventState
 from ._motion.results import RESULTS as RESULTS

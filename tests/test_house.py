@@ -61,6 +61,7 @@ WINGS = {  # each imports only from those above it, and each file of a wing only
         "time_bounds",
         "time_functions",
         "choices",
+        "boundaries",
     ],
     "_model": [
         "user_errors",
@@ -296,7 +297,17 @@ WINGS = {  # each imports only from those above it, and each file of a wing only
     ],
 }
 BESIDE = ["dissipation", "learnt", "rigid"]  # need nothing of the package
-ON_TOP = ["plot", "results", "direction", "interpolation", "stabilisation", "__init__", "__main__"]  # import from any wing
+ON_TOP = [
+    "plot",
+    "results",
+    "direction",
+    "interpolation",
+    "stabilisation",
+    "surfaces",
+    "elements",
+    "__init__",
+    "__main__",
+]  # import from any wing
 
 
 HOMES = [

@@ -105,12 +105,14 @@ def _deviations(minimum, k, row, known):
 
 
 def deciding(minimum: Minimum) -> dict[str, str]:
-    """By leaf of params, the line of the user's code where it decides, with the position, what a function of the system is."""
+    """By leaf of params, the line of the user's code where it decides, with the position or the time, what a function of the system is,
+    and steps do not end.
+    """
     found: dict[str, str] = {}
     for e in minimum.recordings:
         system, params = minimum.problem.model.system, with_own(minimum.problem.free.params, e.params)
         for surface in surfaces(system, e.q0, e.qdot0, params, e.ts[0], {}):
-            found |= dict.fromkeys(surface.params, surface.line)
+            found |= {} if surface.located else dict.fromkeys(surface.params, surface.line)
     return found
 
 

@@ -24,7 +24,7 @@ from .lagrange import applied_force, constraint_rows, inertia, position_residual
 from .massless import with_first_order_rates, with_masses
 from .pseudo_inverse import CLEAR, SEEN
 from .singular_directions import Failure, is_defined, not_affine_in, tangent_basis
-from .surfaces import surfaces
+from .surfaces import Surface, surfaces
 
 
 @dataclasses.dataclass(frozen=True)
@@ -41,6 +41,8 @@ class Examination:
       decided by dissipation alone; they count as degrees of freedom.
     - `couplings`: from 64 coordinates on, by matrix and term, e.g. ("G", "rods"): how many entries may be nonzero (None if the program is
       too long to be read), and out of how many. The matrices: ∂²L/∂q̇², ∂²L/∂q², ∂²D/∂q̇², and rows of G.
+    - `surfaces`: where functions jump or bend by the position, the time or a state: of each the `function`, `what` chooses, the `line`, and
+      whether it is `located`, so that steps end there.
     """
 
     coordinates: tuple[str, ...]
@@ -58,6 +60,7 @@ class Examination:
     contacts: dict[str, bool] = dataclasses.field(default_factory=dict)
     without_inertia: tuple[str, ...] = ()
     couplings: dict[tuple[str, str], tuple[int | None, int]] = dataclasses.field(default_factory=dict)
+    surfaces: tuple[Surface, ...] = ()
 
     def __repr__(self) -> str:
         fastest, slowest = self.time_constants
@@ -72,6 +75,8 @@ class Examination:
             ("time constants", f"{fastest:.3g} … {slowest:.3g}"),
             *((matrix, f"{_counted(entries)} of {size} numbers, {name}") for (matrix, name), (entries, size) in self.couplings.items()),
         ]
+        located = [surface for surface in self.surfaces if surface.located]
+        rows += [("steps end at", f"`{of.what}` of {of.function}, {of.line}") for of in located]
         lines = [f"  {name:<20}{value}" for name, value in rows]
         return "\n".join(["Examination", *lines, *(f"  - {finding}" for finding in self.findings or ("no issues found",))])
 
@@ -133,6 +138,7 @@ def examine(system: System, q: PyTree, qdot: PyTree, params: PyTree = None, *, t
     defect = _largest_defect(found["defects"], rank == G.shape[0], eps)
     names = entry_names(q, "q")
     coupled = dict(sorted(found["couplings"].items(), key=lambda of: MATRICES.index(of[0][0])))
+    chosen = surfaces(system, *state(q, qdot), params, t, given_states(system, states, q))
     found_out = [
         *findings.without_inertia(names, M, G, units),
         *findings.nearly_without_inertia(names, M, G),
@@ -143,12 +149,13 @@ def examine(system: System, q: PyTree, qdot: PyTree, params: PyTree = None, *, t
         *findings.not_unique(found["multipliers"], found["other_multipliers"]),
         *findings.coupling_all(coupled, found["uses_all_numbers"], len(names)),
         *_unread_friction(system, q, qdot, params, t, states),
-        *findings.bending(surfaces(system, *state(q, qdot), params, t, given_states(system, states, q)), bool(system.events)),
+        *findings.bending([surface for surface in chosen if not surface.located], bool(system.events)),
     ]
     light = tuple(names[i] for i in np.flatnonzero(found["light"]))
     states = tuple(name for name, _ in system.states)
     counts = {of: (None if c.entries == NOT_READ else int(c.entries), int(c.size)) for of, c in coupled.items()}
-    return Examination(**numbers, findings=tuple(found_out), states=states, contacts=contacts, without_inertia=light, couplings=counts)
+    numbers |= {"states": states, "contacts": contacts, "without_inertia": light, "couplings": counts, "surfaces": tuple(chosen)}
+    return Examination(findings=tuple(found_out), **numbers)
 
 
 def _largest_defect(defects, is_regular, eps):

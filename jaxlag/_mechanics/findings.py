@@ -116,15 +116,15 @@ def of_numbers(numbers, distances, defect, dtype):
 
 
 def bending(surfaces, has_events):
-    """Functions that choose by the position, each line once."""
+    """Functions that choose where steps do not end, each line once."""
     for line in dict.fromkeys(surface.line for surface in surfaces):
         here = [surface for surface in surfaces if surface.line == line]
         functions = list(dict.fromkeys(surface.function for surface in here))
         chosen = ", ".join(dict.fromkeys(f"`{surface.what}`" for surface in here))
         beside = ", unless one of `events` is zero there" if has_events else ""
         yield (
-            f"{' and '.join(functions)} {'chooses' if len(functions) == 1 else 'choose'} by the position ({chosen}, {line}): where the "
-            "choice changes, a force jumps or bends, and the steps of "
+            f"{' and '.join(functions)} {'chooses' if len(functions) == 1 else 'choose'} ({chosen}, {line}): "
+            "where the choice changes, a force jumps or bends, and the steps of "
             "a motion do not end there, so that it errs by more than its tolerance, and derivatives by what decides are wrong where a "
             f'force jumps{beside}: end them by `events={{"edge": jl.Event(lambda q: ...)}}`, a function that is zero there'
         )

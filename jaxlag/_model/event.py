@@ -72,8 +72,9 @@ class Event:
     The time is located to rounding and differentiated exactly, as is the state that `then` returns, which is projected onto the constraints
     and out of obstacles. A sample exactly at the time of an event shows the state before or after it, depending on rounding. A sign change
     of w caused by an impact, a jump of an input or another event also triggers the event, but none happens twice at one time. Simultaneous
-    events happen in the order in which they are listed. If a force jumps or bends across w = 0, as with `jnp.where` or `jnp.maximum` of q,
-    an event makes steps end there and derivatives exact: up to there, forces are those of the side that the motion comes from.
+    events happen in the order in which they are listed. If a force jumps or bends across w = 0, steps end there, and up to there forces are
+    those of the side that the motion comes from; where functions of the system choose by the position or the time, as `jnp.where` of q
+    does, that holds without an event (`jl.surfaces.Located`).
 
     `equilibrium`, `linearise`, `examine` and `equations` ignore events. Any consistent units. Pass events by name to a system, `System(...,
     events={"latch": Event(...)})`, or to a motion, `simulate(..., events=...)`.

@@ -23,6 +23,7 @@ from .._mechanics.stick_slip import Friction, ModeSelection
 from .._mechanics.stick_slip import Search as ModeSearch
 from .._model.flat import rows_by_name
 from .._program.conditions import zeros_like
+from .held_sides import on_held_sides
 from .mode_changes import Touch, behind_impact, friction_at, resting_at, touching_at, with_closed
 from .state_vector import Parts
 from .step_machine import Step
@@ -129,13 +130,14 @@ class ContactStep(Step):
             ended, moved = jnp.where(at_start, touching, ended), jnp.where(at_start, 0, moved)
             of_positions = jnp.where(at_start, roundings_beside(flat, turn.end, parts.q, parts.v)[0], of_positions)
         _, of_contact, passed = jnp.split(ended, np.cumsum([self.equations.elements, self.equations.contacts]))
+        parts = self._beyond(turn.end, parts, passed)
         touch = touching_at(self.equations, flat, turn.end, parts, self.args, of_contact, of_positions)
         is_impact = jnp.any(touch.hits)
         impulse = of_compression(flat, turn.end, parts.q, parts.v, touch.e)._replace(happens=is_impact)
         nothing = zeros_like(turn.change.total)._replace(v=parts.v, consistent=jnp.array(True), impulsive=jnp.array(True))
         loose = jnp.zeros_like(turn.change.loose)
         phase = jnp.where(is_impact, COMPRESSION, MOTION)
-        change = Change(phase, turn.piece.y, ended, moved, touch, impulse, loose, nothing)
+        change = Change(phase, parts.y, ended, moved, touch, impulse, loose, nothing)
         change = jax.tree.map(lambda new, old: jnp.where(last, new, old), change, turn.change)
         search = jax.tree.map(lambda new, old: jnp.where(last, new, old), self.new_search(parts.y, turn.end), turn.choice.search)
         turn = turn._replace(kind=jnp.where(last, ALONE, turn.kind), first=jnp.where(last, 0, turn.first), change=change)
@@ -143,6 +145,14 @@ class ContactStep(Step):
         turn = turn._replace(choice=turn.choice._replace(search=search, passed=passed))
         on_contacts = parts._replace(closed=jnp.maximum(parts.closed, touch.hits.astype(parts.closed.dtype)))
         return Decision(turn, last & is_impact, turn.end, on_contacts.y)
+
+    def _beyond(self, t, parts: Parts, passed) -> Parts:
+        """The state by a few roundings beyond the surfaces that were passed: there gaps and their rates are seen, which may bend."""
+        if not self.equations.sided:
+            return parts
+        there = parts._replace(sign=beyond(parts.sign, passed))
+        _, there = on_held_sides(self.contents(t, parts)[0], t, there, self.args, self.equations.levels)
+        return there._replace(sign=parts.sign)
 
     def put(self, turn: Turn, there, y) -> Turn:
         """With q on what is struck."""

@@ -11,6 +11,8 @@ from jaxtyping import Array, Bool, Float, PyTree
 from .first_order import EquationsOfMotion
 from .protocol import FirstOrderSystem
 
+OFTEN = 1000  # crossings
+
 
 def most(equations: FirstOrderSystem) -> np.ndarray:
     """How many of each event are recorded."""
@@ -23,7 +25,7 @@ def with_events(equations: FirstOrderSystem, write: Callable, saved, samples: in
 
     `number(y)` is y without its variations.
     """
-    if not (isinstance(equations, EquationsOfMotion) and equations.events):
+    if not (isinstance(equations, EquationsOfMotion) and equations.system.events):
         return saved
     now = equations.parts(number(y)).happened
     earlier = jnp.zeros_like(now) if before is None else equations.parts(before).happened
@@ -58,4 +60,9 @@ def has_stopped(equations: FirstOrderSystem, y) -> Bool[Array, ""]:
 
 def overflows(equations: EquationsOfMotion, y) -> Bool[Array, ""]:
     """Whether more events happened than are recorded."""
-    return jnp.any(equations.parts(y).happened > most(equations)) if equations.events else jnp.array(False)
+    return jnp.any(equations.parts(y).happened[: len(equations.system.events)] > most(equations))
+
+
+def rattles(equations: EquationsOfMotion, y) -> Bool[Array, ""]:
+    """Whether a surface of the position was crossed so often that a motion that has come no farther rattles about it."""
+    return jnp.any(equations.parts(y).happened[len(equations.system.events) :] > OFTEN)

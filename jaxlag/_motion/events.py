@@ -68,13 +68,13 @@ def _settled(equations: EquationsOfMotion, t, seen, y, args: Arguments, passed: 
         parts = before = equations.parts(y)
         brought = brought_to_zero(equations, t, seen, parts, args)
         parts, happens, done = passing(equations, t, parts, args, passed, brought, done, at_start)
-        changing = np.array([event.then is not None for _, event in equations.system.events])
+        changing = np.array([event.then is not None for event in equations.watched])
         unmoved = lambda: (parts.y, jnp.array(True))
         move = (lambda: _moved(equations, t, parts, args, happens)) if changing.any() else unmoved
         moves = jnp.any(happens & changing)
         y, fine = jax.lax.cond(moves, move, unmoved)
         consistent &= fine
-        if equations.sided and equations.elements:  # where forces jump, what sticks may break away
+        if equations.sided and (equations.elements or equations.contacts):  # where forces jump, what sticks may break away, or gaps bend
             selected = lambda: _on_new_sides(equations, t, y, args)
             y, fine = jax.lax.cond(jnp.any(parts.sign != before.sign), selected, lambda: (y, jnp.array(True)))
             consistent &= fine
@@ -89,12 +89,14 @@ def _settled(equations: EquationsOfMotion, t, seen, y, args: Arguments, passed: 
 
 
 def _on_new_sides(equations: EquationsOfMotion, t, y, args: Arguments):
-    """y in the mode of friction that holds on the sides where witnesses are now."""
+    """y in the mode of friction and contact that holds on the sides where witnesses are now; gaps that bend there open, or strike."""
     parts = equations.parts(y)
     flat, _ = equations.contents(t, parts, args)
-    held = on_held_sides(flat, t, parts, args)
-    after, consistent = after_jump(equations, t, held.y, held.y, args, args)
-    return equations.parts(after)._replace(q=parts.q, v=parts.v).y, consistent
+    time, held = on_held_sides(flat, t, parts, args, equations.levels)
+    held = held._replace(closed=_still_closed(flat, time, held.q, held.v, held.closed, args.scales))
+    after, consistent = after_jump(equations, time, held.y, held.y, args, args)
+    after = equations.parts(after)
+    return after._replace(q=parts.q, v=after.v if equations.contacts else parts.v).y, consistent
 
 
 def _moved(equations: EquationsOfMotion, t, parts: Parts, args: Arguments, happens):

@@ -23,7 +23,8 @@ from .._mechanics.projection import Projection, corrected
 from .._mechanics.saddle_point import SaddlePoint
 from .._mechanics.sliders import with_sliders_returned
 from .._mechanics.stick_slip import Friction, friction, in_mode, redirected, slip_of, sticking
-from .._mechanics.surfaces import bends_by_position
+from .._mechanics.surfaces import CROSSING, bends, with_surfaces
+from .._model.event import Event
 from .._model.flat import Flat, StatesAt, bind
 from .._model.signal import at_time, nonsmooth_signals
 from .._model.state_values import NOTHING, Layout, of_first_order, period, ravelled, sampled
@@ -52,9 +53,10 @@ class EquationsOfMotion:
     states: Layout = NOTHING  # of first order, by name
     sampled: Layout = NOTHING  # states that change at sample times
     contacts: int = 0
-    events: int = 0
+    events: int = 0  # those of the system, and behind them surfaces across which forces may jump or bend
     light: tuple[int, ...] = ()  # coordinates without inertia, whose velocities follow from the rest
     entangled: bool = False  # whether elements of friction may share their forces in more than one way, or constraints drive their slips
+    levels: tuple[int, ...] = ()  # of each event, by how many other surfaces its witness may jump
     sided: bool = False  # whether functions choose by the position, perhaps across the surface of an event
     sees_time: bool = False  # whether functions ask for the time, beside signals at that time
     follows_time: bool = True  # whether they depend on the time at all
@@ -76,8 +78,11 @@ class EquationsOfMotion:
         at_time = lambda params, t: values_of(alone.flat_at(params, at._replace(t=t)), t, *at[2:])
         follows, sees = follows_time(at_time, system, params, at.t)
         alone = dataclasses.replace(alone, light=tuple(map(int, light)), sees_time=sees, follows_time=follows)
-        if any(callable(event.when) for _, event in system.events):
-            alone = dataclasses.replace(alone, sided=bends_by_position(system, alone.flat_at(params, at), *at[1:]))
+        located = formulation.surfaces.levels(alone.flat_at(params, at))
+        has_witnesses = any(callable(event.when) for event in alone.watched)
+        sided = bool(located) or (has_witnesses and bends(alone.flat_at(params, at)))
+        levels = (0,) * alone.events + located
+        alone = dataclasses.replace(alone, sided=sided, events=len(levels), levels=levels)
         elements = formulation.friction.elements(alone.flat_at(params, at))
         if system.unilateral:
             check_impacts(alone.flat_at(params, at), elements, formulation.friction)
@@ -88,7 +93,8 @@ class EquationsOfMotion:
 
     def flat(self, params: PyTree, at: StatesAt) -> Flat:
         """The system over flat vectors."""
-        return bind(self.system, self.like.shapes, params, at)
+        flat = bind(self.system, self.like.shapes, params, at)
+        return with_surfaces(flat) if self.events > len(self.system.events) else flat
 
     def flat_at(self, params: PyTree, at: StatesAt) -> Flat:
         """The system over flat vectors at one time: its inputs are looked up once."""
@@ -129,6 +135,12 @@ class EquationsOfMotion:
     def modes(self) -> int:
         """How many elements of dry friction and contacts change their modes, and events happen."""
         return self.elements + self.contacts + self.events
+
+    @property
+    def watched(self) -> tuple[Event, ...]:
+        """The events of the system, and surfaces."""
+        of_system = tuple(event for _, event in self.system.events)
+        return of_system + (CROSSING,) * (self.events - len(of_system))
 
     @property
     def works(self) -> tuple[str, ...]:
@@ -180,7 +192,7 @@ class EquationsOfMotion:
     @property
     def seen(self) -> int:
         """How many numbers are recorded of an event, where there are any: the time, q, q̇ and the states."""
-        return 1 + len(self.controlled) + self.sampled.size if self.events else 0
+        return 1 + len(self.controlled) + self.sampled.size if self.system.events else 0
 
     @property
     def projection(self) -> Projection | None:
@@ -320,32 +332,51 @@ def _are_entangled(equations: EquationsOfMotion, flat: Flat, elements: FrictionE
     return bool(may_share(flat, elements)) or turned or bool(used_arguments(constraints, at.t)[0])
 
 
+def _on_held_sides(equations: EquationsOfMotion, at: Callable, t, parts: Parts, args) -> tuple[Array, Any]:
+    """Rates, and what else `at(t, parts)` finds, on the sides that are held. Beyond a surface they are continued from there by their
+    slopes, so that the stages of a step that ends there are those of a smooth motion.
+    """
+    if not equations.sided:
+        return at(t, parts)
+    of_state = lambda t, parts: (t, parts.q, parts.v, parts.z)
+    held = on_held_sides(equations.contents(t, parts, args)[0], t, parts, args, equations.levels)
+    rates, found = at(*held)
+    there, here = jax.lax.stop_gradient((of_state(*held), of_state(t, parts)))
+    along = lambda t, q, v, z: at(t, held[1]._replace(q=q, v=v, z=z))[0]
+    more = jax.lax.stop_gradient(jax.jvp(along, there, jax.tree.map(jnp.subtract, here, there))[1])
+    return equations.parts(rates + jnp.where(jnp.isfinite(more), more, 0))._replace(q=parts.v).y, found
+
+
 @jitted  # so that diffrax's many calls trace it once
 def _rates(equations: EquationsOfMotion, t, y, args):
     moving = equations.decided(t, equations.parts(y), args)
-    parts = on_held_sides(equations.contents(t, moving, args)[0], t, moving, args) if equations.sided else moving
+    return _on_held_sides(equations, lambda t, parts: (_rates_at(equations, t, parts, args), None), t, moving, args)[0]
+
+
+def _rates_at(equations: EquationsOfMotion, t, parts: Parts, args) -> Array:
     q, v, works, sigma, held = parts.q, parts.v, parts.works, parts.sigma, parts.held
     flat, mode, elements = equations.mode(t, parts, args)
     of = lambda is_free: lambda: equations.accelerated(t, parts, args, is_free).x
     qddot = equations.where_closed(parts, of(False), of(True))
     if equations.light:  # what follows from the rest has no rate of its own
         qddot = qddot.at[np.array(equations.light, int)].set(0)
-    rates = ravelled(flat.state_rates(t, q, v), y.dtype)
+    rates = ravelled(flat.state_rates(t, q, v), q.dtype)
     powers = listed_powers(mode, t, q, v) if equations.works else works
-    stuck = parts.time_stuck if elements is None else jnp.maximum(sticking(elements, sigma).astype(y.dtype), held)
+    stuck = parts.time_stuck if elements is None else jnp.maximum(sticking(elements, sigma).astype(q.dtype), held)
     resting = Parts(*(jnp.zeros_like(part) for part in parts))
-    return resting._replace(q=moving.v, v=qddot, z=rates, works=powers, time_stuck=stuck).y
+    return resting._replace(q=v, v=qddot, z=rates, works=powers, time_stuck=stuck).y
 
 
 @jitted
 def _rates_and_friction(
     equations: EquationsOfMotion, t, parts: Parts, args, impulse: Impulse | None, correction: Correction | None, shares
 ) -> tuple[Array, Friction]:
-    moving = parts.v
-    if equations.sided:
-        held = on_held_sides(equations.contents(t, parts, args)[0], t, parts, args)
-        is_back = False if correction is None else correction.happens
-        parts = jax.tree.map(lambda held, there: jnp.where(is_back, there, held), held, parts)
+    at = lambda t, parts: _rates_and_friction_at(equations, t, parts, args, impulse, correction, shares)
+    rates, found = _on_held_sides(equations, at, t, parts, args)
+    return rates, found._replace(qdot=parts.v) if equations.sided else found
+
+
+def _rates_and_friction_at(equations: EquationsOfMotion, t, parts: Parts, args, impulse, correction, shares) -> tuple[Array, Friction]:
     q, v = parts.q, parts.v
     flat, elements = equations.rubbing(t, parts, args)
     if equations.elements:
@@ -353,7 +384,7 @@ def _rates_and_friction(
     there, rubbing = (flat, elements) if impulse is None else of_impulses(flat, elements, t, q, v, impulse)
     assert rubbing is not None  # as many as there are elements
     found = friction(there, rubbing, parts.sigma, t, q, v, impulse=impulse, correction=correction, shares=shares)
-    v, qddot = moving if equations.sided else found.qdot, found.qddot.at[np.array(equations.light, int)].set(0)
+    v, qddot = found.qdot, found.qddot.at[np.array(equations.light, int)].set(0)
     powers = listed_powers(in_mode(flat, elements, parts.sigma), t, q, v) if equations.works else parts.works
     stuck = jnp.maximum(sticking(elements, parts.sigma).astype(q.dtype), parts.held)
     resting = Parts(*(jnp.zeros_like(part) for part in parts))
@@ -393,11 +424,13 @@ def _updated(equations: EquationsOfMotion, t, y, args, due):
 
 @jitted
 def _projected(equations: EquationsOfMotion, t, y, args, found):
-    parts = equations.parts(y)
-    q, v = parts.q, parts.v
-    flat, mode, _ = equations.mode(t, parts, args)
+    parts = there = equations.parts(y)
+    if equations.sided:
+        t, there = on_held_sides(equations.contents(t, parts, args)[0], t, parts, args, equations.levels)
+    q, v = there.q, there.v
+    flat, mode, _ = equations.mode(t, there, args)
     assert equations.projection is not None  # asked where there is something to keep
     projection = equations.projection
     of_none = (lambda: (q, v)) if flat.rows == equations.contacts else lambda: projection.project(free(mode), t, q, v, found=found)
     on_q, on_v = equations.where_closed(parts, lambda: projection.project(mode, t, q, v, found=found), of_none)
-    return equations.put_back(t, parts, on_q, on_v, args)
+    return equations.put_back(t, parts, parts.q + (on_q - q), parts.v + (on_v - v), args)

@@ -7,6 +7,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from .._model.injection import asks_for
+from .event_record import rattles
 from .first_order import EquationsOfMotion
 from .results import RESULTS
 from .sample import Evidence, Sample
@@ -27,6 +28,8 @@ def verified(
     """
     reached = ts[-1]
     result = RESULTS.where((result == RESULTS.dt_min_reached) & _locks(equations, ts, samples[0]), RESULTS.beyond_reach, result)
+    rattled = (result == RESULTS.max_steps_reached) & rattles(equations, ys[-1])
+    result = RESULTS.where(rattled, RESULTS.on_a_jump, result)
     agree = _agree(equations, *samples)
     result = RESULTS.where((result == RESULTS.undefined) & ~agree[-1], RESULTS.no_multipliers, result)
     ts, ys, (sample, evidence) = jax.tree.map(lambda leaf: leaf[:-1], (ts, ys, samples))

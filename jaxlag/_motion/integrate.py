@@ -15,6 +15,7 @@ from .._mechanics.consistent_state import Consistent, has_inertia, nearest_state
 from .._mechanics.contact import free, outside
 from .._mechanics.friction_treatment import Regularised, StickSlip
 from .._mechanics.projection import Baumgarte, NoStabilisation, Projection
+from .._mechanics.surfaces import Located, NotLocated
 from .._model.flat import Flat, StatesAt
 from .._model.numbers import count
 from .._model.signal import moves_smoothly, nonsmooth_signals
@@ -48,6 +49,7 @@ CHOICES: dict[str, tuple[tuple[type, ...], str]] = {  # what may be chosen; the 
         "`Projection()`, `Baumgarte()` or `NoStabilisation()`, of `jaxlag.stabilisation`",
     ),
     "friction": ((StickSlip, Regularised), "`StickSlip()` or `Regularised(width)`"),
+    "surfaces": ((Located, NotLocated), "`Located()` or `NotLocated()`, of `jaxlag.surfaces`"),
     "adjoint": ((type(None), dfx.AbstractAdjoint), "`diffrax.RecursiveCheckpointAdjoint()`, or leave it out"),
 }
 
@@ -67,8 +69,9 @@ class SolverOptions:
     def of(cls, solver: Any, formulation: Formulation, max_steps: Any, adjoint: Any = None, progress: bool = False) -> "SolverOptions":
         """Checked, with the default solver where none is given."""
         solver = _default_solver() if solver is None else solver
-        chosen = {"solver": solver, "stabilisation": formulation.stabilisation, "friction": formulation.friction, "adjoint": adjoint}
-        for name, given in chosen.items():
+        given_by_name = {"solver": solver, **formulation._asdict(), "adjoint": adjoint}
+        for name in CHOICES:
+            given = given_by_name[name]
             kinds, cure = CHOICES[name]
             if not isinstance(given, kinds):
                 raise TypeError(f"`{name}` must be an object that makes the choice, but is {given!r}. Take e.g. {cure}.")
@@ -256,7 +259,7 @@ def _wrapped(options, equations, projected, adjoint, start, begins: bool = False
 def has_nodes(equations: FirstOrderSystem, params: PyTree) -> bool:
     """Whether steps end where an input jumps or bends, or a state is updated."""
     return isinstance(equations, EquationsOfMotion) and bool(
-        equations.contacts or equations.events or equations.sampled.size or nonsmooth_signals(params)
+        equations.contacts or equations.system.events or equations.sampled.size or nonsmooth_signals(params)
     )
 
 

@@ -72,8 +72,8 @@ def _margins(equations: EquationsOfMotion, t, parts: Parts, args):
         pressing = lambda: contact_rows(flat, equations.acceleration(mode, t, q, v).multipliers)
         forces = jax.lax.cond(jnp.any(closed), pressing, none) if equations.contacts else none()
         return jnp.concatenate([_contact_margins(flat, t, q, closed, forces, args), of_events, *unbounded])
-    there = on_held_sides(flat, t, parts, args) if equations.sided else parts
-    return margins_of(equations, t, parts, args, equations.friction(t, there, args), of_events)
+    time, there = on_held_sides(flat, t, parts, args, equations.levels) if equations.sided else (t, parts)
+    return margins_of(equations, t, parts, args, equations.friction(time, there, args), of_events)
 
 
 def margins_of(equations: EquationsOfMotion, t, parts: Parts, args: Arguments, found: Friction, of_events: Array | None = None) -> Array:
@@ -170,10 +170,11 @@ def exactly(
     args: Arguments,
     found: Float[Array, " m"],
     slopes: Float[Array, " m"],
-    decided: bool = False,
+    qddot: Float[Array, " n"] | None = None,
 ) -> AtEnd:
     """With the margins `found` and their `slopes`, those of open contacts apart, which are g and ġ as they are: among many impacts a gap is
-    hardly more than its rounding, and its rate is no difference of gaps. `decided`: whether velocities that follow from the rest do.
+    hardly more than its rounding, and its rate is no difference of gaps. Where q̈ is given, the slopes of witnesses are those there, and
+    velocities that follow from the rest do.
     """
     flat, _ = equations.contents(t, parts, args)
     first = [equations.elements, equations.elements + equations.contacts]
@@ -181,7 +182,10 @@ def exactly(
     is_closed = parts.closed > 0.5
     gaps = jnp.where(is_closed, of_contacts, flat.gaps(t, parts.q))
     rates = jnp.where(is_closed, rises, gap_rates(flat, t, parts.q, parts.v))
-    witnesses, rounding = (margins_at if decided else witness_margins)(equations, t, parts, args)
+    witnesses, rounding = (witness_margins if qddot is None else margins_at)(equations, t, parts, args)
+    if qddot is not None:
+        along = jnp.ones_like(t), parts.v, qddot
+        passes = parts.sign * jax.jvp(lambda *state: plain_witnesses(flat, *state), (t, parts.q, parts.v), along)[1]
     passes = jnp.where(parts.sign == 0, 0, passes)  # what stays at zero does not pass through it
     value, slope = jnp.concatenate([of_elements, gaps, witnesses]), jnp.concatenate([falls, rates, passes])
     is_exact = jnp.concatenate([jnp.zeros_like(falls, bool), ~is_closed, jnp.ones_like(passes, bool)])

@@ -54,9 +54,9 @@ class OneEvaluationSolver(StickSlipSolver):
         rate, is_new, start = solver_state
         kind = ContactStep if self.equations.contacts else Step if self.equations.elements else EventStep
         done = kind.of(self, t0, t1, y0, args, ~start.known if self.begins else None).run(rate, made_jump | is_new)
-        ended, ok = done.split.seen.ended, dfx.RESULTS.successful
+        ended = done.split.seen.ended
         first = jax.tree.map(lambda cut, whole: jnp.where(ended, cut, whole), done.split.first, done.piece)
-        split = done.split._replace(first=first._replace(result=ok), second=done.piece._replace(result=ok))
+        split = done.split._replace(first=first, second=done.piece)
         y1, error, dense, rate, result = self._joined(split, t0, t1, y0, args)
         if self.begins:
             begins, fine, begun = ~start.known, jnp.array(True), done.begun

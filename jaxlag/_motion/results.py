@@ -55,6 +55,10 @@ class RESULTS(dfx.RESULTS):  # pyright: ignore
         "an event happened more than `most` times. Allow more, `Event(..., most=...)`; one that happens at once for ever chatters: let "
         "`then` take the state away from where `when` is zero."
     )
+    on_a_jump = (
+        "the motion comes to rest where a force jumps by the position and pushes back on either side, as sign(q) does: it rattles about "
+        "that place ever faster. Let the force bend over a short distance, e.g. `jnp.clip(q / width, -1, 1)`."
+    )
     chattering = (
         "friction changed between sliding and sticking more than `max_transitions` times: it chatters. "
         "Allow more with `friction=StickSlip(max_transitions=...)`, or smooth it with `friction=Regularised(width)`."

@@ -79,7 +79,7 @@ def sample_at(equations: EquationsOfMotion, t, y, params, scales: Scales, found:
         violation = violation.beside(*_contact_violation(flat, t, parts, multipliers, scales))
     of_contact = parts.closed > 0.5, parts.impacts, origin_of(params) + parts.changed, parts.impulse
     contacts = dict(zip(flat.contacts, zip(*of_contact, strict=True), strict=True))
-    events = dict(zip(dict(equations.system.events), parts.happened, strict=True))
+    events = dict(zip(dict(equations.system.events), parts.happened, strict=False))
     unraveled = flat.unravel(q), flat.unravel(v), flat.unravel(qddot), flat.unravel_multipliers(multipliers)
     sample = Sample(*unraveled, dict(states), named, friction_states, contacts, events, counts)
     return sample, Evidence(sound, off, jax.lax.stop_gradient(violation))

@@ -9,6 +9,7 @@ from jaxtyping import Array, PyTree
 
 from .._mechanics.friction_treatment import Regularised, StickSlip
 from .._mechanics.projection import Baumgarte, NoStabilisation, Projection
+from .._mechanics.surfaces import Located, NotLocated
 from .._model.event import Event
 from .._model.state_values import given_states
 from .._model.system import System
@@ -41,6 +42,7 @@ def simulate(
     atol: PyTree = None,
     stabilisation: Projection | Baumgarte | NoStabilisation = Projection(),
     friction: StickSlip | Regularised = StickSlip(),
+    surfaces: Located | NotLocated = Located(),
     max_steps: int = 100_000,
     adjoint: dfx.AbstractAdjoint | None = None,
     works: bool = False,
@@ -72,6 +74,8 @@ def simulate(
     - `stabilisation`: how the constraints are maintained, one of `jl.stabilisation`: `Projection()`, `Baumgarte(...)` or
       `NoStabilisation()`.
     - `friction`: treatment of dry friction: `StickSlip()` (exact Coulomb friction) or `Regularised(width)`.
+    - `surfaces`: whether steps end where functions jump or bend by the position, the time or a state, as of `where`, `maximum`, `interp`:
+      one of `jl.surfaces`, `Located()` or `NotLocated()`.
     - `max_steps`: step limit.
     - `adjoint`: a diffrax adjoint, used in place of the derivative rule of this package; with contacts, events, sampled states, and signals
       that jump or bend, either `diffrax.ForwardMode()` or `diffrax.RecursiveCheckpointAdjoint()`, for forward or reverse mode.
@@ -96,7 +100,7 @@ def simulate(
     """
     system = system if events is None else system.with_events(events)
     given = state_and_params(q0, qdot0, params, ("q0", "qdot0"))
-    options = SolverOptions.of(solver, Formulation(stabilisation, friction, works), max_steps, adjoint, progress)
+    options = SolverOptions.of(solver, Formulation(stabilisation, friction, surfaces, works), max_steps, adjoint, progress)
     (ts, length), tolerances = padded_times(ts, given.dtype), tolerances_of(rtol, atol, given.trees[0])
     states = {} if states is None else given_states(system, states, given.trees[0])
     padded = padded_signals(given)

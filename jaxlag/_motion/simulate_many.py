@@ -14,6 +14,7 @@ from jaxtyping import Array, PyTree
 
 from .._mechanics.friction_treatment import Regularised, StickSlip
 from .._mechanics.projection import Baumgarte, NoStabilisation, Projection
+from .._mechanics.surfaces import Located, NotLocated
 from .._model.event import Event
 from .._model.flat import StatesAt
 from .._model.paths import is_within, leaf_names, listed
@@ -55,6 +56,7 @@ def simulate_many(
     atol: PyTree = None,
     stabilisation: Projection | Baumgarte | NoStabilisation = Projection(),
     friction: StickSlip | Regularised = StickSlip(),
+    surfaces: Located | NotLocated = Located(),
     max_steps: int = 100_000,
     throw: bool = True,
 ) -> Trajectory:
@@ -73,7 +75,8 @@ def simulate_many(
     - `over`: what differs: "q0", "qdot0", entries of them ("q0.phi") or of `params` ("b", "wheel.c").
     - `common_steps`: True makes 64 members at a time take the same steps, short enough for each of them, with the members as the last axis
       of all arithmetic: many times faster than one by one. False lets each member take its own steps. Default: True, but False with dry
-      friction, a contact, an event, or a measured input that jumps, or bends and drives a constraint: these end steps at different times.
+      friction, a contact, an event, a force that jumps or bends, or a measured input that jumps, or bends and drives a constraint: these
+      end steps at different times.
       If one of 64 cannot go on, all stop; `common_steps=False` then shows which.
 
     **Returns:** a `Trajectory`; each of its fields has the B members as its first axis, the samples as its second.
@@ -97,7 +100,7 @@ def simulate_many(
     everything["params"] = parameters(params, everything["q0"])
     own, shared = eqx.partition(everything, _differing(everything, listed(over)))
     dtype = jnp.result_type(*jax.tree.leaves((everything["q0"], everything["qdot0"])))
-    options = SolverOptions.of(solver, Formulation(stabilisation, friction), max_steps)
+    options = SolverOptions.of(solver, Formulation(stabilisation, friction, surfaces), max_steps)
     if common_steps not in (None, True, False):
         raise ValueError(f"`common_steps` must be True or False, but is {common_steps!r}. Leave it out to have it chosen.")
     like = eqx.combine(jax.tree.map(lambda leaf: np.zeros(leaf.shape[1:], leaf.dtype), own["q0"]), shared["q0"])
@@ -162,8 +165,8 @@ def _share_steps(common_steps, equations, params, own):
     obstacle = equations.modes or equations.sampled.size or signals or equations.driving or jump_times(params, float) is not None
     if common_steps and obstacle:
         raise ValueError(
-            "`common_steps` must be False where dry friction, a contact, an event, a jumping input or an update ends steps at its own "
-            "time, or signals differ, but is True. Leave it out."
+            "`common_steps` must be False where dry friction, a contact, an event, a force or an input that jumps or bends, or an update "
+            "ends steps at its own time, or signals differ, but is True. Leave it out."
         )
     return common_steps is not False and not obstacle
 
@@ -171,7 +174,7 @@ def _share_steps(common_steps, equations, params, own):
 def _one(system, options, everything, ts, tolerances):
     """One member, with steps of its own."""
     formulation = options.formulation
-    choices = dict(stabilisation=formulation.stabilisation, friction=formulation.friction, max_steps=options.max_steps)
+    choices = {name: getattr(formulation, name) for name in ("stabilisation", "friction", "surfaces")} | {"max_steps": options.max_steps}
     start = everything["q0"], everything["qdot0"], ts, everything["params"]
     return simulate(system, *start, solver=options.solver, rtol=tolerances[0], atol=tolerances[1], **choices, throw=False)
 

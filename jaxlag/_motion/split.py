@@ -35,13 +35,12 @@ class SplitInterpolation(dfx.AbstractLocalInterpolation):
 
 
 class Piece(NamedTuple):
-    """A step or a part of one: its end, error, dense output, the state of the solver, and whether it succeeded."""
+    """A step or a part of one: its end, error, dense output, and the state of the solver."""
 
     y: Any
     error: Any
     dense: Any
     state: Any
-    result: dfx.RESULTS | None  # None as of an explicit scheme, which always succeeds
 
 
 class Cut(NamedTuple):
@@ -72,11 +71,12 @@ def next_estimate(cut: Cut, end, value, slope, late, step: tuple[Any, Any], args
     modes end there, and by how much margins move with the last digit of the time. `late`: the time that rounding may hide an end for.
     """
     (t0, t1), falling = step, slope < 0
-    until = jnp.where(falling, jnp.abs(value) / jnp.where(falling, -slope, 1), jnp.inf)
-    nearest = jax.lax.stop_gradient(jnp.argmin(until))
-    estimate = end - value[nearest] / jnp.where(falling[nearest], slope[nearest], -jnp.inf)
-    slack = jnp.maximum(late[nearest], args.scales.rounding)  # times near zero are finer than what happens at them
-    usable = jnp.any(falling) & (end >= t0 - slack) & (end <= t1)
+    slack = jnp.maximum(late, args.scales.rounding)  # times near zero are finer than what happens at them
+    until = jnp.where(falling, value / jnp.where(falling, -slope, 1), jnp.inf)
+    first = jax.lax.stop_gradient(jnp.argmin(jnp.where(end + until >= t0 - slack, until, jnp.inf)))
+    estimate = end - value[first] / jnp.where(falling[first], slope[first], -jnp.inf)
+    near = jnp.abs(until[first]) <= jnp.maximum(slack[first], args.scales.rtol * (t1 - t0))  # it may have been seen on a path beyond others
+    usable = jnp.any(falling) & (end >= t0 - slack[first]) & (end <= t1) & near
     moved = jnp.where(falling, -slope, 0) * args.scales.rounding
-    ended = (jnp.arange(value.size) == nearest) | falling & (value <= SIMULTANEOUS * moved)
+    ended = (jnp.arange(value.size) == first) | falling & (value <= SIMULTANEOUS * moved)
     return cut._replace(time=end, estimate=estimate, usable=usable), ended, moved

@@ -297,7 +297,7 @@ class Step:
         y1, error, dense, rate = self.scheme.finished(y0, stages, lambda change: h * change)
         counts = np.zeros(len(error), bool)
         counts[: len(self.solver.controlled)] = self.solver.controlled
-        return Piece(y1, jnp.where(counts, error, 0), dense, rate, None)
+        return Piece(y1, jnp.where(counts, error, 0), dense, rate)
 
     def contents(self, t, parts: Parts) -> tuple[Flat, FrictionElements]:
         """The system and its elements of dry friction."""
@@ -365,7 +365,7 @@ class Step:
         given = AtEnd(value, slope, jnp.zeros_like(value))
         if self.is_rough:
             witnessed = parts._replace(v=found.qdot)
-            given = exactly(self.equations, end, witnessed, self.args, value, jnp.concatenate([slope, of_others]), decided=True)
+            given = exactly(self.equations, end, witnessed, self.args, value, jnp.concatenate([slope, of_others]), found.qddot)
         cut, ended, moved = next_estimate(turn.split.cut, end, *given, (self.t0, self.t1), self.args)
         onward = turn._replace(
             kind=jnp.array(STAGE),

@@ -12,6 +12,7 @@ from jaxtyping import Array, Bool, Float, PyTree
 
 from .._mechanics.friction_treatment import Regularised, StickSlip
 from .._mechanics.projection import Baumgarte, NoStabilisation, Projection
+from .._mechanics.surfaces import Located, NotLocated
 from .._model.event import Event
 from .._model.numbers import number
 from .._model.state_values import given_states, sampled
@@ -175,6 +176,7 @@ def stepper(
     atol: float | None = None,
     stabilisation: Projection | Baumgarte | NoStabilisation = Projection(),
     friction: StickSlip | Regularised = StickSlip(),
+    surfaces: Located | NotLocated = Located(),
     max_steps: int = 1000,
 ) -> Stepper:
     r"""Steps of `dt` of a motion, one at a time, for a loop of your own: pure, for `lax.scan`, `vmap` and `grad`.
@@ -190,7 +192,7 @@ def stepper(
     - `dt`: the length of a step, in any consistent unit.
     - `params`: what the functions of the system name, by name.
     - `inputs`: by name, params that may be others in each step, with their values at the start.
-    - `events`, `solver`, `rtol`, `atol`, `stabilisation`, `friction`: as of `simulate`.
+    - `events`, `solver`, `rtol`, `atol`, `stabilisation`, `friction`, `surfaces`: as of `simulate`.
     - `max_steps`: step limit of the solver within each step of `dt`.
 
     **Returns:** a `Stepper`: `stepper.start(q0, qdot0, t0)` is a state, `stepper(state, inputs)` the next, with `t`, `q`, `qdot`, `states`
@@ -218,6 +220,6 @@ def stepper(
     params, inputs = ({} if given is None else given for given in (params, inputs))
     _check_mapping(params, "params")
     _check_mapping(inputs, "inputs")
-    options = SolverOptions.of(solver, Formulation(stabilisation, friction, False), max_steps)
+    options = SolverOptions.of(solver, Formulation(stabilisation, friction, surfaces), max_steps)
     dt = number(dt, "`dt`", positive=True, cure="It is the length of a step.")
     return Stepper(system, options, dt, dict(params), dict(inputs), (rtol, atol))

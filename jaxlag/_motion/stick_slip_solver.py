@@ -50,7 +50,7 @@ class StickSlipSolver(ProjectedSolver):
     def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
         solver_state, is_new = solver_state
         made_jump = made_jump | is_new
-        piece = lambda *given: Piece(*self.projected_step(terms, *given[:3], args, *given[3:]))
+        piece = lambda *given: Piece(*self.projected_step(terms, *given[:3], args, *given[3:])[:4])  # what failed has an infinite error
         given = t0, t1, y0, solver_state, jnp.asarray(made_jump)
         nothing = zeros_like(jax.eval_shape(piece, *given))
         no, zeros = jnp.array(False), jnp.zeros(self.equations.modes, y0.dtype)
@@ -125,7 +125,6 @@ class StickSlipSolver(ProjectedSolver):
         result = dfx.RESULTS.where(seen.negative & ~shrinking, under_diffrax(RESULTS.negative_bound), result)
         result = dfx.RESULTS.where(self.equations.exhausted(second.y), under_diffrax(RESULTS.chattering), result)
         result = dfx.RESULTS.where(overflows(self.equations, second.y), under_diffrax(RESULTS.too_many_events), result)
-        result = dfx.RESULTS.where(first.result == dfx.RESULTS.successful, result, first.result)
         dense = {"cut": jnp.where(ended, cut.time, t1), "first": first.dense, "second": second.dense}
         return behind_step(self.equations, t1, second.y, args), error, dense, second.state, result
 

@@ -12,6 +12,7 @@ from .._model.flat import Flat
 from .._model.injection import asks_for
 from .._model.signal import origin_of
 from .first_order import EquationsOfMotion
+from .held_sides import on_held_sides
 from .protocol import Arguments
 from .state_vector import Parts
 
@@ -36,16 +37,24 @@ def _value_and_scale(equations, t, parts, args):
     multipliers = _multipliers(equations, t, parts, args)(t, parts.q, parts.v)
     largest = jax.lax.stop_gradient(jnp.max(jnp.abs(multipliers), initial=0.0)) * jnp.ones_like(multipliers)
     of_loads, of_time = roundings(largest, largest), roundings(t[None], args.scales.duration)
-    at = t, parts.q, parts.v, multipliers
     late = 4 * jnp.finfo(t.dtype).eps * jnp.abs(origin_of(args.params))  # the rounding of the user's time, which functions see
-    of_times = late * np.array([callable(event.when) for _, event in equations.system.events])
-    slopes = [jnp.abs(by).reshape(equations.events, -1) for by in jax.jacfwd(flat.witnesses, argnums=(0, 1, 2, 3))(*at)]
+    of_times = late * np.array([callable(event.when) for event in equations.watched])
+
+    def witnessed(t, q, v):
+        slopes = jax.jacfwd(flat.witnesses, argnums=(0, 1, 2, 3))(t, q, v, multipliers)
+        return flat.witnesses(t, q, v, multipliers), [jnp.abs(by).reshape(equations.events, -1) for by in slopes]
+
+    value, slopes = witnessed(t, parts.q, parts.v)
+    for level in range(1, max(equations.levels) + 1):  # one that jumps where others pass through zero is seen where these have their signs
+        (time, there), follows = on_held_sides(flat, t, parts, args, equations.levels, level), np.array(equations.levels) == level
+        of_level = lambda new, old, follows=follows: jnp.where(follows.reshape(-1, *[1] * (old.ndim - 1)), new, old)
+        value, slopes = jax.tree.map(of_level, witnessed(time, there.q, there.v), (value, slopes))
 
     def scale(of_q, of_v):
         errors = (of_time + of_times)[:, None], of_q[None], of_v[None], of_loads[None]
         return jax.lax.stop_gradient(sum(jnp.sum(by * of, axis=1) for by, of in zip(slopes, errors, strict=True)))
 
-    return flat.witnesses(*at), slopes, scale
+    return value, slopes, scale
 
 
 def _multipliers(equations, t, parts, args):
@@ -69,16 +78,32 @@ def sides(equations: EquationsOfMotion, t, parts: Parts, args: Arguments, qddot=
         parts = equations.decided(t, parts, args)
         _, mode, _ = equations.mode(t, parts, args)
         qddot = equations.acceleration(mode, t, parts.q, parts.v).x
+    found = _sides(equations, t, parts, args, qddot)
+    for level in range(1, max(equations.levels) + 1):
+        lower, (side, _) = np.array(equations.levels) < level, found
+        there = parts._replace(sign=jnp.where(lower, side, parts.sign))
+        found = jax.tree.map(lambda old, new, lower=lower: jnp.where(lower, old, new), found, _sides(equations, t, there, args, qddot))
+    return jax.lax.stop_gradient(found)
+
+
+def _sides(equations, t, parts, args, qddot):
     value, slopes, scale_of = _value_and_scale(equations, t, parts, args)
     flat, _ = equations.contents(t, parts, args)
     multipliers = _multipliers(equations, t, parts, args)
     along = lambda t, q, v: flat.witnesses(t, q, v, multipliers(t, q, v))
-    rate = jax.jvp(along, (t, parts.q, parts.v), (jnp.ones_like(t), parts.v, qddot))[1]
+    way = lambda v: (jnp.ones_like(t), v, qddot)
+    rate, turn = jax.jvp(lambda *state: jax.jvp(along, state, way(state[-1]))[1], (t, parts.q, parts.v), way(parts.v))
     is_far = jnp.abs(value) > scale_of(args.scales.of_positions(parts.q), args.scales.of_velocities(parts.v))
     of_q, of_v = args.scales.roundings(parts.q, parts.v)
-    stays = ~is_far & (jnp.abs(rate) <= slopes[1] @ of_v + slopes[2] @ args.scales.roundings_of_rates(qddot)) & _may_stay(equations)
-    side = jnp.where(stays, 0.0, jnp.where(jnp.where(is_far, value, rate) < 0, -1.0, 1.0)).astype(value.dtype)
-    return jax.lax.stop_gradient((side, jnp.abs(value) > scale_of(of_q, of_v)))
+    of_rates = args.scales.roundings_of_rates(qddot)
+    is_slow = jnp.abs(rate) <= slopes[1] @ of_v + slopes[2] @ of_rates
+    turns = (
+        jnp.all(slopes[2] == 0, axis=1) & _is_surface(equations) & (jnp.abs(turn) > slopes[1] @ of_rates)
+    )  # as its acceleration is known
+    stays = ~is_far & is_slow & ~turns & _may_stay(equations)
+    going = jnp.where(is_far, value, jnp.where(is_slow & turns, turn, rate))
+    side = jnp.where(stays, 0.0, jnp.where(going < 0, -1.0, 1.0)).astype(value.dtype)
+    return side, jnp.abs(value) > scale_of(of_q, of_v)
 
 
 def signs_behind_step(equations: EquationsOfMotion, t, parts: Parts, args: Arguments) -> Float[Array, " w"]:
@@ -97,7 +122,12 @@ def signs_behind_step(equations: EquationsOfMotion, t, parts: Parts, args: Argum
 
 def _may_stay(equations) -> Bool[np.ndarray, " w"]:
     """Which witnesses may leave zero without an event: not those that happen wherever they are negative."""
-    return np.array([not isinstance(event.direction, Negative) for _, event in equations.system.events])
+    return np.array([not isinstance(event.direction, Negative) for event in equations.watched])
+
+
+def _is_surface(equations) -> Bool[np.ndarray, " w"]:
+    """Which of them are surfaces."""
+    return np.arange(equations.events) >= len(equations.system.events)
 
 
 def beyond(sign: Float[Array, " w"], passed: Bool[Array, " w"]) -> Float[Array, " w"]:
@@ -107,7 +137,7 @@ def beyond(sign: Float[Array, " w"], passed: Bool[Array, " w"]) -> Float[Array, 
 
 def matching(equations: EquationsOfMotion, sign: Float[Array, " w"]) -> Bool[Array, " w"]:
     """Which events happen where their witness had this sign and loses it."""
-    of = [event.direction for _, event in equations.system.events]
+    of = [event.direction for event in equations.watched]
     falls = np.array([not isinstance(direction, Rising) for direction in of])
     rises = np.array([isinstance(direction, (Rising, Either)) for direction in of])
     return jnp.where(sign > 0, falls, rises)
@@ -145,14 +175,14 @@ def struck(equations: EquationsOfMotion, before, y) -> Bool[Array, " w"]:
     """Which events are those of contacts that had an impact between two states."""
     impacts = equations.parts(y).impacts - (0 if before is None else equations.parts(before).impacts)
     names = [name for name, _ in equations.system.unilateral]
-    of = [event.when for _, event in equations.system.events]
+    of = [event.when for event in equations.watched]
     return jnp.stack([impacts[names.index(when)] > 0 if isinstance(when, str) else jnp.array(False) for when in of])
 
 
 def with_seen(equations: EquationsOfMotion, t, seen, parts: Parts) -> Parts:
     """With what is recorded of an event: the time, and the state that was `seen` before."""
     before = equations.parts(seen)
-    return parts._replace(seen=jnp.concatenate([t[None], before.q, before.v, before.z, before.u]))
+    return parts._replace(seen=jnp.concatenate([t[None], before.q, before.v, before.z, before.u])) if equations.seen else parts
 
 
 def passing(equations: EquationsOfMotion, t, parts: Parts, args: Arguments, passed, brought, done, at_start, qddot=None):
@@ -167,26 +197,26 @@ def passing(equations: EquationsOfMotion, t, parts: Parts, args: Arguments, pass
     passed = (passed | (is_new & _due(equations) & (side < 0)) | (~is_new & crosses)) & ~done
     done = done | passed
     happens = passed & matching(equations, before)
-    stops = jnp.any(happens & np.array([event.stop for _, event in equations.system.events]))
+    stops = jnp.any(happens & np.array([event.stop for event in equations.watched]))
     sign, stopped = jnp.where(done | (is_new & at_start), side, parts.sign), jnp.maximum(parts.stopped, stops)
     return parts._replace(sign=sign, happened=parts.happened + happens, stopped=stopped), happens, done
 
 
 def _due(equations):
     """Which events happen where their witness is negative at the start."""
-    return np.array([isinstance(event.direction, Negative) for _, event in equations.system.events])
+    return np.array([isinstance(event.direction, Negative) for event in equations.watched])
 
 
 def changes_states(equations: EquationsOfMotion) -> bool:
     """Whether any event changes the state."""
-    return any(event.then is not None for _, event in equations.system.events)
+    return any(event.then is not None for event in equations.watched)
 
 
 def asks_for_forces(equations: EquationsOfMotion) -> bool:
     """Whether any witness depends on constraint forces."""
-    return any(callable(event.when) and asks_for(event.when, "multipliers") for _, event in equations.system.events)
+    return any(callable(event.when) and asks_for(event.when, "multipliers") for event in equations.watched)
 
 
 def may_be_due(equations: EquationsOfMotion) -> bool:
     """Whether events may happen at the start."""
-    return bool(np.any(_due(equations))) or any(isinstance(event.when, str) for _, event in equations.system.events)
+    return bool(np.any(_due(equations))) or any(isinstance(event.when, str) for event in equations.watched)

@@ -8,10 +8,11 @@ import jax
 import jax.numpy as jnp
 from jax.extend import source_info_util
 
-from .primitives import ANY_CALL, CHOOSING, EQUALITIES, LOOKUPS, NAMES_IN_NUMPY
+from .primitives import ANY_CALL, CALLS, CHOOSING, EQUALITIES, LOOKUPS, NAMES_IN_NUMPY
 from .walker import called_program, columns_of_branches, parts_of_scan, walk
 
-OWN = str(pathlib.Path(__file__).parents[1])
+PACKAGE = pathlib.Path(__file__).parents[1]
+OWN, LENT = str(PACKAGE), (str(PACKAGE / "elements.py"), str(PACKAGE / "examples"))  # and what stands for code of the user's
 SMOOTH = frozenset(["hypot", "logaddexp", "logaddexp2", "sinc", "softplus"])  # though they choose inside
 Marks = frozenset[str]
 
@@ -50,9 +51,14 @@ def choices(function: Callable, *marked: tuple[Any, str]) -> list[Choice]:
     inputs = [Value(frozenset((mark,))) for argument, mark in marked for _ in jax.tree.leaves(argument)]
     found: dict[tuple[str, str], Marks] = {}
     for what, line, by in Value.of(_walked(program, inputs, None)).choices:
-        if OWN not in line:
+        if not is_own(line):
             found[what, line] = found.get((what, line), frozenset()) | by
     return sorted(Choice(*of, by) for of, by in found.items())
+
+
+def is_own(line: str) -> bool:
+    """Whether a line is of jaxlag's own code, which chooses, but neither jumps nor bends."""
+    return OWN in line and not any(file in line for file in LENT)
 
 
 def _walked(program: Any, inputs: Iterable[Value], within: _Call | None) -> list[Value]:
@@ -72,7 +78,10 @@ def _evaluated(equation: Any, operands: list[Value], within: _Call | None) -> Se
         called = str(params.get("name") or program.jaxpr.debug_info.func_name).strip("_<>")
         inner = _Call(here.what or (called if called != "lambda" else None), here.line)
         given = operands[len(operands) - len(program.jaxpr.invars) :]
-        return [found] * len(equation.outvars) if called in SMOOTH else _walked(program, given, inner)
+        if called in SMOOTH:
+            return [found] * len(equation.outvars)
+        outputs = _walked(program, given, inner)
+        return outputs if name in CALLS else [value._replace(marks=value.marks | found.marks) for value in outputs]  # a rule may see more
     if name == "cond":
         columns = columns_of_branches(params, operands[1:], lambda branch, given: _walked(branch, given, here))
         return [Value.of((chosen("cond", operands[0].marks), *of)) for of in columns]

@@ -18,19 +18,20 @@ integer_pow: power overflows
 square: power overflows zero_unsigned
 convert_element_type: power unchanged
 
-abs: elementwise nonsmooth modulus chooses overflows zero_unsigned
-sign: elementwise nonsmooth modulus chooses increasing
-max min: elementwise nonsmooth modulus chooses increasing
+abs: elementwise nonsmooth modulus chooses at_zero overflows zero_unsigned
+sign: elementwise nonsmooth modulus chooses at_zero steps increasing
+max min: elementwise nonsmooth modulus chooses at_equality increasing
 select_n: elementwise nonsmooth modulus
-clamp: elementwise nonsmooth chooses increasing
-floor ceil round: elementwise nonsmooth chooses increasing
-rem: elementwise integral nonsmooth chooses
+clamp: elementwise nonsmooth chooses at_bounds increasing
+floor ceil: elementwise nonsmooth chooses at_integers steps increasing
+round: elementwise nonsmooth chooses at_halves steps increasing
+rem: elementwise integral nonsmooth chooses at_multiples
 sqrt: elementwise modulus increasing
-gt lt: elementwise nonsmooth modulus order strict
-ge le: elementwise nonsmooth modulus order
-eq: elementwise nonsmooth equality
-ne: elementwise nonsmooth equality strict
-is_finite: elementwise
+gt lt: elementwise nonsmooth modulus order at_equality steps strict
+ge le: elementwise nonsmooth modulus order at_equality steps
+eq: elementwise nonsmooth equality steps
+ne: elementwise nonsmooth equality steps strict
+is_finite: elementwise steps
 and or: elementwise integral logical increasing
 not: elementwise integral logical decreasing
 xor: elementwise integral
@@ -96,6 +97,10 @@ ZERO_UNSIGNED = _with("zero_unsigned")  # a zero of either sign gives the same
 
 NONSMOOTH = _with("nonsmooth")
 CHOOSING = _with("chooses")  # by value
+STEPS = _with("steps")  # constant between jumps
+JUMPS = STEPS | _with("at_multiples")
+BENDS = _with("at_equality", "at_bounds") - STEPS
+EDGES = {name: edge for edge in ("at_zero", "at_equality", "at_bounds", "at_integers", "at_halves", "at_multiples") for name in _with(edge)}
 MODULI = _with("modulus")  # in terms of |s| and the sign of s
 SIGMOIDS = _with("sigmoid")
 EQUALITIES = _with("equality")  # true or false at points alone

@@ -1,4 +1,4 @@
-"""Forces that jump or bend across a surface: named by `examine` and `fit`, and exact where an event is zero there. Closed forms."""
+"""Forces that jump or bend across a surface: exact, with an event there too; named by `examine` and `fit` where steps do not end there."""
 
 import inspect
 
@@ -12,8 +12,10 @@ from jaxlag._program.choices import choices
 
 FREE = lambda qdot: 0.5 * qdot**2
 MUD = lambda q, qdot, a, b: 0.5 * jnp.where(q > a, b, 0.0) * qdot**2  # thick behind a
+HIDDEN = lambda q, qdot, a, b: 0.5 * jnp.stack([b, 0.0])[jnp.argmax(jnp.stack([q, a]))] * qdot**2  # the same
 STOP = lambda q, a, c: -0.5 * c * jnp.maximum(q - a, 0.0) ** 2
 EDGES = {
+    "none": None,
     "plain": jl.Event(lambda q, a: q - a),
     "rising": jl.Event(lambda q, a: 1e3 * (q - a), direction=jl.direction.Rising()),
     "curved": jl.Event(lambda q, a: (a - q) * (3 * a**2 + q**2)),
@@ -29,7 +31,7 @@ def line_of(function):
 @pytest.mark.parametrize("edge", EDGES)
 def test_mud_behind_an_edge(edge, derivative):
     """From q = 0 at speed 1, q(T) = a + (1 − e^{−b (T−a)})/b; the derivative by a was 0, and with an event not right either."""
-    system = jl.System(FREE, dissipation=MUD, events={"edge": EDGES[edge]})
+    system = jl.System(FREE, dissipation=MUD, events=EDGES[edge] and {"edge": EDGES[edge]})
 
     @jax.jit
     def last(x, unit):
@@ -56,11 +58,12 @@ def test_a_spring_that_one_runs_into():
 @pytest.mark.parametrize(
     "edge",
     [
+        None,
         jl.Event(lambda q, a: q["x"] - a),
         jl.Event(lambda q, a: q["x"] - a, lambda q: {"q": q}),
         jl.Event(lambda q, a: q["x"] - a, lambda q: {"q": q}, direction=jl.direction.Falling()),
     ],
-    ids=["plain", "then", "passed the other way"],
+    ids=["none", "plain", "then", "passed the other way"],
 )
 def test_what_sticks_breaks_away_where_its_load_jumps(edge):
     """A load f on a block with friction F begins where a body, at speed 1, passes a: y(T) = (f − F)(T − a)²/2. dy/da was 0: friction
@@ -70,7 +73,7 @@ def test_what_sticks_breaks_away_where_its_load_jumps(edge):
         lambda qdot: 0.5 * (qdot["x"] ** 2 + qdot["y"] ** 2),
         dissipation=lambda qdot, F: F * jnp.abs(qdot["y"]),
         force=lambda q, a, f: {"y": jnp.where(q["x"] > a, f, 0.0)},
-        events={"edge": edge},
+        events=edge and {"edge": edge},
     )
 
     def last(x, length, time):
@@ -92,29 +95,36 @@ def test_what_sticks_breaks_away_where_its_load_jumps(edge):
 def test_the_user_is_told_where():
     """Each function and its line, the table too; neither dry friction nor guards nor what is smooth."""
     table = lambda q: {"x": -jnp.interp(q["x"], jnp.arange(4.0), jnp.arange(4.0) ** 2) / jnp.where(q["x"] == 0, 1.0, q["x"])}
+    hidden = lambda q, qdot, a, b: HIDDEN(q["x"], qdot["x"], a, b)
     system = jl.System(
         {"free": lambda qdot: 0.5 * qdot["x"] ** 2, "stop": lambda q, a, c: STOP(q["x"], a, c), "well": lambda q: -jnp.hypot(q["x"], 1.0)},
-        dissipation={"mud": lambda q, qdot, a, b: MUD(q["x"], qdot["x"], a, b), "rubbing": lambda qdot: 0.1 * jnp.abs(qdot["x"])},
+        dissipation={
+            "mud": lambda q, qdot, a, b: MUD(q["x"], qdot["x"], a, b),
+            "rubbing": lambda qdot: 0.1 * jnp.abs(qdot["x"]),
+            "hidden": hidden,
+        },
         force=table,
     )
-    found = jl.examine(system, {"x": 0.3}, {"x": 1.0}, {"a": 0.5, "b": 1.0, "c": 4.0}).findings
-    for what, line in (("'stop' chooses", line_of(STOP)), ("'mud' chooses", line_of(MUD)), ("`force` chooses", line_of(table))):
-        (finding,) = [finding for finding in found if what in finding]
-        assert f"test_surfaces.py:{line}:" in finding and "jl.Event" in finding
-    assert not any(name in finding for finding in found for name in ("well", "rubbing", "free"))
+    found = jl.examine(system, {"x": 0.3}, {"x": 1.0}, {"a": 0.5, "b": 1.0, "c": 4.0})
+    for function, what, line in (("'stop'", "maximum", STOP), ("'mud'", "where", MUD), ("`force`", "interp", table)):
+        (surface,) = {surface for surface in found.surfaces if function in surface.function}
+        assert f"test_surfaces.py:{line_of(line)}:" in surface.line and surface.located and what in surface.what
+        assert f"{surface.what}` of {surface.function}, {surface.line}" in str(found)
+    (finding,) = found.findings
+    assert "'hidden' chooses" in finding and f"test_surfaces.py:{line_of(HIDDEN)}:" in finding and "jl.Event" in finding
+    assert not any(name in surface.function for surface in found.surfaces for name in ("well", "rubbing", "free"))
 
 
 @pytest.mark.slow
 def test_a_fit_does_not_deny_an_influence():
-    """Without an event the derivative by a is 0; a parameter that stands nowhere has none indeed."""
-    system, ts = jl.System(FREE, dissipation=MUD), np.linspace(0, 2, 41)
+    """Where steps do not end, the derivative by a is 0; a parameter that stands nowhere has none indeed."""
+    system, ts = jl.System(FREE, dissipation=HIDDEN), np.linspace(0, 2, 41)
     exact = np.where(ts < 0.5, ts, 0.5 + 1 - np.exp(-np.maximum(ts - 0.5, 0)))
     record = jl.Experiment(ts, exact + 1e-3 * np.random.default_rng(0).normal(size=ts.size), 0.0, 1.0, sigma=1e-3)
     shown = str(jl.fit(system, record, {"a": 0.52, "b": 1.1, "idle": 1.0}, free=("a", "b", "idle")))
-    assert "a decides where" in shown and f"test_surfaces.py:{line_of(MUD)}:" in shown
+    assert "a decides where" in shown and f"test_surfaces.py:{line_of(HIDDEN)}:" in shown
     assert "a has no influence" not in shown and "idle has no influence" in shown
-    edged = jl.System(FREE, dissipation=MUD, events={"edge": EDGES["plain"]})
-    found = jl.fit(edged, record, {"a": 0.52, "b": 1.1}, free=("a", "b"))
+    found = jl.fit(jl.System(FREE, dissipation=MUD), record, {"a": 0.52, "b": 1.1}, free=("a", "b"))
     assert found.converged and abs(found.estimates["a"] - 0.5) < 4 * found.standard_errors["a"] < 0.01
 
 
