@@ -57,7 +57,7 @@ def end_stop(x: Number, v: Number, c: Number, d: Number = 0.0) -> Value:
     elements.end_stop(0.01, -3.0, c=1000.0, d=5.0)  # 0: it does not pull
     ```
     """
-    return jnp.where(jnp.asarray(x) > 0, -jnp.maximum(c * x + d * v, 0.0), 0.0)
+    return jnp.where(jnp.asarray(x) > 0, -_pushing(c * x + d * v), 0.0)
 
 
 def hunt_crossley(x: Number, v: Number, c: Number, lam: Number = 0.0, n: Number = 1.5) -> Value:
@@ -80,7 +80,7 @@ def hunt_crossley(x: Number, v: Number, c: Number, lam: Number = 0.0, n: Number 
     """
     inside = jnp.asarray(x) > 0
     depth = jnp.where(inside, x, 1.0)  # so that no power of a negative number is differentiated
-    return jnp.where(inside, -jnp.maximum(c * depth**n * (1 + lam * v), 0.0), 0.0)
+    return jnp.where(inside, -_pushing(c * depth**n * (1 + lam * v)), 0.0)
 
 
 def preload(x: Number, c: Number, F: Number) -> Value:
@@ -140,8 +140,7 @@ def dead_zone(x: Number, width: Number) -> Value:
     elements.dead_zone(-0.5, 0.2)  # −0.3
     ```
     """
-    x = jnp.asarray(x)
-    return x - jnp.clip(x, -width, width)
+    return jnp.maximum(x - width, 0.0) + jnp.minimum(x + width, 0.0)  # two terms, so that a width of zero has a slope
 
 
 def saturation(x: Number, limit: Number) -> Value:
@@ -158,7 +157,7 @@ def saturation(x: Number, limit: Number) -> Value:
     elements.saturation(-5.0, 2.0)  # −2
     ```
     """
-    return jnp.clip(jnp.asarray(x), -limit, limit)
+    return x - dead_zone(x, limit)
 
 
 def table(x: Number, xs: Any, ys: Any) -> Value:
@@ -207,6 +206,11 @@ def table_integral(x: Number, xs: Any, ys: Any) -> Value:
     left, inside = jnp.maximum(i - 1, 0), (i > 0) & (i < xs.size)
     s = x - xs[left]
     return before[left] + s * ys[left] + jnp.where(inside, slopes[jnp.minimum(left, xs.size - 2)], 0.0) * s**2 / 2
+
+
+def _pushing(force: Any) -> Array:
+    """A force that pushes, or none; where it is zero, its slopes are those of the force, so that parameters may be zero."""
+    return force + jax.nn.relu(-force)
 
 
 def _points(xs: Any, ys: Any) -> tuple[Array, Array]:

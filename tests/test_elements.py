@@ -9,6 +9,7 @@ from scipy.integrate import quad, solve_ivp
 import jaxlag as jl
 from jaxlag import elements
 
+FREE = lambda qdot: 0.5 * qdot**2
 XS, YS = np.array([-1.0, -0.2, 0.5, 2.0]), np.array([2.0, -1.0, 0.5, 0.7])
 
 
@@ -106,3 +107,16 @@ def test_bad_tables_are_refused():
     with pytest.raises(ValueError, match="`xs` and `ys` must be of one length"):
         elements.table(0.3, [0.0, 1.0], [0.0, 1.0, 2.0])
     assert np.isfinite(jax.jit(elements.table)(0.3, jnp.asarray(XS), jnp.asarray(YS)))
+
+
+def test_slopes_where_parameters_are_zero():
+    """Those towards positive ones: of a stop that is not yet there, a gap without width, a drive without force."""
+    stop = jl.System(FREE, force=lambda q, qdot, a, c, d: elements.end_stop(q - a, qdot, c, d))
+    last = lambda c, d: jl.simulate(stop, 0.0, 1.0, np.array([0.0, 2.0]), {"a": 0.5, "c": c, "d": d}).q[-1]
+    np.testing.assert_allclose(jax.grad(last, (0, 1))(0.0, 0.0), [-(1.5**3) / 6, -(1.5**2) / 2], rtol=1e-7)
+    gap = jl.System(lambda q, qdot, s: FREE(qdot) - elements.gap_spring(q, 4.0, s))
+    at = lambda s: jl.simulate(gap, 0.3, 0.0, np.array([0.0, np.pi / 4]), {"s": s}).q[-1]
+    np.testing.assert_allclose(jax.grad(at)(0.0), 0.5, rtol=1e-6)  # q = s/2 + (0.3 − s/2) cos 2t
+    for x, slope in ((0.4, 1.0), (-0.4, -1.0)):
+        assert jax.grad(elements.saturation, 1)(x, 0.0) == slope == -jax.grad(elements.dead_zone, 1)(x, 0.0)
+    np.testing.assert_allclose(elements.saturation(np.array([-5.0, -0.5, 0.3, 7.0]), 2.0), [-2.0, -0.5, 0.3, 2.0])

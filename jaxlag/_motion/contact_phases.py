@@ -23,7 +23,6 @@ from .._mechanics.stick_slip import Friction, ModeSelection
 from .._mechanics.stick_slip import Search as ModeSearch
 from .._model.flat import rows_by_name
 from .._program.conditions import zeros_like
-from .held_sides import on_held_sides
 from .mode_changes import Touch, behind_impact, friction_at, resting_at, touching_at, with_closed
 from .state_vector import Parts
 from .step_machine import Step
@@ -148,10 +147,7 @@ class ContactStep(Step):
 
     def _beyond(self, t, parts: Parts, passed) -> Parts:
         """The state by a few roundings beyond the surfaces that were passed: there gaps and their rates are seen, which may bend."""
-        if not self.equations.sided:
-            return parts
-        there = parts._replace(sign=beyond(parts.sign, passed))
-        _, there = on_held_sides(self.contents(t, parts)[0], t, there, self.args, self.equations.levels)
+        _, there = self.equations.on_held_sides(t, parts._replace(sign=beyond(parts.sign, passed)), self.args)
         return there._replace(sign=parts.sign)
 
     def put(self, turn: Turn, there, y) -> Turn:

@@ -11,7 +11,6 @@ from .._model.flat import Flat
 from .._model.state_values import ravelled
 from .._program.jit import jitted
 from .first_order import EquationsOfMotion
-from .held_sides import on_held_sides
 from .jumps import after_jump
 from .mode_changes import Change, changed
 from .protocol import Arguments
@@ -92,7 +91,7 @@ def _on_new_sides(equations: EquationsOfMotion, t, y, args: Arguments):
     """y in the mode of friction and contact that holds on the sides where witnesses are now; gaps that bend there open, or strike."""
     parts = equations.parts(y)
     flat, _ = equations.contents(t, parts, args)
-    time, held = on_held_sides(flat, t, parts, args, equations.levels)
+    time, held = equations.on_held_sides(t, parts, args)
     held = held._replace(closed=_still_closed(flat, time, held.q, held.v, held.closed, args.scales))
     after, consistent = after_jump(equations, time, held.y, held.y, args, args)
     after = equations.parts(after)

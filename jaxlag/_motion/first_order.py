@@ -124,6 +124,10 @@ class EquationsOfMotion:
         elements = on_constraints(flat, elements, t, parts.q, parts.v, lambda: _left_by_constraints(self, t, parts, args))
         return flat, in_mode(flat, elements, parts.sigma), elements
 
+    def on_held_sides(self, t, parts: Parts, args: Arguments) -> tuple[Any, Parts]:
+        """The time and the state at which forces are taken: those themselves, unless functions jump or bend, or nearest by."""
+        return on_held_sides(self.contents(t, parts, args)[0], t, parts, args, self.levels) if self.sided else (t, parts)
+
     def decided(self, t, parts: Parts, args: Arguments) -> Parts:
         """With the velocities that follow from the rest: between the ends of steps, those of coordinates without inertia are not kept."""
         if not self.light:
@@ -339,7 +343,7 @@ def _on_held_sides(equations: EquationsOfMotion, at: Callable, t, parts: Parts, 
     if not equations.sided:
         return at(t, parts)
     of_state = lambda t, parts: (t, parts.q, parts.v, parts.z)
-    held = on_held_sides(equations.contents(t, parts, args)[0], t, parts, args, equations.levels)
+    held = equations.on_held_sides(t, parts, args)
     rates, found = at(*held)
     there, here = jax.lax.stop_gradient((of_state(*held), of_state(t, parts)))
     along = lambda t, q, v, z: at(t, held[1]._replace(q=q, v=v, z=z))[0]
@@ -424,9 +428,8 @@ def _updated(equations: EquationsOfMotion, t, y, args, due):
 
 @jitted
 def _projected(equations: EquationsOfMotion, t, y, args, found):
-    parts = there = equations.parts(y)
-    if equations.sided:
-        t, there = on_held_sides(equations.contents(t, parts, args)[0], t, parts, args, equations.levels)
+    parts = equations.parts(y)
+    t, there = equations.on_held_sides(t, parts, args)
     q, v = there.q, there.v
     flat, mode, _ = equations.mode(t, there, args)
     assert equations.projection is not None  # asked where there is something to keep

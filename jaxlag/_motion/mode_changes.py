@@ -28,7 +28,6 @@ from .._model.flat import Flat, StatesAt
 from .._program.jit import jitted
 from .._program.time_bounds import bounds_over_boxes
 from .first_order import EquationsOfMotion
-from .held_sides import on_held_sides
 from .path_bounds import PathBounds
 from .protocol import Arguments
 from .state_vector import Parts, Start
@@ -72,7 +71,7 @@ def _margins(equations: EquationsOfMotion, t, parts: Parts, args):
         pressing = lambda: contact_rows(flat, equations.acceleration(mode, t, q, v).multipliers)
         forces = jax.lax.cond(jnp.any(closed), pressing, none) if equations.contacts else none()
         return jnp.concatenate([_contact_margins(flat, t, q, closed, forces, args), of_events, *unbounded])
-    time, there = on_held_sides(flat, t, parts, args, equations.levels) if equations.sided else (t, parts)
+    time, there = equations.on_held_sides(t, parts, args)
     return margins_of(equations, t, parts, args, equations.friction(time, there, args), of_events)
 
 

@@ -9,7 +9,7 @@ from jax.extend import source_info_util
 from jaxtyping import Array, Float
 
 from .choices import SMOOTH, is_own
-from .primitives import ANY_CALL, BENDS, CALLS, CHOOSING, EDGES, JUMPS, MOVEMENTS, STEPS
+from .primitives import ANY_CALL, BENDS, CALLS, CHOOSING, EDGES, JUMPS, MOVEMENTS, ORDER, STEPS
 from .walker import called_program, primitive_names, walk, without_unused
 
 Marks = frozenset[str]
@@ -101,14 +101,14 @@ class _Reader:
         program = called_program(equation)
         called = str(equation.params.get("name") or program.jaxpr.debug_info.func_name)
         given = operands[len(operands) - len(program.jaxpr.invars) :]
-        if not quiet and not is_own(line) and self.counts(_all(given), False):
+        jumps = (called in PERIODIC or called == SEARCH) and self.counts(_all(given), False)
+        if jumps and not (quiet or is_own(line)):
             if called == SEARCH:
                 self._look_in_table(*given, self._bound(equation, operands)[0])
-            if called in PERIODIC:
+            else:
                 self._add("multiples", lambda x, y: jnp.sin(jnp.pi * x / y), *given)
-        jumps = called in PERIODIC or called == SEARCH
         outputs = self.read(program, given, line, quiet or jumps or called in SMOOTH)
-        if jumps and self.counts(_all(given), False):
+        if jumps:
             outputs = [output._replace(level=1 + max(operand.level for operand in given)) for output in outputs]
         if equation.primitive.name not in CALLS:
             levels = [output.level for output in outputs]
@@ -155,7 +155,7 @@ class _Reader:
             self._add(kind, lambda x: jnp.cos(jnp.pi * x), *operands)
         elif kind == "at_multiples":
             self._add("multiples", lambda x, y: jnp.sin(jnp.pi * x / y), *operands)
-        elif name in CHOOSING or (name in WITH_BODIES and not CHOOSING.isdisjoint(primitive_names([equation]))):
+        elif name in CHOOSING or (name in WITH_BODIES and not (CHOOSING | ORDER.keys()).isdisjoint(primitive_names([equation]))):
             self.unknown[line] = None
 
     def _add(self, kind, function, *operands):

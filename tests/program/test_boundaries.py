@@ -59,6 +59,7 @@ def test_what_jumps_itself_is_told_by_its_level():
         lambda q, v: jnp.max(jnp.stack([q, 2 * q])),
         lambda q, v: jnp.sort(jnp.stack([q, 2 * q]))[1],
         lambda q, v: jax.lax.scan(lambda x, _: (jnp.maximum(x, q), None), 0.3, None, 3)[0],
+        lambda q, v: jax.lax.scan(lambda x, _: (jnp.where(x > q, 2 * x, x), None), 0.3, None, 3)[0],
         lambda q, v: jax.lax.cond(q > 0, lambda: jnp.maximum(q, 0.3), lambda: q),
     ],
 )
