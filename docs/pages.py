@@ -30,7 +30,8 @@ REFERENCE = {  # names in `jaxlag`
     "rigid.inertia.principal_axes rigid.inertia.Principal rigid.inertia.matrix rigid.inertia.physical "
     "rigid.inertia.log_cholesky rigid.inertia.Body",
     "Parts that jump or bend": "elements.gap_spring elements.end_stop elements.hunt_crossley elements.preload elements.bilinear "
-    "elements.dead_zone elements.saturation elements.table elements.table_integral",
+    "elements.dead_zone elements.saturation elements.table elements.table_integral elements.gear elements.rope_over_pulley elements.belt "
+    "elements.lossy_joint",
     "At one state": "acceleration results.Acceleration mass_matrix momentum energy constraint_jacobian constraint_residual "
     "constraint_force powers results.Residual consistent_state examine results.Examination results.Surface",
     "Motions": "simulate simulate_many results.Trajectory results.FrictionState results.ContactState results.EventState "

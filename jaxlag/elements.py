@@ -1,7 +1,9 @@
-"""Ready parts of machines whose forces jump or bend: springs with play, end stops, dead zones, saturation, curves from a table.
+"""Ready parts of machines whose forces jump or bend: springs with play, end stops, dead zones, saturation, curves from a table; and
+what is lost in gears, belts, ropes and joints by the forces in them.
 
 Potentials V(x) are subtracted in L, forces are returned by functions of `force`. Where they jump or bend is located (`jl.surfaces`), so
-that the motion, and its derivatives by where that is, are exact. Any consistent units.
+that the motion, and its derivatives by where that is, are exact. Losses D are terms of `dissipation`; they are exact dry friction, which
+sticks. Any consistent units.
 """
 
 from typing import Any, TypeAlias
@@ -9,6 +11,8 @@ from typing import Any, TypeAlias
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float, Real
+
+from .dissipation import speed
 
 Number: TypeAlias = Real[ArrayLike, "..."]
 Value: TypeAlias = Float[Array, "..."]
@@ -206,6 +210,122 @@ def table_integral(x: Number, xs: Any, ys: Any) -> Value:
     left, inside = jnp.maximum(i - 1, 0), (i > 0) & (i < xs.size)
     s = x - xs[left]
     return before[left] + s * ys[left] + jnp.where(inside, slopes[jnp.minimum(left, xs.size - 2)], 0.0) * s**2 / 2
+
+
+def gear(v: Number, force: Number, efficiency: Number, back: Number) -> Value:
+    r"""Loss of a gear, a screw or a worm, by the force that it transmits: one efficiency where it drives, another where it is driven back.
+
+    $$ D = \mu_1 |\lambda v| \ \text{ where } \lambda v < 0, \qquad \mu_2 |\lambda v| \ \text{ where } \lambda v > 0, \qquad
+    \mu_1 = \tfrac{1}{\eta_1} - 1,\quad \mu_2 = 1 - \eta_2 $$
+
+           M₁ →  (q₁)==mesh: q₁ − i q₂ = 0==(q₂)  → M₂        drives:       M₂ = η₁ i M₁
+                      force on q₁: λ                           driven back:  M₁ = η₂ M₂ / i,  0 where η₂ ≤ 0
+
+    The ratio i stands in a constraint, the inertias in L. With η₂ ≤ 0 the gear locks itself: no load moves it, however large. Of a worm
+    with friction alone η₂ = 2 − 1/η₁.
+
+    **Arguments:** `v`, velocity of the driving side; `force`, λ, of the mesh on the driving side, positive along v: the multiplier of
+    q₁ − i q₂ = 0; `efficiency`, η₁, in (0, 1]; `back`, η₂, at most 1.
+
+    **Returns:** a term of `dissipation`, by which the mesh sticks, too.
+
+    **Source:** Pelchen, Schweiger & Otter, Modeling and simulating the efficiency of gearboxes and of planetary gearboxes, 2nd Modelica
+    Conference (2002) 257-266.
+
+    ```python
+    import jaxlag as jl
+    from jaxlag import elements
+    hoist = jl.System(
+        lambda qdot, J_1, J_2: 0.5 * J_1 * qdot["motor"] ** 2 + 0.5 * J_2 * qdot["drum"] ** 2,
+        force=lambda t, M, load: {"motor": M, "drum": -load},
+        dissipation=lambda qdot, multipliers, eta, back: elements.gear(qdot["motor"], multipliers["mesh"], eta, back),
+        holonomic={"mesh": lambda q, i: q["motor"] - i * q["drum"]},
+    )
+    ```
+    """
+    driving, driven = 1 / jnp.asarray(efficiency) - 1, 1 - jnp.asarray(back)
+    return 0.5 * (driving + driven) * jnp.abs(force) * jnp.abs(v) - 0.5 * (driving - driven) * force * v
+
+
+def rope_over_pulley(v: Number, tension: Number, mu: Number, angle: Number) -> Value:
+    r"""Loss of a rope that slides over a fixed drum, a bollard or a pulley that is stuck (Euler and Eytelwein).
+
+    $$ T_1 = T_2\, e^{\mu\alpha} \ \text{ where } v > 0, \qquad T_1 = T_2\, e^{-\mu\alpha} \ \text{ where } v < 0 $$
+
+              ___
+             /   \        α, angle of wrap
+            |     |
+        v ↓ |T₁   | T₂
+
+    **Arguments:** `v`, velocity of the rope, positive towards the end 1; `tension`, T₂ ≥ 0, at the other end: minus the multiplier of
+    y₁ + y₂ = ℓ for two ends that hang; `mu`, μ; `angle`, α in radians.
+
+    **Returns:** a term of `dissipation`, by which the rope sticks as long as T₁ and T₂ differ by less.
+
+    **Source:** Euler, Remarques sur l'effet du frottement dans l'équilibre (1769); Popov, Contact Mechanics and Friction, section 10.
+
+    ```python
+    import numpy as np
+    import jaxlag as jl
+    from jaxlag import elements
+    rope = jl.System(
+        lambda q, qdot, m_1, m_2, g: 0.5 * (m_1 * qdot["1"] ** 2 + m_2 * qdot["2"] ** 2) + g * (m_1 * q["1"] + m_2 * q["2"]),
+        dissipation=lambda qdot, multipliers, mu: elements.rope_over_pulley(qdot["1"], -multipliers["rope"], mu, np.pi),
+        holonomic={"rope": lambda q: q["1"] + q["2"]},
+    )
+    ```
+    """
+    passed = jnp.exp(-jnp.asarray(mu) * angle)
+    return gear(v, -jnp.asarray(tension), passed, passed)
+
+
+def belt(slip: Number, T_0: Number, mu: Number, angle: Number) -> Value:
+    r"""Loss of a belt that slips on its pulley: it passes on what two strands of the same pretension can differ by.
+
+    $$ D = 2 T_0 \tanh\!\left(\tfrac12 \mu\alpha\right) |s| $$
+
+    **Arguments:** `slip`, s = r₁ω₁ − r₂ω₂; `T_0`, pretension, half the sum of the tensions of both strands, not negative; `mu`, μ;
+    `angle`, α of the smaller wrap, in radians. Elastic creep is left out: until it slips, the belt is a constraint.
+
+    **Returns:** a term of `dissipation`.
+
+    **Source:** Shigley's Mechanical Engineering Design, 10th ed., section 17-2; T₁ + T₂ = 2 T₀ and T₁ = T₂ exp(μα).
+
+    ```python
+    import numpy as np
+    from jaxlag import elements
+    elements.belt(-0.5, T_0=100.0, mu=0.3, angle=np.pi)  # 2 · 100 · tanh(0.471) · 0.5 = 43.9
+    ```
+    """
+    return 2 * jnp.asarray(T_0) * jnp.tanh(0.5 * jnp.asarray(mu) * angle) * jnp.abs(jnp.asarray(slip))
+
+
+def lossy_joint(omega: Number, force: Number, mu: Number, r: Number) -> Float[Array, ""]:
+    r"""Loss of a pin that rubs in its bearing, by the force that the joint carries.
+
+    $$ D = \mu\, r\, \|\lambda\|\, |\omega| $$
+
+    It stays where the line of the load passes the centre within the friction circle, of radius μ r.
+
+    **Arguments:** `omega`, ω, the angular velocity between both links; `force`, λ, the multipliers of the joint: one number, or an array of
+    those along all directions; `mu`, μ; `r`, radius of the pin.
+
+    **Returns:** a term of `dissipation`.
+
+    **Source:** Shigley & Uicker, Theory of Machines and Mechanisms, section 14.9 (friction circle), with μ for sin(arctan μ).
+
+    ```python
+    import jax.numpy as jnp
+    import jaxlag as jl
+    from jaxlag import elements
+    pendulum = jl.System(
+        lambda q, qdot, m, J, g: 0.5 * m * (qdot["x"] ** 2 + qdot["y"] ** 2) + 0.5 * J * qdot["phi"] ** 2 - m * g * q["y"],
+        dissipation=lambda qdot, multipliers, mu, r: elements.lossy_joint(qdot["phi"], multipliers["pin"], mu, r),
+        holonomic={"pin": lambda q, l: jnp.stack([q["x"] - l * jnp.sin(q["phi"]), q["y"] + l * jnp.cos(q["phi"])])},
+    )
+    ```
+    """
+    return mu * r * speed(jnp.atleast_1d(jnp.asarray(force))) * jnp.abs(jnp.asarray(omega))
 
 
 def _pushing(force: Any) -> Array:

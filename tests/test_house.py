@@ -104,6 +104,7 @@ WINGS = {  # each imports only from those above it, and each file of a wing only
         "load_sharing",
         "slip_direction",
         "stick_slip",
+        "frictional_contact",
         "friction_treatment",
         "contact",
         "impact",

@@ -7,6 +7,7 @@ ordinary one, with or without dry friction, so the rest of the package need not 
 Source: Pfeiffer & Glocker, Multibody Dynamics with Unilateral Contacts, chapters 5 and 6; Glocker, Set-Valued Force Laws, chapter 10.
 """
 
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
@@ -15,13 +16,18 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from .._model.flat import Flat, variant
+from .._program.implicit import implicit_root, open_function
 from .._program.scalarise import scalarised
+from .augmented_inertia import augmented
 from .constrained_acceleration import Impulse, constrained_acceleration
 from .constrained_slip import on_constraints
 from .friction_elements import FrictionElements, find_elements, with_all_masses
-from .lagrange import inertia, position_residual
+from .frictional_contact import Problem, choice, turning
+from .lagrange import constraint_rows, inertia, position_residual
+from .pseudo_inverse import pseudo_inverse
 from .saddle_point import SaddlePoint, reach_of, saddle_point
-from .stick_slip import first_mode, in_mode, sticking
+from .slip_direction import unit, without_force
+from .stick_slip import NEXT, Friction, Mode, ModeSelection, Search, bounds, first_mode, in_mode, sticking
 
 OUTWARDS = 6  # Newton steps that put a start on its obstacle
 ROUNDING = 0.75  # power of eps, what counts as rounding of a gap, its rate, its acceleration and its force
@@ -188,6 +194,15 @@ class Contacts(NamedTuple):
         """The choice of this number, all candidates closed in that of zero."""
         return self._replace(closed=self.candidates & (number & 2 ** np.arange(self.closed.size) == 0))
 
+    def begun(self, selection: ModeSelection, search: Search, friction_in: Callable) -> Search:
+        """The search as it begins."""
+        if not begins_with_choice(selection.flat, selection.elements):
+            return search
+        everywhere = jnp.ones_like(selection.at_rest)
+        sigma = without_force(selection.elements, selection.sigma, everywhere)
+        alone = friction_in(sigma, self._replace(closed=jnp.zeros_like(self.closed)))
+        return from_choice(selection, search, Alone.of(selection.flat, alone))
+
     def unloaded(self, bound: Float[Array, " e"]) -> Bool[Array, " e"]:
         """Which elements no force loads while a contact is open."""
         return (bound == 0) & ~jnp.all(self.closed)
@@ -206,6 +221,71 @@ class Contacts(NamedTuple):
         excess = jnp.where(self.turn > 2 * size, in_order, jnp.where(jnp.any(pull > 0), pull, deeper))
         flips = (jnp.arange(size) == jnp.argmax(excess)) & (excess > 0)
         return self._replace(closed=self.closed ^ flips, turn=self.turn + 1), jnp.any(flips), departs
+
+
+def begins_with_choice(flat: Flat, elements: FrictionElements | None) -> bool:
+    """Whether a search for the mode begins with a `choice`: where friction of contacts has directions."""
+    return bool(flat.contacts) and elements is not None and bool(np.any(elements.is_vector)) and not flat.massless
+
+
+class Alone(NamedTuple):
+    """Accelerations without contacts and friction, or velocities of an impact; the multipliers of other constraints; slip rates."""
+
+    x: Float[Array, " n"]
+    multipliers: Float[Array, " m"]
+    slip_rate: Float[Array, " r"]
+
+    @classmethod
+    def of(cls, flat: Flat, found: Friction) -> "Alone":
+        """That which was found with all contacts open and no friction."""
+        return cls(found.qddot, found.multipliers[: flat.rows], found.slip_rate)
+
+
+def from_choice(selection: ModeSelection, search: Search, alone: Alone) -> Search:
+    """A search for the mode from a `choice`; as it was, where none is found."""
+    problem, rounding = _condensed(selection, search.contacts, alone)
+    chosen = choice(problem)
+    contacts, mode = search.contacts._replace(closed=chosen.closed), search.mode._replace(sigma=chosen.sigma)
+    scale = chosen.scale + 1e8 * selection.elements.norms(rounding)  # of the scale of slip rates 1e-6 is next to nothing
+    onward = Search(jnp.array(NEXT), contacts, mode, *search[3:-1], scale)
+    return jax.tree.map(lambda new, old: jnp.where(chosen.found, new, old), onward, search)
+
+
+def turned_with(selection: ModeSelection, mode: Mode, contacts: Contacts, alone: Alone) -> Float[Array, " r"]:
+    """σ of the mode that was found, with the derivative of what begins to slip by it; what that follows from is asked for with it alone."""
+    given = jax.lax.stop_gradient(mode.sigma)
+
+    def turned():
+        begins = jax.lax.stop_gradient((mode.bound != 0) & ~mode.held)
+        return turning(_condensed(selection, contacts, alone)[0], contacts.closed, given, begins)
+
+    opened, within = open_function(turned)
+    return implicit_root(lambda within, sigma: sigma - opened(*within), lambda within, sigma, left: -left, within, given)
+
+
+def _condensed(selection: ModeSelection, contacts: Contacts, alone: Alone) -> tuple[Problem, Float[Array, " r"]]:
+    """The forces of contacts and friction, and what of the slip rates alone is rounding."""
+    flat, elements, t, q, v, at_rest = (getattr(selection, name) for name in ("flat", "elements", "t", "q", "v", "at_rest"))
+    count = len(flat.contacts)
+    rows = flat.rows_of_bilateral + np.arange(count)
+    _, G, _ = constraint_rows(in_contact(flat, jnp.ones(count, bool)), t, q, v)
+    of_slip = jax.jacfwd(elements.slip, argnums=2)(t, q, v)
+    A, G = jnp.concatenate([G[rows], of_slip]), G[: flat.rows].at[rows].set(0)
+    M = augmented(inertia(flat, t, q, v).as_matrix(), G)[0]
+    free, held = jnp.split(jnp.linalg.solve(M, jnp.concatenate([A, G]).T), [len(A)], axis=1)
+    of_others = -pseudo_inverse(G @ held) @ (G @ free) if flat.rows > count else jnp.zeros_like(G @ free)
+    b = jnp.concatenate([departures(flat, t, q, v, alone.x, selection.impulse), alone.slip_rate])
+    slip = elements.slip(t, q, v)
+    keeps = at_rest | (elements.norms(slip) == 0)
+    sigma = jnp.where(keeps[elements.element_of_row], selection.sigma, unit(elements, slip))
+
+    def bound(forces):
+        multipliers = (alone.multipliers + of_others @ forces).at[rows].set(forces[:count])
+        return bounds(elements, sigma, t, q, v, multipliers)
+
+    W, among = A @ (free + held @ of_others), (elements.element_of_row, bound, at_rest, selection.breaking & at_rest, sigma)
+    rounding = jnp.finfo(v.dtype).eps * (jnp.abs(of_slip) @ jnp.abs(alone.x))
+    return Problem(W, b, contacts.candidates, *among, contacts.acceleration), rounding
 
 
 def accelerated(flat: Flat, t, q, v, impulse: Impulse | None = None) -> SaddlePoint:

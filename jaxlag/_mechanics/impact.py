@@ -19,12 +19,24 @@ from jaxtyping import Array, Bool, Float
 from .._model.flat import Flat, rows_by_name
 from .constrained_acceleration import Impulse
 from .constrained_slip import on_constraints
-from .contact import ROUNDING, Contacts, accelerated, contact_rows, gap_rates, in_contact, select_closed
+from .contact import (
+    ROUNDING,
+    Alone,
+    Contacts,
+    accelerated,
+    begins_with_choice,
+    contact_rows,
+    gap_rates,
+    in_contact,
+    select_closed,
+    turned_with,
+)
 from .friction_elements import FrictionElements, with_all_masses
 from .friction_treatment import Regularised, StickSlip
 from .lagrange import constraint_rows
 from .massless import inertial_part
-from .stick_slip import Friction, bounds, friction, friction_by_term, select_mode
+from .slip_direction import without_force
+from .stick_slip import Friction, ModeSelection, bounds, friction, friction_by_term, select_mode
 
 RISE = 1e-9  # of the energy exchanged, by which an impact may raise it by rounding
 
@@ -110,8 +122,12 @@ def _phase(flat, elements, t, q, v, near, impulse: Impulse, loose=None, least=No
     everywhere, still = jnp.ones(of_impact.size, bool), jnp.zeros(of_impact.element_of_row.size, v.dtype)
     contacts = Contacts.of(momentum, t, q, v, near, loose, least, impulse)
     mode, contacts = select_mode(momentum, of_impact, t, q, v, still, everywhere, ~everywhere, contacts, impulse=impulse)
-    closed = contacts.applied_to(momentum)
-    found = friction(closed, on_constraints(closed, of_impact, t, q, v), mode.sigma, t, q, v, impulse=impulse)
+    rubbed = lambda closed, sigma: friction(closed, on_constraints(closed, of_impact, t, q, v), sigma, t, q, v, impulse=impulse)
+    if begins_with_choice(momentum, of_impact):
+        alone = rubbed(in_contact(momentum, jnp.zeros_like(near)), without_force(of_impact, still, everywhere))
+        selection = ModeSelection(momentum, of_impact, t, q, v, still, everywhere, ~everywhere, impulse)
+        mode = mode._replace(sigma=turned_with(selection, mode, contacts, Alone.of(momentum, alone)))
+    found = rubbed(contacts.applied_to(momentum), mode.sigma)
     rubbing = Rubbing(elements, of_impact, mode.sigma, mode.held, found)
     return phase_behind(flat, rubbing, t, q, v, impulse, (found.qddot, found.multipliers), mode.consistent)
 
@@ -161,7 +177,7 @@ def no_impact(flat: Flat, elements: FrictionElements | None, v) -> Impact:
     return Impact(v, jnp.zeros(len(flat.contacts), v.dtype), {name: none for name in (*rows_by_name(flat), *terms)}, yes, yes, yes)
 
 
-def check_impacts(flat: Flat, elements: FrictionElements | None, treatment: StickSlip | Regularised) -> None:
+def check_impacts(flat: Flat, treatment: StickSlip | Regularised) -> None:
     """Refuses friction whose impulses are not solved for."""
     if not flat.needs_multipliers:
         return
@@ -169,11 +185,6 @@ def check_impacts(flat: Flat, elements: FrictionElements | None, treatment: Stic
         raise ValueError(
             "`friction` must be `StickSlip()` where contacts rub, whose impacts take the impulses for the forces, but is `Regularised`. "
             "Leave it out."
-        )
-    if elements is not None and np.any(elements.is_vector):
-        raise ValueError(
-            "`dissipation` must rub along single directions where an impact may multiply its normal force, but holds the norm of a slip "
-            "velocity of several components, whose direction in an impact is not solved for. Move in a plane, or leave out `unilateral`."
         )
 
 
@@ -194,7 +205,8 @@ def of_impulses(flat: Flat, elements: FrictionElements | None, t, q, v, impulse:
 
     potentials = {name: impulsive(D) for name, D in elements.potentials.items()}
     forces = {name: _either(impulse, lambda *_: nothing, Q) for name, Q in flat.forces.items()}
-    near_rest = impulse.instead(lambda: jnp.zeros_like(elements.near_rest), lambda: elements.near_rest)
+    everything = jnp.full(elements.size, jnp.finfo(v.dtype).max ** 0.5)  # friction is along the slip behind the impact
+    near_rest = impulse.instead(lambda: everything, lambda: jnp.broadcast_to(elements.near_rest, everything.shape))
     return flat._replace(dissipations={}, forces=forces), elements._replace(potentials=potentials, near_rest=near_rest)
 
 

@@ -54,8 +54,9 @@ def self_consistent(reaction: Callable, unit: Float[Array, " m"]) -> Float[Array
 
 
 def _slope(reaction: Callable, x: Float[Array, " m"]) -> Float[Array, "m m"]:
-    """1 − ∂r/∂λ."""
-    return jnp.eye(x.size, dtype=x.dtype) - jax.jacfwd(reaction)(x)
+    """1 − ∂r/∂λ; where r has no slope, as √(λ₁² + λ₂²) at λ = 0, it is taken as zero, as that of |λ| is."""
+    slope = jax.jacfwd(reaction)(x)
+    return jnp.eye(x.size, dtype=x.dtype) - jnp.where(jnp.isnan(slope), 0, slope)
 
 
 def _by_newton(reaction: Callable, unit: Float[Array, " m"], start: Float[Array, " m"] | None = None) -> Float[Array, " m"]:

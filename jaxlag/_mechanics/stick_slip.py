@@ -217,6 +217,10 @@ class NoContact(NamedTuple):
         """The system with those that are closed."""
         return flat
 
+    def begun(self, selection: Any, search: Any, friction_in: Callable) -> Any:
+        """The search as it begins."""
+        return search
+
     def unloaded(self, bound: Float[Array, " e"]) -> Bool[Array, " e"]:
         """Which elements no open contact loads."""
         return jnp.zeros(bound.size, bool)
@@ -411,7 +415,8 @@ def select_mode(
         return selection.next(search, *found)
 
     # Nothing here is differentiated, so that the loop may end by itself: a motion behind many jumps of an input takes a tenth less.
-    done = undifferentiated(lambda: jax.lax.while_loop(lambda search: search.stage != DONE, turn, selection.start(contacts)))()
+    start = lambda: contacts.begun(selection, selection.start(contacts), friction_in)
+    done = undifferentiated(lambda: jax.lax.while_loop(lambda search: search.stage != DONE, turn, start()))()
     return done.mode, done.contacts
 
 

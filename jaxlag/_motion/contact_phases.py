@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from .._mechanics.constrained_acceleration import Impulse
-from .._mechanics.contact import Contacts, gap_rates, roundings_beside, scales_of
+from .._mechanics.contact import Alone, Contacts, begins_with_choice, from_choice, gap_rates, roundings_beside, scales_of, turned_with
 from .._mechanics.friction_elements import FrictionElements
 from .._mechanics.impact import Phase, Rubbing, of_compression, of_expansion, of_impulses, phase_behind, together
 from .._mechanics.slip_direction import without_force
@@ -23,6 +23,7 @@ from .._mechanics.stick_slip import Friction, ModeSelection
 from .._mechanics.stick_slip import Search as ModeSearch
 from .._model.flat import rows_by_name
 from .._program.conditions import zeros_like
+from .._program.implicit import undifferentiated
 from .mode_changes import Touch, behind_impact, friction_at, resting_at, touching_at, with_closed
 from .state_vector import Parts
 from .step_machine import Step
@@ -34,7 +35,8 @@ MOTION, COMPRESSION, EXPANSION = range(3)
 
 class Change(NamedTuple):
     """Where modes end: the phase, of an impact or of none; y on its way to the next mode; which modes have ended, and what slip is rounding
-    of the time; what touches; the impact that is asked about, how much of it is rounding, and what it has done so far.
+    of the time; what touches; the impact that is asked about, how much of it is rounding, and what it has done so far; where friction has
+    directions, the motion without contacts and friction, and σ behind the impact, both as they move.
     """
 
     phase: Any
@@ -45,6 +47,8 @@ class Change(NamedTuple):
     impulse: Impulse
     loose: Float[Array, "2 c"]
     total: Phase
+    alone: Alone | None
+    sigma: Float[Array, " r"]
 
     @property
     def is_impact(self) -> Bool[Array, ""]:
@@ -75,8 +79,17 @@ class ContactStep(Step):
         terms = (*rows_by_name(flat), *(friction.rows_of_term if elements else ()))
         zero, yes = jnp.zeros((), y.dtype), jnp.array(True)
         total = Phase(y[: self.equations.size], number, dict.fromkeys(terms, zero), yes, yes, zero, zero)
-        loose = jnp.stack([number, number])
-        return Change(jnp.array(MOTION), y, jnp.zeros(modes, bool), jnp.zeros(modes, y.dtype), touch, self.no_impulse, loose, total)
+        loose, alone, sigma = jnp.stack([number, number]), None, jnp.zeros(self.equations.rows, y.dtype)
+        if self.begins_with_choice:
+            alone = Alone(y[: self.equations.size], jnp.zeros(flat.rows, y.dtype), sigma)
+        no = jnp.zeros(modes, bool), jnp.zeros(modes, y.dtype)
+        return Change(jnp.array(MOTION), y, *no, touch, self.no_impulse, loose, total, alone, sigma)
+
+    @property
+    def begins_with_choice(self) -> bool:
+        """Whether a mode is looked for from a `choice`."""
+        flat, elements = self.contents(self.t0, self.equations.parts(self.y0))
+        return begins_with_choice(flat, elements if self.equations.elements else None)
 
     def new_search(self, y, t) -> ModeSearch:
         none = jnp.zeros(self.equations.elements, bool)
@@ -99,12 +112,14 @@ class ContactStep(Step):
         search, kind = turn.choice.search, turn.kind
         selection, there = self._selection_in(turn)
         moving = self.equations.parts(turn.change.y)
-        q, v = jax.tree.map(
-            lambda of_all, of_search: jnp.where(kind == STRIKE, of_all, of_search), (moving.q, moving.v), (there.q, there.v)
+        moves = (kind == STRIKE) | (kind == ALONE) & self.begins_with_choice
+        q, v = (
+            jnp.where(moves, _with_motion_of(all, of_search), of_search) for all, of_search in ((moving.q, there.q), (moving.v, there.v))
         )
         freed, *_ = selection.kinds(search)
         alone, none = (kind == ALONE) & jnp.ones_like(freed), jnp.zeros_like(there.closed)
-        sigma = without_force(selection.elements, search.mode.sigma, jnp.where(kind == STRIKE, False, freed | alone))
+        sigma = jnp.where(kind == STRIKE, turn.change.sigma, search.mode.sigma) if self.begins_with_choice else search.mode.sigma
+        sigma = without_force(selection.elements, sigma, jnp.where(kind == STRIKE, False, freed | alone))
         closed, sign = jnp.where(kind == ALONE, none, search.contacts.closed), beyond(there.sign, turn.choice.passed)
         there = moving._replace(q=q, v=v, closed=closed, sign=sign)
         return lambda k: there._replace(sigma=self.changed(sigma, k)).y
@@ -117,6 +132,14 @@ class ContactStep(Step):
         v, sigma = (jnp.where(change.is_impact, a, b) for a, b in ((parts.v, there.v), (jnp.zeros_like(parts.sigma), parts.sigma)))
         impulse = jax.lax.stop_gradient(impulse._replace(happens=change.is_impact))
         return dataclasses.replace(selection, v=v, sigma=sigma, impulse=impulse), there._replace(v=v)
+
+    def _moving(self, selection: ModeSelection, turn: Turn) -> ModeSelection:
+        """The same of the phase that is asked about, as it moves with all that it depends on."""
+        change, parts = turn.change, self.equations.parts(turn.change.y)
+        v, impulse = _with_motion_of(parts.v, selection.v), change.impulse._replace(happens=change.is_impact)
+        flat, elements = of_impulses(*self.contents(turn.end, parts), turn.end, parts.q, v, impulse)
+        assert elements is not None  # as many as there are
+        return dataclasses.replace(selection, flat=flat, elements=elements, t=turn.end, q=parts.q, v=v, impulse=impulse)
 
     def ended(self, turn: Turn, last, parts: Parts, elements: FrictionElements, found: Friction, ended, moved) -> Decision:
         """After the last of Newton's steps: what is struck, and is put there."""
@@ -136,7 +159,7 @@ class ContactStep(Step):
         nothing = zeros_like(turn.change.total)._replace(v=parts.v, consistent=jnp.array(True), impulsive=jnp.array(True))
         loose = jnp.zeros_like(turn.change.loose)
         phase = jnp.where(is_impact, COMPRESSION, MOTION)
-        change = Change(phase, parts.y, ended, moved, touch, impulse, loose, nothing)
+        change = Change(phase, parts.y, ended, moved, touch, impulse, loose, nothing, turn.change.alone, turn.change.sigma)
         change = jax.tree.map(lambda new, old: jnp.where(last, new, old), change, turn.change)
         search = jax.tree.map(lambda new, old: jnp.where(last, new, old), self.new_search(parts.y, turn.end), turn.choice.search)
         turn = turn._replace(kind=jnp.where(last, ALONE, turn.kind), first=jnp.where(last, 0, turn.first), change=change)
@@ -183,6 +206,9 @@ class ContactStep(Step):
         force, acceleration = jax.lax.stop_gradient(scales_of(*given))
         force, acceleration = jnp.where(loose > 0, -force - loose, force), jnp.maximum(acceleration, least)
         search = selection.start(Contacts(candidates, candidates, jnp.array(0), force, acceleration))
+        if self.begins_with_choice:
+            turn = turn._replace(change=change._replace(alone=Alone.of(flat, point.friction)))
+            search = undifferentiated(lambda: from_choice(self._moving(selection, turn), search, turn.change.alone))()
         cut = turn.split.cut
         cut = cut._replace(usable=cut.usable & (change.is_impact | fine))
         turn = turn._replace(choice=turn.choice._replace(search=search), split=turn.split._replace(cut=cut))
@@ -199,6 +225,10 @@ class ContactStep(Step):
         contacts = search.contacts._replace(impulse=None)
         turn = turn._replace(choice=turn.choice._replace(search=search._replace(contacts=contacts), found=found))
         parts = self.in_mode(turn, selection.elements, search)
+        if self.begins_with_choice:
+            sigma = turned_with(self._moving(selection, turn), search.mode, search.contacts, change.alone)
+            change = change._replace(sigma=sigma)
+            turn, parts = turn._replace(change=change), parts._replace(sigma=jnp.where(change.is_impact, parts.sigma, sigma))
         modes = {"sigma": parts.sigma, "held": parts.held, "transitions": parts.transitions, "sign": parts.sign}
         parts = with_closed(turn.end, equations.parts(change.y)._replace(**modes), change.touch, contacts.closed)
         goes_on, strikes, cut = done & ~change.is_impact, done & change.is_impact, turn.split.cut
@@ -233,3 +263,8 @@ class ContactStep(Step):
         change = change._replace(phase=phase, y=y, impulse=expansion, loose=loose, total=total)
         turn = turn._replace(kind=jnp.array(ALONE), first=jnp.array(0), change=change)
         return Decision(turn, jnp.array(False), t, y)
+
+
+def _with_motion_of(moving: Array, values: Array) -> Array:
+    """The same values, which move as others do."""
+    return values + moving - jax.lax.stop_gradient(moving)

@@ -85,7 +85,7 @@ class EquationsOfMotion:
         alone = dataclasses.replace(alone, sided=sided, events=len(levels), levels=levels)
         elements = formulation.friction.elements(alone.flat_at(params, at))
         if system.unilateral:
-            check_impacts(alone.flat_at(params, at), elements, formulation.friction)
+            check_impacts(alone.flat_at(params, at), formulation.friction)
         if elements is None:
             return alone
         found = dataclasses.replace(alone, rows=elements.element_of_row.size, elements=elements.size)

@@ -184,12 +184,12 @@ def states_at(
 
 def begins_in_steps(equations: FirstOrderSystem, options: SolverOptions, params: PyTree, reverse: bool) -> bool:
     """Whether the first step finds the mode of friction and contact at the start, by the evaluation of all others: not where slip begins in
-    a plane, whose direction turns with all that it depends on, nor where events may happen there.
+    a plane without contacts, whose direction turns with all that it depends on, nor where events may happen there.
     """
     if not isinstance(equations, EquationsOfMotion) or (options.adjoint and not has_nodes(equations, params)):
         return False
     one = has_one_evaluation(equations, options.solver, reverse)
-    return one and equations.rows == equations.elements and not may_be_due(equations)
+    return one and bool(equations.rows == equations.elements or equations.contacts) and not may_be_due(equations)
 
 
 def in_rows(equations: EquationsOfMotion, options: SolverOptions, params: PyTree, reverse: bool) -> bool:

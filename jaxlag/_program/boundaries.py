@@ -10,7 +10,7 @@ from jaxtyping import Array, Float
 
 from .choices import SMOOTH, is_own
 from .primitives import ANY_CALL, BENDS, CALLS, CHOOSING, EDGES, JUMPS, MOVEMENTS, ORDER, STEPS
-from .walker import called_program, primitive_names, walk, without_unused
+from .walker import called_program, name_in_jax, primitive_names, walk, without_unused
 
 Marks = frozenset[str]
 PERIODIC = frozenset(["remainder", "fmod", "floor_divide"])  # of NumPy: they jump at multiples of their second operand
@@ -98,10 +98,10 @@ class _Reader:
 
     def _called(self, equation, operands, line, quiet):
         """What a call returns, with the derivative rule that it may have."""
-        program = called_program(equation)
-        called = str(equation.params.get("name") or program.jaxpr.debug_info.func_name)
+        program, called = called_program(equation), name_in_jax(equation)
         given = operands[len(operands) - len(program.jaxpr.invars) :]
-        jumps = (called in PERIODIC or called == SEARCH) and self.counts(_all(given), False)
+        is_periodic = called in PERIODIC and len(given) == 2 and "rem" in primitive_names(program)  # no linear part of it
+        jumps = (is_periodic or called == SEARCH) and self.counts(_all(given), False)
         if jumps and not (quiet or is_own(line)):
             if called == SEARCH:
                 self._look_in_table(*given, self._bound(equation, operands)[0])

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jax.extend import source_info_util
 
 from .primitives import ANY_CALL, CALLS, CHOOSING, EQUALITIES, LOOKUPS, NAMES_IN_NUMPY
-from .walker import called_program, columns_of_branches, parts_of_scan, walk
+from .walker import called_name, called_program, columns_of_branches, name_in_jax, parts_of_scan, walk
 
 PACKAGE = pathlib.Path(__file__).parents[1]
 OWN, LENT = str(PACKAGE), (str(PACKAGE / "elements.py"), str(PACKAGE / "examples"))  # and what stands for code of the user's
@@ -75,10 +75,10 @@ def _evaluated(equation: Any, operands: list[Value], within: _Call | None) -> Se
 
     if name in ANY_CALL:
         program = called_program(equation)
-        called = str(params.get("name") or program.jaxpr.debug_info.func_name).strip("_<>")
+        called = called_name(equation).strip("_<>")
         inner = _Call(here.what or (called if called != "lambda" else None), here.line)
         given = operands[len(operands) - len(program.jaxpr.invars) :]
-        if called in SMOOTH:
+        if name_in_jax(equation) in SMOOTH:
             return [found] * len(equation.outvars)
         outputs = _walked(program, given, inner)
         return outputs if name in CALLS else [value._replace(marks=value.marks | found.marks) for value in outputs]  # a rule may see more

@@ -8,7 +8,7 @@ import numpy as np
 from jax.extend import core
 
 from .primitives import ANY_CALL, SIGN_OF_ZERO, STRICT, ZERO_UNSIGNED
-from .walker import called_program, programs_within
+from .walker import called_program, name_in_jax, programs_within
 
 
 def equations_with_signed_zeros(program: Any) -> frozenset[int]:
@@ -41,7 +41,7 @@ def _chosen_where_not_zero(equation: Any, compared: dict) -> Any:
     """x of a choice like `where(x > 0, x, 1)`; None of other equations."""
     if equation.primitive.name == "select_n":
         which, *_, x = equation.invars
-    elif equation.params.get("name") == "_where" and len(equation.invars) == 3:  # NumPy's
+    elif equation.primitive.name in ANY_CALL and name_in_jax(equation) == "where" and len(equation.invars) == 3:  # NumPy's
         which, x, _ = equation.invars
     else:
         return None

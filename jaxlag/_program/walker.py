@@ -4,6 +4,7 @@
 intervals, sums of matrix products, numbers of quantities) and what an equation does with them is left to the caller.
 """
 
+import pathlib
 from collections.abc import Callable, Container, Iterable, Iterator, Sequence
 from typing import Any
 
@@ -13,6 +14,8 @@ from jax.extend import core
 from jax.interpreters import partial_eval as pe
 
 from .primitives import CALLS as CALLS
+
+IN_JAX = str(pathlib.Path(jax.__file__).parent)
 
 
 def walk(
@@ -69,6 +72,16 @@ def is_call_of(equation: Any, function: Callable) -> bool:
     given = [jax.ShapeDtypeStruct(v.aval.shape, v.aval.dtype, weak_type=v.aval.weak_type) for v in equation.invars]
     own = jax.make_jaxpr(function)(*given).jaxpr.eqns
     return len(own) == 1 and str(own[0].params["jaxpr"]) == str(equation.params.get("jaxpr"))
+
+
+def called_name(equation: Any) -> str:
+    """The name of the function that is called."""
+    return str(equation.params.get("name") or called_program(equation).jaxpr.debug_info.func_name)
+
+
+def name_in_jax(equation: Any) -> str | None:
+    """The name of the function that is called if it is one of JAX itself, not one of the user's with the same name."""
+    return called_name(equation).strip("_<>") if IN_JAX in called_program(equation).jaxpr.debug_info.func_src_info else None
 
 
 def branch_index(index: Any, params: dict) -> int:

@@ -15,6 +15,22 @@ def found(function, q, v=0.3):
     return boundaries(function, counts, (jnp.asarray(q), "q"), (jnp.asarray(v), "v"))
 
 
+@jax.jit
+def remainder(q, place):
+    """One of a user's own that has the name of one of NumPy."""
+    return jnp.maximum(q - place, 0.0)
+
+
+@jax.jit
+def searchsorted(q, place):
+    return jnp.minimum(q, place)
+
+
+@jax.jit
+def hypot(q, place):
+    return jnp.minimum(q, place)
+
+
 CASES = {  # the zeros of what was found, in [-2.2, 2.2]
     "where": (lambda q, v: jnp.where(q > 0.2, v, 2 * v), [0.2]),
     "once": (lambda q, v: jnp.maximum(q - 0.2, 0) + jnp.where(q <= 0.2, v, 0) + jax.nn.relu(q - 0.2) + jnp.minimum(0.2, q), [0.2]),
@@ -30,6 +46,8 @@ CASES = {  # the zeros of what was found, in [-2.2, 2.2]
     "of arrays": (lambda q, v: jnp.sum(jnp.maximum(q - jnp.asarray(PLACES), 0)), PLACES),
     "of logic": (lambda q, v: jnp.where((q > 1) | ~(q > -1), v, 0), [-1, 1]),
     "smooth": (lambda q, v: jnp.hypot(q, v) + jax.nn.softplus(q) + jnp.where(q == 0, 0, q) + jnp.sinc(q), []),
+    "of the same names": (lambda q, v: remainder(q, 0.3) + hypot(q, 0.7) + searchsorted(q, 1.3), [0.3, 0.7, 1.3]),
+    "of a slope": (lambda q, v: jax.linearize(lambda q: jnp.fmod(q, 0.7) * q, q)[1](v), [-2.1, -1.4, -0.7, 0, 0.7, 1.4, 2.1]),
     "by others": (lambda q, v: jnp.maximum(q, v) + jnp.where(v > 0, q, 0), []),
 }
 
