@@ -283,7 +283,7 @@ def _condensed(selection: ModeSelection, contacts: Contacts, alone: Alone) -> tu
         multipliers = (alone.multipliers + of_others @ forces).at[rows].set(forces[:count])
         return bounds(elements, sigma, t, q, v, multipliers)
 
-    W, among = A @ (free + held @ of_others), (elements.element_of_row, bound, at_rest, selection.breaking & at_rest, sigma)
+    W, among = A @ (free + held @ of_others), (elements, bound, at_rest, selection.breaking & at_rest, sigma)
     rounding = jnp.finfo(v.dtype).eps * (jnp.abs(of_slip) @ jnp.abs(alone.x))
     return Problem(W, b, contacts.candidates, *among, contacts.acceleration), rounding
 

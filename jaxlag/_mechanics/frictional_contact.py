@@ -18,6 +18,8 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from .._program.implicit import implicit_root, open_function, undifferentiated
+from .friction_elements import FrictionElements
+from .slip_direction import unit
 
 TURNS = 20  # of Newton's method: five on the average, and 12 for two contacts at most
 ROUNDS = 6  # of plain iterations, each three times as many as before
@@ -28,14 +30,14 @@ BREAKS = 1e-7  # of its bound, by how much it is lowered where an element is kno
 
 
 class Problem(NamedTuple):
-    """W and b, gaps first; `candidates` for closing; the element of each row of slip; F(Λ); which elements are `at_rest`, the others slip
+    """W and b, gaps first; `candidates` for closing; the elements of friction; F(Λ); which elements are `at_rest`, the others slip
     along σ; which of those at rest are known to break away.
     """
 
     W: Float[Array, "k k"]
     b: Float[Array, " k"]
     candidates: Bool[Array, " c"]
-    of: np.ndarray
+    elements: FrictionElements
     bound: Callable[[Float[Array, " k"]], Float[Array, " e"]]
     at_rest: Bool[Array, " e"]
     breaking: Bool[Array, " e"]
@@ -57,25 +59,25 @@ def choice(problem: Problem) -> Choice:
     scaled, units = _scaled(problem)
     forces, found = _solution(scaled)
     normal, pull, size, limit = _projected(scaled, forces)
-    slips = jnp.where(problem.at_rest, size > limit, True)
-    way = jnp.where(problem.at_rest[problem.of], -pull / jnp.where(size > 0, size, 1)[problem.of], problem.sigma)
+    elements, of = problem.elements, problem.elements.element_of_row
+    slips = ~problem.at_rest | (size > limit)
+    way = jnp.where(problem.at_rest[of], -unit(elements, pull), problem.sigma)
     b, tangential = jnp.abs(problem.b), units[normal.size :]
     rates = (b + jnp.abs(problem.W) @ jnp.concatenate([normal / units[: normal.size], jnp.zeros_like(tangential)]))[normal.size :]
     departs = (problem.W @ (forces / units) + problem.b)[: normal.size] > problem.rounding
-    sigma, scale = jnp.where(slips[problem.of], way, 0), _norms(problem.of, problem.at_rest.size, rates)
-    return Choice(problem.candidates & ~departs, sigma, scale, found)
+    return Choice(problem.candidates & ~departs, jnp.where(slips[of], way, 0), elements.norms(rates), found)
 
 
 def turning(problem: Problem, closed: Bool[Array, " c"], sigma: Float[Array, " r"], begins: Bool[Array, " e"]) -> Float[Array, " r"]:
     """σ of a solution, which in elements where slip `begins` is that of w_t, and turns with all that the problem depends on."""
     scaled, _ = _scaled(problem._replace(breaking=jnp.zeros_like(problem.breaking)))
-    of, contacts = problem.of, closed.size
-    slips, turns = (_norms(of, begins.size, sigma) > 0)[of], (begins & problem.at_rest)[of]
+    elements, of, contacts = problem.elements, problem.elements.element_of_row, closed.size
+    slips, turns = (elements.norms(sigma) > 0)[of], (begins & problem.at_rest)[of]
     given = jnp.where(problem.at_rest[of], jax.lax.stop_gradient(sigma), problem.sigma)
 
     def way(w):
-        size = _norms(of, begins.size, w[contacts:])[of]
-        return jnp.where(turns & (size > 0), w[contacts:] / jnp.where(size > 0, size, 1), given)
+        slip = w[contacts:]
+        return jnp.where(turns & (elements.norms(slip) > 0)[of], unit(elements, slip), given)
 
     def residual(forces, way):
         w = scaled.W @ forces + scaled.b
@@ -97,16 +99,11 @@ def turning(problem: Problem, closed: Bool[Array, " c"], sigma: Float[Array, " r
     return jnp.where(turns, way(scaled.W @ forces + scaled.b), sigma)
 
 
-def _norms(of: np.ndarray, size: int, rows: Float[Array, " r"]) -> Float[Array, " e"]:
-    squared = jnp.sum(jnp.where(of == np.arange(size)[:, None], rows[None] ** 2, 0), axis=1)
-    return jnp.where(squared > 0, jnp.sqrt(jnp.where(squared > 0, squared, 1)), 0)
-
-
 def _scaled(problem: Problem) -> tuple[Problem, Float[Array, " k"]]:
-    """In units in which the diagonal of W is one, and the same along all directions of an element; and those units."""
-    of, contacts, elements = problem.of, problem.candidates.size, problem.at_rest.size
+    """In units in which W is of order one, the same for all directions of an element, so that discs stay round; and these units."""
+    of, contacts = problem.elements.element_of_row, problem.candidates.size
     diagonal = jnp.diagonal(problem.W)
-    of_elements = jnp.max(jnp.where(of == np.arange(elements)[:, None], diagonal[contacts:][None], 0), axis=1)
+    of_elements = problem.elements.sums(diagonal[contacts:])
     squared = jnp.concatenate([diagonal[:contacts], of_elements[of]])
     units = jnp.sqrt(jnp.where(squared > 0, squared, 1))
     b = problem.b / units
@@ -119,18 +116,18 @@ def _scaled(problem: Problem) -> tuple[Problem, Float[Array, " k"]]:
 
 def _projected(problem: Problem, forces: Float[Array, " k"]) -> tuple[Array, Array, Array, Array]:
     """Of the forces after a step against w: those of contacts, which push; of elements, before they are bounded, ‖·‖, and the bounds."""
-    contacts, (_, b, candidates, of, bound, at_rest, *_) = problem.candidates.size, problem
+    contacts, (_, b, candidates, elements, bound, *_) = problem.candidates.size, problem
     onward = forces - (problem.W @ forces + b)
     normal = jnp.where(candidates, jnp.maximum(onward[:contacts], 0), 0)
     pull = onward[contacts:]
     limit = bound(jnp.concatenate([normal, forces[contacts:]]))
-    return normal, pull, _norms(of, at_rest.size, pull), limit
+    return normal, pull, elements.norms(pull), limit
 
 
 def _map(problem: Problem, forces: Float[Array, " k"]) -> Float[Array, " k"]:
     """What is zero in the solution."""
     normal, pull, size, limit = _projected(problem, forces)
-    of, slips = problem.of, size > limit
+    of, slips = problem.elements.element_of_row, size > limit
     resting = jnp.where(slips[of], pull * (limit / jnp.where(slips, size, 1))[of], pull)
     tangential = jnp.where(problem.at_rest[of], resting, -limit[of] * problem.sigma)
     return forces - jnp.concatenate([normal, tangential])

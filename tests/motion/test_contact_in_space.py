@@ -190,26 +190,31 @@ def test_a_ball_that_bounces_to_rest_rolls_on(unit):
     np.testing.assert_allclose([late[3] - 0.02 * late[7], late[4] + 0.02 * late[6]], 0, atol=1e-14)
 
 
-DIRECTIONS = {"mu": 0, "speed": 1, "spin": 2}
+def changed(x, mu):
+    """μ, velocity and spin at the start by three numbers, which are zero."""
+    return mu + x[0], (1.0 + x[1], 0.5, -1.0), SPIN * jnp.array([1.0, 1.0 + x[2], 1.0])
 
 
-def of_direction(x, mu):
-    return thrown(mu * x[0], 0.5, velocity=(x[1], 0.5, -1.0), spin=SPIN * jnp.array([1.0, x[2], 1.0]), rtol=1e-10, atol=1e-12)
+def thrown_by(x, mu, unit):
+    mu, velocity, spin = changed(x, mu)
+    return thrown(mu, 0.5, unit, velocity=velocity, spin=spin, rtol=1e-10)
 
 
 def slopes_by_hand(mu):
-    by_hand = lambda x: thrown_by_hand(mu * x[0], 0.5, (x[1], 0.5, -1.0), SPIN * np.array([1.0, x[2], 1.0]))
-    return np.stack([(by_hand(1 + h) - by_hand(1 - h)) / 2e-6 for h in 1e-6 * np.eye(3)], axis=1)
+    by_hand = lambda x: (lambda mu, *start: thrown_by_hand(mu, 0.5, *start))(*changed(x, mu))
+    return np.stack([(by_hand(h) - by_hand(-h)) / 2e-6 for h in 1e-6 * np.eye(3)], axis=1)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("mu", [0.02, 0.2])
+@pytest.mark.parametrize("mu", [0.0, 0.02, 0.2])
 def test_derivatives_of_a_bounce(mu):
-    """Friction turns with the slip behind the impact, and derivatives know; forward and reverse."""
-    found = jax.jacfwd(of_direction)(jnp.ones(3), mu)
-    np.testing.assert_allclose(found, slopes_by_hand(mu), rtol=1e-6, atol=1e-7)
-    reverse = jax.grad(lambda x: of_direction(x, mu)[0])(jnp.ones(3))
-    np.testing.assert_allclose(reverse, found[0], rtol=1e-9, atol=1e-12)
+    """Friction turns with the slip behind the impact, and derivatives know: forward and reverse, in any unit, and where there is none."""
+    expected = slopes_by_hand(mu)
+    found = [jax.jacfwd(thrown_by)(jnp.zeros(3), mu, unit) for unit in UNITS]
+    for slopes in found:
+        np.testing.assert_allclose(slopes, expected, rtol=1e-6, atol=1e-7)
+    reverse = jax.grad(lambda x: thrown_by(x, mu, 1.0)[0])(jnp.zeros(3))
+    np.testing.assert_allclose(reverse, found[0][0], rtol=1e-9, atol=1e-12)
 
 
 @pytest.mark.slow
