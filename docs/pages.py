@@ -25,7 +25,8 @@ REFERENCE = {  # names in `jaxlag`
     "rigid.unit rigid.to_quaternion rigid.quaternion_rate rigid.rotation_vector rigid.angular_velocity "
     "rigid.kinetic_energy rigid.frame rigid.Frame rigid.spherical rigid.revolute rigid.prismatic rigid.cylindrical "
     "rigid.universal rigid.fixed rigid.same_axes rigid.on_plane rigid.length rigid.wheel_height rigid.rolling "
-    "rigid.rolling_ball rigid.inertia.box rigid.inertia.cylinder rigid.inertia.hollow_cylinder rigid.inertia.sphere "
+    "rigid.rolling_ball rigid.Touching rigid.sphere_plane rigid.box_plane rigid.capsule_plane rigid.ellipsoid_plane rigid.sphere_sphere "
+    "rigid.inertia.box rigid.inertia.cylinder rigid.inertia.hollow_cylinder rigid.inertia.sphere "
     "rigid.inertia.hollow_sphere rigid.inertia.ellipsoid rigid.inertia.steiner rigid.inertia.rotated "
     "rigid.inertia.principal_axes rigid.inertia.Principal rigid.inertia.matrix rigid.inertia.physical "
     "rigid.inertia.log_cholesky rigid.inertia.Body",

@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from typing import Any
 
+import jax
 import numpy as np
 
 from .._motion.trajectory import Trajectory
@@ -82,6 +83,7 @@ def forces(trajectory: Trajectory, names: Sequence[str] | None = None, *, units:
         if crossings.size or pulled or touches:
             if len(entries) == 1:
                 ax.lines[0].set_label(None)
+            if len(entries) == 1 or touches:  # on the right there are the impulses
                 legend_above(ax)
             else:
                 legend_beside(ax)
@@ -148,13 +150,14 @@ def friction(trajectory: Trajectory, names: Sequence[str] | None = None, *, unit
 
 def _contact(ax, trajectory, name, units):
     """Shades the times at which a contact is closed and draws the impulses of its impacts; returns whether there are any."""
-    ts, contact = np.asarray(trajectory.ts), trajectory.contacts[name]
-    closed = _intervals(ts, contact.closed)
+    ts = np.asarray(trajectory.ts)
+    contact = jax.tree.map(lambda x: np.reshape(x, (ts.size, -1)).T, trajectory.contacts[name])  # gap by gap
+    closed = [interval for of_gap in contact.closed for interval in _intervals(ts, of_gap)]
     for i, interval in enumerate(closed):
-        ax.axvspan(*interval, color=GREY, alpha=0.35, linewidth=0, label=None if i else "closed")
-    impulses, changed = np.diff(contact.impulse), np.asarray(contact.changed)[1:]
-    struck = impulses > 0
-    times = np.where((changed > ts[:-1]) & (changed <= ts[1:]), changed, ts[1:])[struck]
+        ax.axvspan(*interval, color=GREY, alpha=0.35 / len(contact.closed), linewidth=0, label=None if i else "closed")
+    impulses, changed = np.diff(contact.impulse), contact.changed[:, 1:]
+    struck, (before, behind) = impulses > 0, (np.broadcast_to(of, changed.shape) for of in (ts[:-1], ts[1:]))
+    times = np.where((changed > before) & (changed <= behind), changed, behind)[struck]
     if times.size:
         (low, high), top, right = ax.get_ylim(), 1.1 * np.max(impulses[struck]), ax.twinx()
         right.vlines(times, 0, impulses[struck], color=COLOURS[1])

@@ -112,7 +112,7 @@ def _is_finite(M: lx.AbstractLinearOperator) -> Bool[Array, ""]:
 
 def _with_decided_rates(flat: Flat, t, q, v) -> Float[Array, " n"]:
     """q̇ with the velocities that dissipation decides, in the mode of friction that holds there; contacts have no part in them."""
-    flat = in_contact(flat, jnp.zeros(len(flat.contacts), bool))
+    flat = in_contact(flat, jnp.zeros(flat.gap_count, bool))
     elements = find_elements(flat) if flat.massless else None
     mode = flat if elements is None else in_mode(flat, elements, first_mode(flat, elements, t, q, v)[0].sigma)
     return with_first_order_rates(mode, t, q, v).v

@@ -192,6 +192,6 @@ def _pushing(flat: Flat, multipliers):
     """λ, that of an open contact zero and no rounding."""
     if flat.closed is None:
         return multipliers
-    start, end = flat.rows_of_bilateral, flat.rows_of_bilateral + len(flat.contacts)
+    start, end = flat.rows_of_bilateral, flat.rows_of_bilateral + flat.gap_count
     before, of_contacts, behind = jnp.split(multipliers, [start, end])
     return jnp.concatenate([before, jnp.where(flat.closed, of_contacts, 0), behind])

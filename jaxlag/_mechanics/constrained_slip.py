@@ -97,11 +97,14 @@ def _left(flat: Flat, elements: FrictionElements, t, q, v) -> Left:
     of, line = elements.element_of_row, jnp.zeros(elements.size, bool)
     there, seen = size(rest) > eps ** (2 * NOISE) * size(A), jnp.sum(rest**2, axis=1) > eps ** (2 * NOISE) * size(A)[of]
     rest = rest - jax.lax.stop_gradient(jnp.where(seen[:, None], 0, rest))  # no rounding, but what it changes by
-    free = jnp.diag(there[of].astype(v.dtype))  # of a single row all or nothing
-    for e in np.flatnonzero(elements.is_vector):
-        mine = np.flatnonzero(of == e)
-        P, rank = _onto_range(jnp.where(there[e], rest[mine] @ rest[mine].T, 0))
-        free, line = free.at[np.ix_(mine, mine)].set(P), line.at[e].set(rank == 1)
+    count = np.bincount(of)
+    free = jnp.diag(jnp.where((count > 1)[of], 0, there[of]).astype(v.dtype))  # of a single row all or nothing
+    for rows in sorted({*count} - {1}):  # those of as many rows together
+        mine = np.stack([np.flatnonzero(of == e) for e in np.flatnonzero(count == rows)])
+        P, rank = jax.vmap(_onto_range)(jnp.where(there[count == rows][:, None, None], rest[mine] @ rest[mine].mT, 0))
+        places = (np.arange(of.size) == mine[..., None]).astype(v.dtype)
+        free = free + jnp.einsum("eir,eij,ejs->rs", places, P, places)
+        line = line.at[count == rows].set(rank == 1)
     decided = decided - free @ decided
     driven = elements.sums(decided**2) > elements.sums(rounding**2)  # squares, whose bounds over time are close
     return Left(free, line & ~driven, driven)

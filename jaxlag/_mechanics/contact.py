@@ -44,7 +44,7 @@ def in_contact(flat: Flat, closed: Bool[Array, " c"]) -> Flat:
 
 def _in_some_contact(flat: Flat, t, q, v) -> Flat:
     """The system with contacts of which it is not known whether they are closed."""
-    return in_contact(flat, jnp.broadcast_to(t > 0, len(flat.contacts)))
+    return in_contact(flat, jnp.broadcast_to(t > 0, flat.gap_count))
 
 
 def free(flat: Flat) -> Flat:
@@ -53,7 +53,7 @@ def free(flat: Flat) -> Flat:
     def of_all(function):
         def padded(t, q, v, multipliers):
             before, behind = jnp.split(multipliers, [flat.rows_of_bilateral])
-            return function(t, q, v, jnp.concatenate([before, jnp.zeros(len(flat.contacts), q.dtype), behind]))
+            return function(t, q, v, jnp.concatenate([before, jnp.zeros(flat.gap_count, q.dtype), behind]))
 
         return padded
 
@@ -68,7 +68,7 @@ def _free(flat: Flat, t, q, v) -> Flat:
 def contact_rows(flat: Flat, multipliers: Float[Array, " m"]) -> Float[Array, " c"]:
     """Of the multipliers of all rows, those of the contacts."""
     holonomic = flat.rows_of_bilateral
-    return multipliers[holonomic : holonomic + len(flat.contacts)]
+    return multipliers[holonomic : holonomic + flat.gap_count]
 
 
 def gap_rates(flat: Flat, t, q, v) -> Float[Array, " c"]:
@@ -213,7 +213,7 @@ class Contacts(NamedTuple):
         """Other ones, where the friction is `agreed` on and a contact pulls or goes deeper; whether there was any; how all depart. If
         agreement is `hopeless`, what pulls opens as well.
         """
-        size = len(flat.contacts)
+        size = flat.gap_count
         pull = jnp.where(self.closed & (agreed | hopeless), -contact_rows(flat, multipliers) - self.force, -jnp.inf)
         departs = departures(flat, t, q, v, qddot, self.impulse)
         deeper = jnp.where(agreed & self.candidates & ~self.closed, -departs - self.acceleration, -jnp.inf)
@@ -266,7 +266,7 @@ def turned_with(selection: ModeSelection, mode: Mode, contacts: Contacts, alone:
 def _condensed(selection: ModeSelection, contacts: Contacts, alone: Alone) -> tuple[Problem, Float[Array, " r"]]:
     """The forces of contacts and friction, and what of the slip rates alone is rounding."""
     flat, elements, t, q, v, at_rest = (getattr(selection, name) for name in ("flat", "elements", "t", "q", "v", "at_rest"))
-    count = len(flat.contacts)
+    count = flat.gap_count
     rows = flat.rows_of_bilateral + np.arange(count)
     _, G, _ = constraint_rows(in_contact(flat, jnp.ones(count, bool)), t, q, v)
     of_slip = jax.jacfwd(elements.slip, argnums=2)(t, q, v)
@@ -324,7 +324,7 @@ def select_closed(
         qddot, multipliers, _ = accelerated(contacts.applied_to(flat), t, q, v, impulse)
         return contacts.next(flat, t, q, v, qddot, multipliers)[:2]
 
-    most = 4 * len(flat.contacts) + 2 ** min(len(flat.contacts), 10)
+    most = 4 * flat.gap_count + 2 ** min(flat.gap_count, 10)
     start = Contacts.of(flat, t, q, v, candidates, loose, least, impulse), jnp.any(candidates)
     contacts, changes = jax.lax.while_loop(lambda carry: carry[1] & (carry[0].turn < most), turn, start)
     return Chosen(contacts.closed, ~changes)

@@ -37,8 +37,8 @@ class Examination:
     - `smallest_inertia`: the least eigenvalue of M on the motions that the constraints allow.
     - `dissipated`: the least of q̇·∂D/∂q̇ near the state, a power, by term.
     - `time_constants`: 1/|eigenvalue| of the linearised motion, the fastest and the slowest, with the further states held.
-    - `findings`: sentences with the cure. `contacts`: which contacts are closed, by name. `without_inertia`: coordinates whose velocity is
-      decided by dissipation alone; they count as degrees of freedom.
+    - `findings`: sentences with the cure. `contacts`: which are closed, by name, of several gaps an array. `without_inertia`:
+      coordinates whose velocity is decided by dissipation alone; they count as degrees of freedom.
     - `couplings`: from 64 coordinates on, by matrix and term, e.g. ("G", "rods"): how many entries may be nonzero (None if the program is
       too long to be read), and out of how many. The matrices: ∂²L/∂q̇², ∂²L/∂q², ∂²D/∂q̇², and rows of G.
     - `surfaces`: where functions jump or bend by the position, the time or a state: of each the `function`, `what` chooses, the `line`, and
@@ -57,7 +57,7 @@ class Examination:
     time_constants: tuple[float, float]
     findings: tuple[str, ...]
     states: tuple[str, ...] = ()
-    contacts: dict[str, bool] = dataclasses.field(default_factory=dict)
+    contacts: dict[str, bool | np.ndarray] = dataclasses.field(default_factory=dict)
     without_inertia: tuple[str, ...] = ()
     couplings: dict[tuple[str, str], tuple[int | None, int]] = dataclasses.field(default_factory=dict)
     surfaces: tuple[Surface, ...] = ()
@@ -67,7 +67,7 @@ class Examination:
         rows = [
             ("coordinates", ", ".join(self.coordinates)),
             *([("states", ", ".join(self.states))] if self.states else []),
-            *((f"contact {name!r}", "closed" if closed else "open") for name, closed in self.contacts.items()),
+            *((f"contact {name!r}", _which_are_closed(closed)) for name, closed in self.contacts.items()),
             *([("without inertia", ", ".join(self.without_inertia))] if self.without_inertia else []),
             ("degrees of freedom", str(self.degrees_of_freedom)),
             ("constraint rows", f"{self.rows}, of rank {self.rank}"),
@@ -119,15 +119,16 @@ def examine(system: System, q: PyTree, qdot: PyTree, params: PyTree = None, *, t
     rank = G.shape[1] - N.shape[1]
     inertia_on_N = _inertias(M, G, units[:, None] * N, eps, least)
     smallest = float(inertia_on_N[0]) if inertia_on_N.size else float("inf")
-    contacts = {name: bool(closed) for (name, _), closed in zip(system.unilateral, found["closed"], strict=True)}
-    redundant = _redundant_rows(G * units, {name: of for name, of in rows.items() if contacts.get(name, True)}, eps, least)
+    contacts = {name: np.asarray(closed) if np.ndim(closed) else bool(closed) for name, closed in found["closed"].items()}
+    held = {name: of[np.ravel(contacts.get(name, np.ones(len(of), bool)))] for name, of in rows.items()}
+    redundant = _redundant_rows(G * units, held, eps, least)
     largest = lambda named: {name: float(np.max(np.abs(value), initial=0.0)) for name, value in named.items()}
     constants = _time_constants(found, N, units) if np.all(np.isfinite(found["A"])) else (float("nan"), float("nan"))
     numbers = {
         "coordinates": leaf_names(q),
         "degrees_of_freedom": N.shape[1],
         "rank": rank,
-        "rows": G.shape[0] - sum(not closed for closed in contacts.values()),
+        "rows": sum(map(len, held.values())),
         "redundant": redundant,
         "off_position": largest(found["position"]),
         "off_velocity": largest(found["velocity"]),
@@ -156,6 +157,12 @@ def examine(system: System, q: PyTree, qdot: PyTree, params: PyTree = None, *, t
     counts = {of: (None if c.entries == NOT_READ else int(c.entries), int(c.size)) for of, c in coupled.items()}
     numbers |= {"states": states, "contacts": contacts, "without_inertia": light, "couplings": counts, "surfaces": tuple(chosen)}
     return Examination(findings=tuple(found_out), **numbers)
+
+
+def _which_are_closed(closed: bool | np.ndarray) -> str:
+    if not np.ndim(closed):
+        return "closed" if closed else "open"
+    return f"{np.sum(closed)} of {np.size(closed)} gaps closed"
 
 
 def _largest_defect(defects, is_regular, eps):
@@ -213,7 +220,7 @@ def _measure(flat: Flat, t, q, v):
         "M": M,
         "units": units,
         "light": jnp.isin(jnp.arange(q.size), light),
-        "closed": closed,
+        "closed": flat.by_contact(closed),
         "G": G,
         "A": jax.jacfwd(rates)(jnp.concatenate([q, v])),
         "not_affine_in": not_affine_in(flat, t, q, v),

@@ -162,7 +162,7 @@ def phase_behind(flat: Flat, rubbing: Rubbing | None, t, q, v, impulse: Impulse,
 
 def _works(flat, elements, t, q, mean, multipliers, rubbed):
     """Of each impulse, its product with the mean of the rates before and after."""
-    _, G, _ = constraint_rows(in_contact(flat, jnp.ones(len(flat.contacts), bool)), t, q, mean)
+    _, G, _ = constraint_rows(in_contact(flat, jnp.ones(flat.gap_count, bool)), t, q, mean)
     works = {name: multipliers[rows] @ (G[rows] @ mean) for name, rows in rows_by_name(flat).items()}
     if elements is None:
         return works
@@ -174,7 +174,7 @@ def no_impact(flat: Flat, elements: FrictionElements | None, v) -> Impact:
     """That of nothing: q̇ stays as it is."""
     yes, none = jnp.array(True), jnp.zeros((), v.dtype)
     terms = {} if elements is None else elements.rows_of_term
-    return Impact(v, jnp.zeros(len(flat.contacts), v.dtype), {name: none for name in (*rows_by_name(flat), *terms)}, yes, yes, yes)
+    return Impact(v, jnp.zeros(flat.gap_count, v.dtype), {name: none for name in (*rows_by_name(flat), *terms)}, yes, yes, yes)
 
 
 def check_impacts(flat: Flat, treatment: StickSlip | Regularised) -> None:

@@ -135,7 +135,7 @@ def plastic(sliding: Flat, slip: Callable, t, q, v) -> tuple[Int[np.ndarray, " k
 def _stated_rows(flat: Flat, t, q) -> tuple[np.ndarray, slice]:
     """Rows of ψ that the user has stated as equations, and those of contacts, which may be open; behind them, those of friction."""
     holonomic, contacts = flat.holonomic(t, q).size, slice(flat.rows_of_bilateral, flat.holonomic(t, q).size)
-    beside = flat.rows - flat.rows_of_bilateral - len(flat.contacts)
+    beside = flat.rows - flat.rows_of_bilateral - flat.gap_count
     return np.r_[: contacts.start, holonomic : holonomic + beside], contacts
 
 

@@ -25,9 +25,10 @@ class Contact:
     $$ g(t, q) \ge 0, \qquad \lambda \ge 0, \qquad g\,\lambda = 0; \qquad
        \dot g^+ + e\,\dot g^- \ge 0, \quad \Lambda \ge 0, \quad (\dot g^+ + e\,\dot g^-)\,\Lambda = 0 \text{ in an impact} $$
 
-    **Arguments:** `gap`: g(t, q), a real number, the distance to the obstacle; negative inside of it. `restitution`: e from 0 to 1, a
-    number, or a function of `params`, their entries and `speed`, the rate −ġ⁻ of approach. Values outside this range are clipped to it.
-    `law`: `NewtonRestitution()`, the law above, or `PoissonRestitution()`: a compression, which is an impact with e = 0, and then an
+    **Arguments:** `gap`: g(t, q), a real number, the distance to the obstacle; negative inside of it; or an array of such gaps, each a
+    contact of its own. `restitution`: e from 0 to 1, a number, or a function of `params`, their entries and `speed`, the rate −ġ⁻ of
+    approach; of several gaps an array, if it is not the same for all. Values outside this range are clipped to it. `law`:
+    `NewtonRestitution()`, the law above, or `PoissonRestitution()`: a compression, which is an impact with e = 0, and then an
     expansion, in which the contact gives back Λ ≥ e Λᶜ. They differ if impacts are coupled by friction or other contacts; in Poisson's law
     a contact that does not approach receives nothing from the restitution of others. Any consistent units.
 

@@ -1,6 +1,7 @@
 """The system over flat vectors: what the mechanics works on."""
 
-from collections.abc import Callable, Mapping
+import math
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -44,8 +45,8 @@ class Flat(NamedTuple):
     needs_multipliers: bool
     events_need_multipliers: bool
     holonomic_names: tuple[str, ...]
-    contacts: tuple[str, ...]
-    poisson: tuple[bool, ...]  # which of them follow Poisson's law
+    contacts: dict[str, tuple[int, ...]]  # the shapes of their gaps
+    poisson: tuple[bool, ...]  # which of all gaps follow Poisson's law
     terms: tuple[str, ...]
     rows: int  # of G, those of the user's constraints
     rows_of_bilateral: int  # of those, the first, of `holonomic` alone
@@ -55,6 +56,15 @@ class Flat(NamedTuple):
     held: dict[str, np.ndarray] = {}  # noqa: RUF012 - rows of G beyond those, with which a dissipation term sticks
     sliders: Any = None  # in a mode of friction, what it alone resists and has no inertia
     stand_ins: tuple[int, ...] = ()  # coordinates of which M has a mass, as large as those of others, that nothing feels
+
+    @property
+    def gap_count(self) -> int:
+        """c: how many gaps all contacts have."""
+        return sum(map(math.prod, self.contacts.values()))
+
+    def by_contact(self, of_gaps: Array) -> dict[str, Array]:
+        """What is known of all gaps, by contact and in the shape of its gaps."""
+        return dict(zip(self.contacts, _apart(of_gaps, self.contacts.values()), strict=True))
 
 
 def bind(system: System, like: PyTree, params: PyTree, states: StatesAt | None = None) -> Flat:
@@ -105,8 +115,12 @@ def _flat(source: Source, massless: tuple[int, ...] = ()) -> Flat:
         needs_multipliers=any(asks_for(function, "multipliers") for _, function in (*system.dissipation, *system.force)),
         events_need_multipliers=any(callable(event.when) and asks_for(event.when, "multipliers") for _, event in system.events),
         holonomic_names=tuple(name for name, _ in (*system.holonomic, *system.unilateral)),
-        contacts=tuple(name for name, _ in system.unilateral),
-        poisson=tuple(isinstance(law, PoissonRestitution) for _, law in system.laws),
+        contacts=bound.gap_shapes,
+        poisson=tuple(
+            isinstance(law, PoissonRestitution)
+            for (_, law), shape in zip(system.laws, bound.gap_shapes.values(), strict=True)
+            for _ in range(math.prod(shape))
+        ),
         terms=system.terms,
         rows=bound.rows,
         rows_of_bilateral=bound.rows_of_bilateral,
@@ -136,8 +150,9 @@ class _Bound:
         ]
         residuals, self.unravel_residuals = ravel_pytree([jax.tree.map(lambda s: jnp.zeros(s.shape, zero.dtype), s) for s in shapes])
         self.rows = residuals.size
-        bilateral = jax.tree.leaves(shapes[: len(system.holonomic)])
-        self.rows_of_bilateral = sum(int(np.prod(s.shape)) for s in bilateral)
+        first = len(system.holonomic)
+        self.rows_of_bilateral = sum(int(np.prod(s.shape)) for s in jax.tree.leaves(shapes[:first]))
+        self.gap_shapes = {name: shapes[first + i].shape for i, (name, _) in enumerate(system.unilateral)}
 
     def value(self, slot, term, t, q, v, **more):
         """What one of the user's functions returns."""
@@ -169,17 +184,18 @@ class _Bound:
         return self._residuals("unilateral", t, q, None)
 
     def holonomic(self, t, q):
-        return jnp.concatenate([self.bilateral(t, q), jnp.zeros(len(self.system.unilateral), q.dtype)])
+        return jnp.concatenate([self.bilateral(t, q), jnp.zeros(sum(map(math.prod, self.gap_shapes.values())), q.dtype)])
 
     def restitution(self, t, speeds):
         def of_one(name, given, speed):
-            if not callable(given):
-                return jnp.asarray(given, speed.dtype)
-            e = jnp.asarray(call(given, f"`restitution` of {name!r}", at_time(self.params, t)[0], speed=speed), speed.dtype)
+            if callable(given):
+                given = call(given, f"`restitution` of {name!r}", at_time(self.params, t)[0], speed=speed)
+            e = jnp.broadcast_to(jnp.asarray(given, speed.dtype), speed.shape)
             return jnp.where(e < 0, 0, jnp.where(e > 1, 1, e))  # not `clip`, which halves the derivative at 0 and 1
 
-        found = [of_one(*term, speed) for term, speed in zip(self.system.restitution, speeds, strict=True)]
-        return jnp.concatenate([jnp.zeros(0, speeds.dtype), *(e[None] for e in found)])
+        of_contacts = zip(self.system.restitution, _apart(speeds, self.gap_shapes.values()), strict=True)
+        found = [jnp.ravel(of_one(*term, speed)) for term, speed in of_contacts]
+        return jnp.concatenate([jnp.zeros(0, speeds.dtype), *found])
 
     def nonholonomic(self, t, q, v):
         return self._residuals("nonholonomic", t, q, v)
@@ -241,6 +257,15 @@ class _Bound:
 
     def unravel_multipliers(self, multipliers):
         return dict(zip(self.system.constraints, self.unravel_residuals(multipliers[: self.rows]), strict=True))
+
+
+def _apart(values: Array, shapes: Iterable[tuple[int, ...]]) -> Iterator[Array]:
+    """Arrays of these shapes, of which there are the values one after the other."""
+    start = 0
+    for shape in shapes:
+        end = start + math.prod(shape)
+        yield values[start:end].reshape(shape)
+        start = end
 
 
 def flat_like(like: PyTree, label: str, given: PyTree) -> Float[Array, " n"]:

@@ -40,8 +40,8 @@ class System:
       force may be omitted.
     - `holonomic`: g(t, q), an array of any shape or a pytree of arrays, kept at zero.
     - `nonholonomic`: a(t, q, q̇), likewise, affine in q̇, kept at zero.
-    - `unilateral`: gaps g(t, q) ≥ 0 of contacts, each a real number, or `Contact(gap, restitution)`: a table, a stop, a slack string. λ ≥ 0
-      pushes along +∇g while g = 0, and is 0 while the contact is open; closing is an impact.
+    - `unilateral`: gaps g(t, q) ≥ 0 of contacts, each a real number or an array of them, or `Contact(gap, restitution)`: a table, a stop, a
+      slack string. λ ≥ 0 pushes along +∇g while g = 0, and is 0 while the contact is open; closing is an impact.
     - `one_sided`: a name or names of holonomic constraints that push and never pull, as a table does: g ≥ 0 and λ ≥ 0, where λ > 0 pushes
       along +∇g. The motion is still computed with g = 0; `Trajectory.pulling()`, the printed trajectory, `examine` and `plot.forces` report
       times with λ < 0, at which the contact would have opened.

@@ -174,9 +174,10 @@ def check(system: System, t: Array, q: Arrays, qdot: Arrays, params: PyTree, sta
                     f"{role(slot, name)} must return residuals, but returned {described(out)}. "
                     "Return what has to be zero, e.g. `q @ q - l**2`."
                 )
-            if slot == "unilateral" and not (isinstance(out, jax.ShapeDtypeStruct) and out.shape == ()):
+            if slot == "unilateral" and not (isinstance(out, jax.ShapeDtypeStruct) and out.size):
                 raise ValueError(
-                    f"{role(slot, name)} must return one gap, a real number, but returned {described(out)}. Give each contact its name."
+                    f"{role(slot, name)} must return a gap, a real number, or an array of them, but returned {described(out)}. "
+                    "Give each contact its name."
                 )
             if slot == "unilateral" and not _uses_q(function, role(slot, name), params, q, t=t, **beside):
                 raise ValueError(

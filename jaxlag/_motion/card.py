@@ -27,9 +27,13 @@ def card(motion: Any) -> str:
     if motion.multipliers:
         rows.append(("start moved by", f"{np.max(motion.stats['start_moved']):.2g}"))
     for name, contact in motion.contacts.items():
-        impacts, closed = np.asarray(contact.impacts), np.asarray(contact.closed)
-        times = int(np.nanmax(impacts, initial=0))
-        rows.append(("contact", f"{name!r}: {times} impact{'s' * (times != 1)}{most}, closed at {closed.sum()} of {closed.size} samples"))
+        impacts, closed = (np.reshape(x, (*motion.ts.shape, -1)) for x in (contact.impacts, contact.closed))
+        times, gaps = (
+            int(np.nanmax(impacts.sum(-1), initial=0)),
+            f" of {closed.shape[-1]} gaps" * (np.ndim(contact.closed) > motion.ts.ndim),
+        )
+        touches = f"closed at {closed.any(-1).sum()} of {closed[..., 0].size} samples"
+        rows.append(("contact", f"{name!r}: {times} impact{'s' * (times != 1)}{gaps}{most}, {touches}"))
     for name, event in motion.events.items():
         when = np.asarray(event.ts)[np.isfinite(event.ts)]
         first = f", first at t = {when.min():.6g}" if when.size else ""

@@ -24,8 +24,7 @@ def evaluated(equations: EquationsOfMotion, t, y: Float[Array, " y"], args: Argu
         k, y, _ = carry
         parts, correction = equations.parts(y), equations.correction(jnp.where(k < count, k, -1))
         _, found = equations.rates_and_friction(t, parts, args, None, correction, k == count)
-        there = equations.corrected(t, parts, args, found, k)
-        y = jnp.where(k < count, equations.put_back(t, parts, there.q, there.v, args), y)
+        y = equations.where_corrected(t, parts, args, found, jnp.where(k < count, k, -1), y)
         return equations.next_correction(parts, found, k), y, found
 
     nothing = zeros_like(_like(equations, t, y, args))

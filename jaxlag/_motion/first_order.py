@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+import math
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -52,7 +53,8 @@ class EquationsOfMotion:
     driving: frozenset[int] = frozenset()  # signals in holonomic constraints: velocities jump where these bend
     states: Layout = NOTHING  # of first order, by name
     sampled: Layout = NOTHING  # states that change at sample times
-    contacts: int = 0
+    gaps: tuple[tuple[str, tuple[int, ...]], ...] = ()  # the shapes of contacts, by name
+    contacts: int = 0  # how many gaps those are
     events: int = 0  # those of the system, and behind them surfaces across which forces may jump or bend
     light: tuple[int, ...] = ()  # coordinates without inertia, whose velocities follow from the rest
     entangled: bool = False  # whether elements of friction may share their forces in more than one way, or constraints drive their slips
@@ -65,7 +67,10 @@ class EquationsOfMotion:
     def of(cls, system: System, q0: PyTree, formulation: Formulation, params: PyTree, at: StatesAt) -> "EquationsOfMotion":
         """Looks for dry friction at the start, in shapes alone."""
         z, u = (Layout.of({name: at.values[name] for name in of}) for of in (of_first_order(system), sampled(system)))
-        alone = cls(system, Layout.of(q0), formulation, states=z, sampled=u, contacts=len(system.unilateral), events=len(system.events))
+        alone = cls(system, Layout.of(q0), formulation, states=z, sampled=u, events=len(system.events))
+        if system.unilateral:
+            gaps = bind(system, alone.like.shapes, params, at).contacts
+            alone = dataclasses.replace(alone, gaps=tuple(gaps.items()), contacts=sum(math.prod(shape) for shape in gaps.values()))
         if nonsmooth_signals(params):
             of_all = lambda flat: (values_of(flat, *at[1:]), at_events(system, flat, *at[1:]))
             elsewhere = called_elsewhere(lambda params: of_all(bind(system, q0, params, at)), params)
@@ -283,8 +288,14 @@ class EquationsOfMotion:
         small = jnp.all(jnp.abs(found.qddot) <= jnp.finfo(parts.q.dtype).eps ** 0.5 * jnp.abs(parts.q))
         return jnp.where(small & (k >= 0) & (k < of_positions), of_positions, k + 1)
 
-    def corrected(self, t, parts: Parts, args: Arguments, found: Friction, k) -> Parts:
-        """With what the correction of this number has found."""
+    def where_corrected(self, t, parts: Parts, args: Arguments, found: Friction, k, otherwise: Array) -> Float[Array, " y"]:
+        """y with the correction of this number, or of a negative one `otherwise`; what follows a change of y may take long."""
+        follows = bool(self.works) or self.rows != self.elements
+        corrected = lambda: self.corrected(t, parts, args, found, k)
+        return jax.lax.cond(k >= 0, corrected, lambda: otherwise) if follows else jnp.where(k >= 0, corrected(), otherwise)
+
+    def corrected(self, t, parts: Parts, args: Arguments, found: Friction, k) -> Float[Array, " y"]:
+        """y with what the correction of this number has found."""
         q, v, (of_positions, all_of_them) = parts.q, parts.v, self.corrections
         if of_positions:
             moved = q + found.qddot
@@ -292,7 +303,7 @@ class EquationsOfMotion:
                 moved = self._with_sliders_returned(t, parts, args, moved)
             q = jnp.where(k < of_positions, moved, q)
         v = jnp.where(k == of_positions, corrected(v, found.qddot), v)
-        return parts._replace(q=q, v=jnp.where(k == all_of_them - 1, found.qdot, v) if self.light else v)
+        return self.put_back(t, parts, q, jnp.where(k == all_of_them - 1, found.qdot, v) if self.light else v, args)
 
     def _with_sliders_returned(self, t, parts: Parts, args: Arguments, q):
         _, mode, _ = self.mode(t, parts, args)

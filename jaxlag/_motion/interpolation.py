@@ -62,8 +62,9 @@ def jumps(ts: Float[Array, " T"], contacts: Iterable[ContactState], events: Iter
     """At impacts, of which the last of each contact is known, and at events, all of which are."""
     found, inside = Jumps(jnp.zeros(ts.size - 1, bool), ts[1:], ts[:-1]), lambda t: jnp.clip(t, ts[:-1], ts[1:])
     of = lambda there, first, last: Jumps(there, jnp.where(there, inside(first), ts[1:]), jnp.where(there, inside(last), ts[:-1]))
-    for contact in contacts:
-        many, last = jnp.diff(contact.impacts), contact.changed[1:]
+    of_gaps = [x for contact in contacts for x in zip(*(x.reshape(ts.size, -1).T for x in (contact.impacts, contact.changed)), strict=True)]
+    for impacts, changed in of_gaps:
+        many, last = jnp.diff(impacts), changed[1:]
         found = found.joined(of(many != 0, jnp.where(many == 1, last, ts[:-1]), last))
     for event in events:
         count = event.count.astype(int)

@@ -18,13 +18,13 @@ class FrictionState(eqx.Module):
 
 class ContactState(eqx.Module):
     """A contact along a motion: whether it is `closed`; the number of its `impacts` so far; when it last `changed`, by an impact, by
-    opening or by closing; the sum of the `impulse`s of its impacts.
+    opening or by closing; the sum of the `impulse`s of its impacts. One of several gaps has their axes behind those of the samples.
     """
 
-    closed: Bool[Array, "*members T"]
-    impacts: Float[Array, "*members T"]
-    changed: Float[Array, "*members T"]
-    impulse: Float[Array, "*members T"]
+    closed: Bool[Array, "..."]
+    impacts: Float[Array, "..."]
+    changed: Float[Array, "..."]
+    impulse: Float[Array, "..."]
 
 
 class EventState(eqx.Module):

@@ -78,7 +78,8 @@ def sample_at(equations: EquationsOfMotion, t, y, params, scales: Scales, found:
     if equations.contacts:
         violation = violation.beside(*_contact_violation(flat, t, parts, multipliers, scales))
     of_contact = parts.closed > 0.5, parts.impacts, origin_of(params) + parts.changed, parts.impulse
-    contacts = dict(zip(flat.contacts, zip(*of_contact, strict=True), strict=True))
+    by_contact = [flat.by_contact(of_gaps) for of_gaps in of_contact]
+    contacts = {name: tuple(of_one[name] for of_one in by_contact) for name in flat.contacts}
     events = dict(zip(dict(equations.system.events), parts.happened, strict=False))
     unraveled = flat.unravel(q), flat.unravel(v), flat.unravel(qddot), flat.unravel_multipliers(multipliers)
     sample = Sample(*unraveled, dict(states), named, friction_states, contacts, events, counts)

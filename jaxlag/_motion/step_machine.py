@@ -33,7 +33,7 @@ from .._mechanics.stick_slip import DONE as SELECTED
 from .._mechanics.stick_slip import Friction, ModeSelection, sticking
 from .._mechanics.stick_slip import Search as ModeSearch
 from .._model.flat import Flat
-from .._program.conditions import computed_first_with_changes, zeros_like
+from .._program.conditions import computed_first_with_changes, one_of, zeros_like
 from .._program.time_bounds import TimeDependence, time_dependence
 from .first_order import EquationsOfMotion
 from .loads import loads_within
@@ -109,7 +109,7 @@ class Step:
         slip_rates = jnp.zeros((rows + 1 if self.may_turn else 0, rows), y0.dtype)
         choice = Choice(search, none, none, jnp.zeros(self.equations.events, bool), zeros_like(self._like().friction), slip_rates)
         first, stage = jnp.where(made_jump, 0, 1), jnp.array(STAGE)
-        back = Back(start, y0, y0, stage, stage, jnp.array(0))
+        back = Back(start, y0, stage, stage, jnp.array(0))
         turn = Turn(stage, first, jnp.array(0), start, end, y0, stages, piece, split, watch, choice, back, self._unchanged())
         if self.begins is None:
             return turn
@@ -139,16 +139,17 @@ class Step:
         """The points up to the next decision, and the decision; what is to be put back on the constraints, comes first."""
         turn, point = self._evaluated(turn)
         kind = jnp.where(turn.kind == TURN, SELECT, turn.kind)
-        turn, projects, t, y = jax.lax.switch(kind, self.decisions, turn, point)
-        back = Back(t, y, y, kind, turn.kind, turn.first)
+        nothing = Decision(turn, jnp.array(False), turn.end, turn.y0)
+        decided = [lambda before, decide=decide: decide(before.turn, point) for decide in self.decisions]
+        turn, projects, t, y = one_of(kind, decided, nothing)
+        back = Back(t, y, kind, turn.kind, turn.first)
         back = jax.tree.map(lambda new, old: jnp.where(projects, new, old), back, turn.back)
         kind, first = jnp.where(projects, BACK, turn.kind), jnp.where(projects, 0, turn.first)
         return turn._replace(kind=kind, first=first, back=back)
 
     def _put_back(self, turn: Turn, point: Point) -> Decision:
         """A state is back on its constraints, and what was decided before follows."""
-        t, before, there, kind, *onward = turn.back
-        y = self._there(t, before, there)
+        t, y, kind, *onward = turn.back
         turn = self.with_cut(turn._replace(kind=onward[0], first=onward[1]), kind == SELECT, y)
         return Decision(self.put(turn, kind == END, y), jnp.array(False), t, y)
 
@@ -167,11 +168,6 @@ class Step:
             turn = turn._replace(begun=turn.begun._replace(y=jnp.where(begins, y, turn.begun.y)))
         split = turn.split._replace(cut=turn.split.cut._replace(y=jnp.where(here, y, turn.split.cut.y)))
         return turn._replace(split=split, y0=jnp.where(here, y, turn.y0))
-
-    def _there(self, t, before, there) -> Array:
-        """y with the state to which corrections have come."""
-        there = self.equations.parts(there)
-        return self.equations.put_back(t, self.equations.parts(before), there.q, there.v, self.args)
 
     @property
     def decisions(self) -> list[Callable]:
@@ -220,7 +216,7 @@ class Step:
             point = computed_first_with_changes(Point(*found), t)
             after = 1
             if correction is not None:
-                back = jnp.where(number >= 0, self.equations.corrected(t, parts, self.args, point.friction, number).y, back)
+                back = self.equations.where_corrected(t, parts, self.args, point.friction, number, back)
                 after = self.equations.next_correction(parts, point.friction, number) - number
             seen, slip_rate = jax.lax.stop_gradient((self._margins(t, parts, point.friction), point.friction.slip_rate))
             stages = jnp.where(is_stage & (number < 0), with_row(stages, point.rates, k), stages)
@@ -314,7 +310,7 @@ class Step:
         piece = self._finished(turn.y0, turn.stages, turn.end - turn.start)
         y = piece.y
         if self.equations.projection:
-            y = jnp.where(self.corrections(turn) > 0, self._there(turn.end, y, turn.back.there), y)
+            y = jnp.where(self.corrections(turn) > 0, turn.back.there, y)
         error = jnp.where(jnp.all(jnp.isfinite(y)), piece.error, jnp.inf)  # it is rejected, and tried again shorter
         piece = piece._replace(y=y, error=error, dense=piece.dense | {"y1": y})
         phase, monitor = self.phases[turn.phase], self._monitor(turn.start, turn.end)

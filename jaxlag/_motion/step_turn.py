@@ -46,12 +46,11 @@ class Choice(NamedTuple):
 
 
 class Back(NamedTuple):
-    """A state that is put back on its constraints at some time: y before, and y on its way; what it is of, and what follows: the kind of
-    the next points, and the number of the first.
+    """A state that is put back on its constraints at some time: y on its way; what it is of, and what follows: the kind of the next
+    points, and the number of the first.
     """
 
     t: Any
-    y: Array
     there: Array
     of: Any
     kind: Any

@@ -1,5 +1,7 @@
 """Witnesses of events: functions of the state that pass through zero where something happens; and what is then known of the event."""
 
+import math
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -174,9 +176,9 @@ def brought_to_zero(equations: EquationsOfMotion, t, seen, parts: Parts, args: A
 def struck(equations: EquationsOfMotion, before, y) -> Bool[Array, " w"]:
     """Which events are those of contacts that had an impact between two states."""
     impacts = equations.parts(y).impacts - (0 if before is None else equations.parts(before).impacts)
-    names = [name for name, _ in equations.system.unilateral]
+    names = np.repeat([name for name, _ in equations.gaps], [math.prod(shape) for _, shape in equations.gaps])
     of = [event.when for event in equations.watched]
-    return jnp.stack([impacts[names.index(when)] > 0 if isinstance(when, str) else jnp.array(False) for when in of])
+    return jnp.stack([jnp.any(impacts[names == when] > 0) if isinstance(when, str) else jnp.array(False) for when in of])
 
 
 def with_seen(equations: EquationsOfMotion, t, seen, parts: Parts) -> Parts:

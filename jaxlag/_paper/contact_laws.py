@@ -1,10 +1,12 @@
 """Contacts on paper: the complementarity of gap and force, and the law of impacts."""
 
-from collections.abc import Iterator
+import math
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
+import numpy as np
 from sympy import Symbol
 
 from .._model.contact import PoissonRestitution
@@ -16,18 +18,24 @@ from .formulas import formulas
 from .symbol_tree import SymbolTree
 
 
-def contact_laws(system: System, gaps: list[Any], multipliers: list[Symbol], params: SymbolTree) -> tuple[ContactLaw, ...]:
-    """The contact laws of a system, from its gaps as formulas and the symbols of its contact forces."""
+def contact_laws(
+    system: System, shapes: Mapping[str, tuple[int, ...]], gaps: list[Any], multipliers: list[Symbol], params: SymbolTree
+) -> tuple[ContactLaw, ...]:
+    """The contact laws of a system, from its gaps as formulas and the symbols of its contact forces; of several gaps by number."""
     found = []
-    for (name, given), (_, law), formula, multiplier in zip(system.restitution, system.laws, gaps, multipliers, strict=True):
-        gap, rate = (Symbol(f"{letter}_{name}", real=True) for letter in ("g", "gdot"))
+    places = [(name, i, place) for name, shape in shapes.items() for i, place in enumerate(np.ndindex(shape))]
+    of_name, laws = dict(system.restitution), dict(system.laws)
+    for (name, i, place), formula, multiplier in zip(places, gaps, multipliers, strict=True):
+        named, given = f"{name}_{i + 1}" if math.prod(shapes[name]) > 1 else name, of_name[name]
+        gap, rate = (Symbol(f"{letter}_{named}", real=True) for letter in ("g", "gdot"))
 
-        def restitution(speed, numbers, given=given, name=name):
-            values = eqx.combine(numbers, params.rest)
-            return jnp.asarray(call(given, f"`restitution` of {name!r}", values, speed=speed) if callable(given) else given, float)
+        def restitution(speed, numbers, given=given, name=name, place=place):
+            if callable(given):
+                given = call(given, f"`restitution` of {name!r}", eqx.combine(numbers, params.rest), speed=speed)
+            return jnp.broadcast_to(jnp.asarray(given, float), shapes[name])[place]
 
         e = formulas(restitution, filled((), [-rate]), params.symbols)[()]
-        found.append(ContactLaw(gap, rate, formula, multiplier, e, isinstance(law, PoissonRestitution)))
+        found.append(ContactLaw(named, gap, rate, formula, multiplier, e, isinstance(laws[name], PoissonRestitution)))
     return tuple(found)
 
 

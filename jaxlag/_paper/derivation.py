@@ -9,8 +9,9 @@ from .simplify import Simplifier
 
 
 class ContactLaw(NamedTuple):
-    """A contact as formulas: the symbols of its gap and gap rate, the gap, the symbol of its force, and its impact law."""
+    """A contact as formulas: its name, the symbols of its gap and gap rate, the gap, the symbol of its force, and its impact law."""
 
+    name: str
     gap: Symbol
     rate: Symbol
     formula: Expr

@@ -151,6 +151,6 @@ def equations(
         rates=dict(zip(reduced.zdot, map(simplify, reduced.rates), strict=True)),
         updates={u: formula and simplify(formula) for u, formula in zip(reduced.u, reduced.updates, strict=True)},
         eliminated=eliminated,
-        contacts={name: contact.formula for (name, _), contact in zip(system.unilateral, full.contacts, strict=True)},
+        contacts={contact.name: contact.formula for contact in full.contacts},
         _details=details,
     )

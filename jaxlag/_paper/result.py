@@ -36,7 +36,8 @@ class Equations:
     - `rates`: the rates of the states of first order, by the symbol of ż; `updates`: those of the sampled states, by the symbol of u, None
       where an update has no formula.
     - `eliminated`: the coordinates that were eliminated, and their formulas in the remaining ones.
-    - `contacts`: the gaps of contacts, by name; their rows of G follow those of g, as if all were closed.
+    - `contacts`: the gaps of contacts, by name, and by number where one has several, as "corners_1"; their rows of G follow those
+      of g, as if all were closed.
 
     ```python
     import jaxlag as jl

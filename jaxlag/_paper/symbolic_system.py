@@ -92,7 +92,7 @@ def trace_system(
     except NotImplementedError:  # measured inputs and other programs of controllers, on which the mechanics does not depend
         updated = (None,) * len(states.u)
     holonomic = flat.rows_of_bilateral
-    contacts = contact_laws(system, list(g[holonomic:]), multipliers[holonomic : len(g)], params)
+    contacts = contact_laws(system, flat.contacts, list(g[holonomic:]), multipliers[holonomic : len(g)], params)
     drawn = dict(contacts=contacts, z=states.z, zdot=states.zdot, rates=tuple(rates), u=states.u, updates=updated)
     symbols = t, tuple(x), tuple(v), tuple(a), tuple(multipliers)
     return SymbolicSystem(*symbols, L[()], D[()], Q, g, nonholonomic, **drawn), multiplier_rows
@@ -101,7 +101,7 @@ def trace_system(
 def bound(system: System, like: PyTree, numbers: PyTree, params: SymbolTree, at: StatesAt) -> Flat:
     """The system over flat vectors, with numbers for the symbols of its parameters, and all contacts closed."""
     flat = bind(system, jax.tree.map(lambda leaf: jnp.zeros(leaf.shape), like), eqx.combine(numbers, params.rest), at)
-    return in_contact(flat, jnp.ones(len(flat.contacts), bool))
+    return in_contact(flat, jnp.ones(flat.gap_count, bool))
 
 
 def _multiplier_names(rows: dict[str, np.ndarray]) -> list[str]:

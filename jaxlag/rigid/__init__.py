@@ -1,4 +1,4 @@
-"""Bodies in space: rotations from coordinates, angular velocities, kinetic energies, joints and moments of inertia.
+"""Bodies in space: rotations from coordinates, angular velocities, kinetic energies, joints, contacts and moments of inertia.
 
 Each is a function of q, to be added to L, g and a: no tree of bodies, no engine.
 
@@ -40,3 +40,9 @@ from ._rotations import rotation_vector as rotation_vector
 from ._rotations import rotation_x as rotation_x
 from ._rotations import rotation_y as rotation_y
 from ._rotations import rotation_z as rotation_z
+from ._touching import Touching as Touching
+from ._touching import box_plane as box_plane
+from ._touching import capsule_plane as capsule_plane
+from ._touching import ellipsoid_plane as ellipsoid_plane
+from ._touching import sphere_plane as sphere_plane
+from ._touching import sphere_sphere as sphere_sphere

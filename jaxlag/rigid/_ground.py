@@ -120,13 +120,13 @@ def _sliding(body: Callable, below: Callable, plane: Frame) -> Callable:
     """The velocity of a body's point at `below(its z axis)` from its origin."""
 
     def velocity(q: Any, qdot: Any) -> Float[Array, "2"]:
-        ((v, (axes, omega)),) = rates(lambda q: [body(q)], q, qdot, _turning)
+        ((v, (axes, omega)),) = rates(lambda q: [body(q)], q, qdot, turning_axes)
         return plane.axes[:, :2].T @ (v + jnp.cross(omega, below(axes[:, 2])))
 
     return velocity
 
 
-def _turning(of: AngularVelocities, R: Any) -> Callable:
+def turning_axes(of: AngularVelocities, R: Any) -> Callable:
     """The axes of a frame, and its angular velocity in space."""
     axes, omega = of.number(R), of.world(R)
     return lambda: (axes()[0], omega())

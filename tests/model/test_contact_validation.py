@@ -36,9 +36,10 @@ def test_what_is_refused_when_it_is_stated(make, error, said):
         make()
 
 
-def test_a_gap_is_one_number():
-    plane = jl.System(lambda qdot: 0.5 * (qdot @ qdot), unilateral={"walls": lambda q: q})
-    with pytest.raises(ValueError, match="`unilateral` 'walls' must"):
+@pytest.mark.parametrize("gap", [lambda q: q[:0], lambda q: {"left": q[0], "right": q[1]}], ids=["none", "a tree"])
+def test_gaps_are_numbers_or_an_array_of_them(gap):
+    plane = jl.System(lambda qdot: 0.5 * (qdot @ qdot), unilateral={"walls": gap})
+    with pytest.raises(ValueError, match="`unilateral` 'walls' must return"):
         jl.simulate(plane, jnp.ones(2), -jnp.ones(2), jnp.array([0.0, 1.0]))
 
 
