@@ -177,7 +177,7 @@ def check(system: System, t: Array, q: Arrays, qdot: Arrays, params: PyTree, sta
             if slot == "unilateral" and not (isinstance(out, jax.ShapeDtypeStruct) and out.size):
                 raise ValueError(
                     f"{role(slot, name)} must return a gap, a real number, or an array of them, but returned {described(out)}. "
-                    "Give each contact its name."
+                    "Return an array, or give each contact its name."
                 )
             if slot == "unilateral" and not _uses_q(function, role(slot, name), params, q, t=t, **beside):
                 raise ValueError(

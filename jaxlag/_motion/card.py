@@ -28,11 +28,9 @@ def card(motion: Any) -> str:
         rows.append(("start moved by", f"{np.max(motion.stats['start_moved']):.2g}"))
     for name, contact in motion.contacts.items():
         impacts, closed = (np.reshape(x, (*motion.ts.shape, -1)) for x in (contact.impacts, contact.closed))
-        times, gaps = (
-            int(np.nanmax(impacts.sum(-1), initial=0)),
-            f" of {closed.shape[-1]} gaps" * (np.ndim(contact.closed) > motion.ts.ndim),
-        )
-        touches = f"closed at {closed.any(-1).sum()} of {closed[..., 0].size} samples"
+        times, at = int(np.nanmax(impacts.sum(-1), initial=0)), closed.any(-1)
+        gaps = f" of {closed.shape[-1]} gaps" if np.ndim(contact.closed) > motion.ts.ndim else ""
+        touches = f"closed at {at.sum()} of {at.size} samples"
         rows.append(("contact", f"{name!r}: {times} impact{'s' * (times != 1)}{gaps}{most}, {touches}"))
     for name, event in motion.events.items():
         when = np.asarray(event.ts)[np.isfinite(event.ts)]

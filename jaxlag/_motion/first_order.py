@@ -54,7 +54,6 @@ class EquationsOfMotion:
     states: Layout = NOTHING  # of first order, by name
     sampled: Layout = NOTHING  # states that change at sample times
     gaps: tuple[tuple[str, tuple[int, ...]], ...] = ()  # the shapes of contacts, by name
-    contacts: int = 0  # how many gaps those are
     events: int = 0  # those of the system, and behind them surfaces across which forces may jump or bend
     light: tuple[int, ...] = ()  # coordinates without inertia, whose velocities follow from the rest
     entangled: bool = False  # whether elements of friction may share their forces in more than one way, or constraints drive their slips
@@ -63,6 +62,11 @@ class EquationsOfMotion:
     sees_time: bool = False  # whether functions ask for the time, beside signals at that time
     follows_time: bool = True  # whether they depend on the time at all
 
+    @property
+    def contacts(self) -> int:
+        """How many gaps there are."""
+        return sum(math.prod(shape) for _, shape in self.gaps)
+
     @classmethod
     def of(cls, system: System, q0: PyTree, formulation: Formulation, params: PyTree, at: StatesAt) -> "EquationsOfMotion":
         """Looks for dry friction at the start, in shapes alone."""
@@ -70,7 +74,7 @@ class EquationsOfMotion:
         alone = cls(system, Layout.of(q0), formulation, states=z, sampled=u, events=len(system.events))
         if system.unilateral:
             gaps = bind(system, alone.like.shapes, params, at).contacts
-            alone = dataclasses.replace(alone, gaps=tuple(gaps.items()), contacts=sum(math.prod(shape) for shape in gaps.values()))
+            alone = dataclasses.replace(alone, gaps=tuple(gaps.items()))
         if nonsmooth_signals(params):
             of_all = lambda flat: (values_of(flat, *at[1:]), at_events(system, flat, *at[1:]))
             elsewhere = called_elsewhere(lambda params: of_all(bind(system, q0, params, at)), params)

@@ -47,8 +47,8 @@ def one_by_one(function: Callable) -> Callable:
 def one_of(index: Any, branches: Sequence[Callable], state: Any) -> Any:
     """`branches[index](state)`, the state again, in which each branch changes something.
 
-    As `jax.lax.switch` has it; but there each branch copies all that it returns, which takes most of the time of a program in which a
-    branch changes few of a hundred numbers. Here each is a condition of its own, for what it changes alone.
+    `jax.lax.switch` does the same, but each of its branches copies all that it returns, also what it leaves as it was. Here each branch is
+    a condition of its own, for what it changes alone: of a bouncing ball's program a quarter of the copies is left.
     """
     leaves, structure = jax.tree.flatten(state)
     for i, branch in enumerate(branches):

@@ -146,36 +146,55 @@ def test_many_at_once():
     np.testing.assert_allclose(many.contacts["floor"].impacts[:, -1], [[1, 1]] * 3)
 
 
-@pytest.mark.slow
-def test_a_cube_on_a_slope():
-    """Eight corners with friction: below the angle of friction it rests for 100 s without creep, above it slides at g (sin α − μ cos α)."""
-    side, m, slope = 0.1, 0.37, 0.2
+SLOPE, MASS = 0.2, 0.37
+
+
+def cube_on_a_slope(metre=1.0, second=1.0):
+    """Friction at all eight corners, at rest at first: how far it has moved, in metres, at a time T (s), for μ and gravity by a factor."""
+    side, g = 0.1 * metre, G * metre / second**2
     turned = lambda q: rigid.quaternion(q["p"])
-    plane = rigid.frame((0.0, 0.0, 0.0), rigid.rotation_y(slope))
+    plane = rigid.frame((0.0, 0.0, 0.0), rigid.rotation_y(SLOPE))
     touch = rigid.box_plane(lambda q: rigid.frame(q["x"], turned(q)), np.full(3, side), plane)
-    body = rigid.kinetic_energy(m, rigid.inertia.box(m, side, side, side), lambda q: q["x"], turned)
+    body = rigid.kinetic_energy(MASS, rigid.inertia.box(MASS, side, side, side), lambda q: q["x"], turned)
 
     def rubbing(q, qdot, multipliers, mu):
         return mu * jnp.sum(multipliers["corners"] * jnp.linalg.norm(touch.slip(q, qdot), axis=1))
 
     cube = jl.System(
-        lambda q, qdot, g: body(q, qdot) - m * g * q["x"][2],
+        lambda q, qdot, g: body(q, qdot) - MASS * g * q["x"][2],
         dissipation={"rub": rubbing},
         holonomic={"unit": lambda q: rigid.unit(q["p"])},
         unilateral={"corners": touch.gap},
     )
-    downhill, normal = np.array(plane.axes[:, 0]), np.array(plane.axes[:, 2])
-    q0 = {"p": np.array(rigid.to_quaternion(plane.axes)), "x": side / 2 * normal}
+    q0 = {"p": np.array(rigid.to_quaternion(plane.axes)), "x": side / 2 * np.array(plane.axes[:, 2])}
     still = {"p": np.zeros(4), "x": np.zeros(3)}
 
-    def moved(T, mu):
-        motion = jl.simulate(cube, q0, still, jnp.array([0.0, T / 2, T]), {"g": G, "mu": mu})
-        return motion, np.array(motion.q["x"]) - q0["x"]
+    def moved(T, mu, gravity=1.0):
+        motion = jl.simulate(cube, q0, still, jnp.array([0.0, T / 2, T]) * second, {"g": gravity * g, "mu": mu})
+        return (motion.q["x"] - q0["x"][None]) / metre, motion
 
-    motion, away = moved(100.0, 0.3)
+    return moved, np.array(plane.axes[:, 0])
+
+
+@pytest.mark.slow
+def test_a_cube_on_a_slope():
+    """Below the angle of friction it rests for 100 s without creep, above it slides at g (sin α − μ cos α)."""
+    moved, downhill = cube_on_a_slope()
+    away, motion = moved(100.0, 0.3)
     assert np.max(np.abs(away)) < 1e-16
     np.testing.assert_array_equal(motion.contacts["corners"].closed[-1], [True, False] * 4)
-    np.testing.assert_allclose(motion.multipliers["corners"][-1].sum(), m * G * np.cos(slope), rtol=1e-12)
-    motion, away = moved(0.5, 0.1)
-    rate = G * (np.sin(slope) - 0.1 * np.cos(slope))
+    np.testing.assert_allclose(motion.multipliers["corners"][-1].sum(), MASS * G * np.cos(SLOPE), rtol=1e-12)
+    away, motion = moved(0.5, 0.1)
+    rate = G * (np.sin(SLOPE) - 0.1 * np.cos(SLOPE))
     np.testing.assert_allclose(away, np.outer(0.5 * rate * np.array(motion.ts) ** 2, downhill), atol=1e-10)
+
+
+@pytest.mark.slow
+def test_derivatives_of_a_cube_on_a_slope():
+    """In micrometres and kiloseconds: by friction and gravity, also without friction, and none where it rests."""
+    moved, downhill = cube_on_a_slope(1e-6, 1e3)
+    slopes = jax.jit(jax.jacfwd(lambda x: moved(0.5, *x)[0][-1] @ downhill))
+    half, s, c = 0.5 * G * 0.5**2, np.sin(SLOPE), np.cos(SLOPE)
+    for mu in (0.1, 0.0):
+        np.testing.assert_allclose(slopes(jnp.array([mu, 1.0])), [-half * c, half * (s - mu * c)], rtol=1e-8)
+    np.testing.assert_allclose(slopes(jnp.array([0.3, 1.0])), 0, atol=1e-16)
