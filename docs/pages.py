@@ -43,11 +43,12 @@ REFERENCE = {  # names in `jaxlag`
     "results.RootLocus results.Crossing periodic results.PeriodicOrbit stability_map results.StabilityMap",
     "Identification": "Experiment Measurement ModalTest FrequencyResponseTest fit fit_each results.Fit results.Channel results.Interval "
     "results.Prediction regress results.Regression Regress MultiStart validate results.Validation compare results.Comparison "
-    "information results.Information Huber learnt.ConvexDissipation learnt.PassiveDissipation learnt.Potential "
+    "information results.Information recover results.Recovery "
+    "log_density results.LogDensity results.Posterior Huber learnt.ConvexDissipation learnt.PassiveDissipation learnt.Potential "
     "learnt.ConvexPotential",
     "On paper": "equations results.Equations results.LinearisedEquations to_sympy",
     "Pictures": "plot.motion plot.phase plot.forces plot.energy plot.balance plot.friction plot.bode plot.nyquist plot.root_locus "
-    "plot.mode_shapes plot.stability_map plot.fit plot.parameters plot.convergence plot.equations plot.animate",
+    "plot.mode_shapes plot.stability_map plot.fit plot.parameters plot.recovery plot.convergence plot.equations plot.animate",
 }
 SHOWN = (".ipynb", ".png", ".gif", ".svg")  # files shown from the folder of notebooks
 WITHOUT_TOC = "---\nhide: [toc]\n---\n"

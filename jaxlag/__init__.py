@@ -19,7 +19,8 @@ from ._paper.equations import equations as equations
 from ._paper.to_sympy import to_sympy as to_sympy
 from ._mechanics.examine import examine as examine
 from ._mechanics.friction_treatment import Regularised as Regularised, StickSlip as StickSlip
-from ._fit.assess import information as information, validate as validate
+from ._fit.information import information as information
+from ._fit.validate import validate as validate
 from ._fit.comparison import compare as compare
 from ._fit.experiment import Experiment as Experiment
 from ._fit.frequency_response_test import FrequencyResponseTest as FrequencyResponseTest
@@ -29,6 +30,8 @@ from ._fit.robust_loss import Huber as Huber
 from ._fit.starts import MultiStart as MultiStart, Regress as Regress
 from ._fit.measurement import Measurement as Measurement
 from ._fit.modal_test import ModalTest as ModalTest
+from ._fit.log_density import log_density as log_density
+from ._fit.recover import recover as recover
 from ._fit.regress import regress as regress
 from ._motion.simulate import simulate as simulate
 from ._motion.load import load as load

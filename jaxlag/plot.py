@@ -16,8 +16,10 @@ from ._draw.forces import forces, friction
 from ._draw.linear import bode, nyquist, root_locus
 from ._draw.mode_shapes import mode_shapes
 from ._draw.motion import balance, energy, motion, phase
+from ._draw.recovery import recovery
 from ._draw.report import report
 from ._draw.stability_map import stability_map
+from ._fit.recover import Recovery
 from ._fit.result import Fit
 from ._linear.modes import Modes
 from ._linear.root_locus import RootLocus
@@ -41,6 +43,7 @@ __all__ = [
     "nyquist",
     "parameters",
     "phase",
+    "recovery",
     "root_locus",
     "stability_map",
 ]
@@ -89,6 +92,7 @@ SHORT_WAYS: tuple[tuple[type, str, Any], ...] = (  # what is computed knows noth
     (Trajectory, "animate", animate),
     (Fit, "plot", fit),
     (Fit, "report", report),
+    (Recovery, "plot", recovery),
     (Modes, "plot", mode_shapes),
     (Modes, "animate", animate),
     (RootLocus, "plot", root_locus),

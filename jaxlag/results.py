@@ -1,8 +1,12 @@
 """The classes that functions of jaxlag return, for annotations and `isinstance`; you need not create any of them."""
 
-from ._fit.assess import Information as Information, Validation as Validation
+from ._fit.information import Information as Information
+from ._fit.validate import Validation as Validation
 from ._fit.comparison import Comparison as Comparison
 from ._fit.channels import Channel as Channel
+from ._fit.log_density import LogDensity as LogDensity
+from ._fit.posterior import Posterior as Posterior
+from ._fit.recover import Recovery as Recovery
 from ._fit.regress import Regression as Regression
 from ._fit.result import Fit as Fit, Interval as Interval, Prediction as Prediction
 from ._linear.equilibrium import Equilibrium as Equilibrium

@@ -79,7 +79,7 @@ class Dynamics:
         mode = in_current_mode(flat, self.t, y.q, y.v)
         z, *_ = first_order(mode)
         off = (y.v - with_first_order_rates(mode, self.t, y.q, y.v).v)[z]
-        return flat.holonomic(self.t, y.q), jnp.concatenate([velocity_residual(mode, self.t, y.q, y.v), off])
+        return mode.holonomic(self.t, y.q), jnp.concatenate([velocity_residual(mode, self.t, y.q, y.v), off])
 
     def forces(self, y: Whole, motion: Motion) -> Forces:
         """q̈ and λ of the state, with its inputs moved."""

@@ -14,7 +14,7 @@ from .._model.numbers import number, refuse_nan
 from .._model.paths import entry_names, is_within, listed
 from .._model.state_values import given_states
 from .._model.system import System
-from .._model.validation import coordinates, parameters, state, without_contacts
+from .._model.validation import coordinates, parameters, state
 from .._program.jit import is_concrete, seen
 from .._program.sparse_jacobian import MANY
 from .not_differentiated import without_derivative
@@ -180,7 +180,6 @@ def _entries(q, names, label):
 
 def _found(system: System, q: PyTree, qdot: PyTree, params: PyTree, t: Any, states: PyTree, search: Search) -> Equilibrium:
     """The result of a search or, if it fails, of a search in which friction holds."""
-    without_contacts(system, "`equilibrium` and `steady`")
     if search.stable and system.force:
         terms = ", ".join(repr(name) for name, _ in system.force)
         raise ValueError(f"`stable` must be False where forces are not from L, but there are {terms}. Write their potential into L.")

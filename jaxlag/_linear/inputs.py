@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PyTree
 
+from .._mechanics.contact import contact_rows
 from .._model.flat import Flat, rows_by_name
 from .._model.paths import entry_names, is_within, labels, leaf_names, listed
 from .._model.signal import is_signal
@@ -90,12 +91,15 @@ def moved_forces(inputs: tuple[Input, ...], flat: Flat, t: Any, motion: Motion) 
         forces[name] = lambda t, q, v, multipliers, i=i, Q=flat.forces[name]: (1 + w(t)[i]) * Q(t, q, v, multipliers)
     if place("force on a coordinate"):
         forces["inputs"] = lambda t, q, v, multipliers: spread("force on a coordinate", q.size)(t)
-    holonomic, nonholonomic = flat.holonomic, flat.nonholonomic
+    holonomic, bilateral, gaps, nonholonomic = flat.holonomic, flat.bilateral, flat.gaps, flat.nonholonomic
     if place("holonomic"):
-        holonomic = lambda t, q: (g := flat.holonomic(t, q)) - spread("holonomic", g.size)(t)
+        of_rows = spread("holonomic", flat.rows)
+        holonomic = lambda t, q: (g := flat.holonomic(t, q)) - of_rows(t)[: g.size]
+        bilateral = lambda t, q: flat.bilateral(t, q) - of_rows(t)[: flat.rows_of_bilateral]
+        gaps = lambda t, q: flat.gaps(t, q) - contact_rows(flat, of_rows(t))
     if place("nonholonomic"):
         nonholonomic = lambda t, q, v: (a := flat.nonholonomic(t, q, v)) - spread("nonholonomic", flat.rows)(t)[flat.rows - a.size :]
-    return flat._replace(forces=forces, holonomic=holonomic, nonholonomic=nonholonomic)
+    return flat._replace(forces=forces, holonomic=holonomic, bilateral=bilateral, gaps=gaps, nonholonomic=nonholonomic)
 
 
 def moved_states(inputs: tuple[Input, ...], sampled: Float[Array, " s"], motion: Motion) -> Float[Array, " s"]:

@@ -9,16 +9,17 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import PyTree
 
-from .._mechanics.consistent_state import consistent_state
+from .._mechanics.consistent_state import state_in_contact
 from .._model.flat import Flat, StatesAt, bind
 from .._model.injection import check_function
 from .._model.numbers import number, refuse_nan
 from .._model.paths import entry_names, is_within, listed
 from .._model.state_values import Layout, given_states, of_first_order, sampled, start_values
 from .._model.system import System
-from .._model.validation import coordinates, parameters, state, without_contacts
+from .._model.validation import coordinates, parameters, state
 from .._motion.trajectory import Trajectory
 from .._program.jit import is_concrete, seen
+from .bends import refuse_bends
 from .dynamics import dynamics_of
 from .inputs import Input, find_inputs
 from .linear_system import Coordinates, LinearSystem
@@ -64,14 +65,16 @@ def linearise(
       the choice at the first sample is kept; where those coordinates cease to be independent, T and A grow without bounds.
     - `frozen`: allows a state that is not steady, where eigenvalues say little about stability.
 
-    Dry friction: elements that stick are held, elements that slip keep their sliding force. With `Sampled` states of one period the result
-    is in discrete time, and exact. Any consistent units.
+    Dry friction: elements that stick are held, elements that slip keep their sliding force. Contacts: what presses is held, what stands
+    open has no part; one that touches and is not pressed is refused, for the motion is another one on either side (NaN under `jit`). With
+    `Sampled` states of one period the result is in discrete time, and exact. Any consistent units.
 
     **Returns:** a `LinearSystem`. Differentiable in `q`, `qdot`, `params`, `states`; a state given as numbers follows its constraints, as
     the position of a pendulum follows the length of its rod.
 
     **Raises:** `ValueError` if the state accelerates or A changes along the motion, if it is off its constraints, at a singular position,
-    or if a name is unknown.
+    if a contact touches without being pressed, or opens or closes along a trajectory, if a function bends or jumps at the state, or if a
+    name is unknown.
 
     **Source:** Wehage & Haug, J. Mechanical Design 104 (1982) 247-255 (independent coordinates); Meijaard, Papadopoulos, Ruina & Schwab,
     Proc. R. Soc. A 463 (2007) 1955-1982 (a rolling bicycle, as a check).
@@ -90,7 +93,6 @@ def linearise(
     if found_before:  # an equilibrium, an instant, a trajectory
         t, states = getattr(q, "ts" if along else "t", t), q.states if states is None else states
         q, qdot = q.q, q.qdot
-    without_contacts(system, "`linearise`")
     q = coordinates(q, "q")
     q, qdot = state(q, jax.tree.map(jnp.zeros_like, q) if qdot is None else qdot)
     dtype = jax.tree.leaves(q)[0].dtype
@@ -104,6 +106,10 @@ def linearise(
     choice = near.choice(inputs, outputs, independent)
     of = lambda t, q, qdot, states: matrices(choice, system, t, q, qdot, params, states)
     found = jax.vmap(of)(t, q, qdot, states) if along else of(t, q, qdot, states)
+    if system.unilateral and is_concrete(found):
+        _refuse_contacts(near.flat, found)
+    if not along:
+        refuse_bends(system, near.flat, first, params, of)
     if along and is_concrete(found) and np.any(found.shifted):
         raise ValueError("`inputs` must not move a constraint along a trajectory, where A changes, but do. Move a force instead.")
     if not (along or frozen):
@@ -113,9 +119,25 @@ def linearise(
 
 def _with_constraints(system: System, t: Any, q: PyTree, qdot: PyTree, params: PyTree, states: PyTree) -> tuple[PyTree, PyTree]:
     """The given state, with derivatives that keep it on its constraints."""
-    nearest = consistent_state(system, q, qdot, params, t=t, states=states)
+    nearest = state_in_contact(system, q, qdot, params, t, states)
     fixed = jax.lax.stop_gradient
     return jax.tree.map(lambda x, nearest: fixed(x) + (nearest - fixed(nearest)), (q, qdot), nearest)
+
+
+def _refuse_contacts(flat: Flat, found: Matrices) -> None:
+    """Raises where a contact touches and is not pressed, or opens or closes along a trajectory."""
+    of_each = lambda masks: [name for name, mask in flat.by_contact(jnp.asarray(masks)).items() if np.any(mask)]
+    barely, closed = (np.asarray(x).reshape(-1, flat.gap_count) for x in (found.barely, found.closed))
+    if names := of_each(np.any(barely, axis=0)):
+        raise ValueError(
+            f"`q` must be where contacts are pressed or stand open, but {names[0]!r} touches and nothing presses it: the motion is another "
+            "one on either side. Move q away from it, or state it as `holonomic`."
+        )
+    if names := of_each(np.any(closed != closed[:1], axis=0)):
+        raise ValueError(
+            f"`q` must be a trajectory along which contacts stay open or closed, but {names[0]!r} changes. Take a part of it, as "
+            "`motion[:20]`."
+        )
 
 
 class _Near:

@@ -12,7 +12,7 @@ from jaxtyping import Array, Bool, Float, PyTree
 
 from .._mechanics.augmented_inertia import augmented, by_weight, unit_lengths
 from .._mechanics.constraint_residuals import off_constraints
-from .._mechanics.contact import in_current_mode
+from .._mechanics.contact import barely_touching, in_current_mode
 from .._mechanics.lagrange import applied_force, constraint_rows, inertia
 from .._mechanics.massless import first_order, with_masses
 from .._model.flat import StatesAt
@@ -66,6 +66,8 @@ class Matrices(NamedTuple):
     mass: Float[Array, "n n"]
     steadiness: Steadiness
     shifted: Bool[Array, ""]  # whether x is not the state itself, but the state less the contributions of u and u̇
+    closed: Bool[Array, " c"]  # which contacts are, and are held
+    barely: Bool[Array, " c"]  # which touch and are not pressed
 
 
 @compiled
@@ -110,7 +112,7 @@ def matrices(choice: Choice, system: System, t: Any, q: PyTree, qdot: PyTree, pa
     rates = jax.tree.map(lambda *rows: jnp.concatenate(rows, axis=-2), *parts)
     by_state = jnp.abs(jnp.concatenate([of.by_state for of in (qddot, z, updates)]))
     by_held = jnp.abs(jnp.concatenate([of.by_inputs[0, :, len(choice.inputs) - choice.loops :] for of in (qddot, z, updates)]))
-    of_state, of_terms = _sizes(dynamics, y, forces.multipliers, M)
+    of_state, of_terms, of_forces = _sizes(dynamics, y, forces.multipliers, M)
     independent = np.array([*positions, *(n + velocities), *range(2 * n, len(of_state))], int)
     size = by_state @ of_state[independent] + of_terms
     of_updates = size[size.size - dynamics.held.size :]  # an update that cancels to zero leaves the rounding of its terms
@@ -119,8 +121,11 @@ def matrices(choice: Choice, system: System, t: Any, q: PyTree, qdot: PyTree, pa
     left = jnp.concatenate([forces.qddot, found.z, found.updates - dynamics.held])
     steadiness = Steadiness(left, allowed, forces.sound.determined & forces.sound.satisfied)
     outputs, multipliers, updates = (_shifted(rates, of) for of in (outputs, multipliers, updates))
-    near = Matrices(_proper(rates), outputs, multipliers, updates, basis, M, steadiness, jnp.any(rates.by_inputs[1:] != 0))
-    return where_known(none_is_nan(params), near)
+    closed = jnp.zeros(0, bool) if mode.closed is None else mode.closed
+    barely = barely_touching(mode, at.t, y.q, y.v, forces.multipliers, of_forces)
+    shifted = jnp.any(rates.by_inputs[1:] != 0)
+    near = Matrices(_proper(rates), outputs, multipliers, updates, basis, M, steadiness, shifted, closed, barely)
+    return where_known(none_is_nan(params) & ~jnp.any(barely), near)
 
 
 def _slopes(
@@ -236,8 +241,10 @@ def _shifted(rates: ByInputs, of: ByInputs) -> ByInputs:
     return ByInputs(C, jnp.stack([D + C @ (B1 + A @ B2), D1 + C @ B2, D2]))
 
 
-def _sizes(dynamics: Dynamics, y: Whole, multipliers: Array, mass: Array) -> tuple[Float[Array, " y"], Float[Array, " r"]]:
-    """The size of each entry of the state, with zero entries sized by mass; and the size of the terms that cancel in q̈, ż and updates."""
+def _sizes(dynamics: Dynamics, y: Whole, multipliers: Array, mass: Array) -> tuple[Array, Array, Array]:
+    """The size of each entry of the state, with zero entries sized by mass; the size of the terms that cancel in q̈, ż and updates; and that
+    of the forces on each coordinate.
+    """
     mode, G = in_current_mode(dynamics.at(y, dynamics.still()), dynamics.t, y.q, y.v), _rows(dynamics, y)
     light = first_order(mode).coordinates
     stand_in = with_masses(mode, light) if light.size else None
@@ -252,4 +259,4 @@ def _sizes(dynamics: Dynamics, y: Whole, multipliers: Array, mass: Array) -> tup
         rates = lambda z: [dynamics.driven(y._replace(z=z), 0 * y.q, multipliers, dynamics.still())[i] for i in (0, 2)]
         terms[1] = size_of_terms(lambda z: jnp.concatenate(rates(z)), y.z)
     sizes = [by_weight(units, jnp.abs(x)) for x in (y.q, y.v)]
-    return jnp.concatenate([*sizes, jnp.abs(y.z)]), jnp.concatenate(terms)
+    return jnp.concatenate([*sizes, jnp.abs(y.z)]), jnp.concatenate(terms), forces

@@ -25,11 +25,14 @@ Residual = Callable[[Any, Float[Array, " u"]], Float[Array, " r"]]  # R(args, w)
 
 
 class Root(NamedTuple):
-    """A candidate w for R(w) = 0, whether it is a root, and the size of the terms that cancel in each equation."""
+    """A candidate w for R(w) = 0, whether it is a root, and the size of the terms that cancel in each equation; where they are known, units
+    of all unknowns, for the length of a step.
+    """
 
     w: Float[Array, " u"]
     found: Bool[Array, ""]
     size: Float[Array, " r"]
+    units: Float[Array, " u"] | None = None
 
 
 def root_near(
@@ -44,7 +47,7 @@ def root_near(
     """The root that Newton's method finds from a guess. If the equations leave several open, it is the nearest in these `units`, where an
     unknown costs less to move the greater its `ease`. Unknowns with unit zero take their units from the others: `units_beside`.
     `forces_on`: units of the coordinates whose forces are the first equations. The unknowns after the first `ways` are forces, such as
-    multipliers.
+    multipliers. It is not differentiated.
     """
     fixed, guess = jax.lax.stop_gradient((args, guess))
     slope = lambda w, units: _felt(jax.jacfwd(residual, 1)(fixed, w), forces_on, units)
@@ -58,8 +61,7 @@ def root_near(
     w, reach = newton(changes, guess, units, ways)
     J, terms = slope(w, units), _terms(residual, fixed, w)
     reach = jnp.where(units > 0, reach, jnp.maximum(reach, _reach_of_forces(J[: forces_on.size], terms[: forces_on.size], forces_on)))
-    root = root_of_size(residual(fixed, w), J, terms, w, reach)
-    return root._replace(w=differentiable_root(residual, args, w, of, forces_on))
+    return root_of_size(residual(fixed, w), J, terms, w, reach)._replace(units=of)
 
 
 def _terms(residual: Residual, args: Any, w: Float[Array, " u"]) -> Float[Array, " r"]:
@@ -161,7 +163,7 @@ def newton(
         return (i < ITERATIONS) & ~done & jnp.all(jnp.isfinite(w))
 
     w, _, _ = jax.lax.while_loop(is_on_its_way, turn, (guess, jnp.array(False), jnp.array(0)))
-    w = jnp.where(jnp.all(jnp.abs(w) <= 8 * eps * reach(guess)), 0, w)
+    w = jnp.where(jnp.abs(w) <= 8 * eps * reach(guess), 0, w)
     return w, reach(w)
 
 

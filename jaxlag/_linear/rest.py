@@ -11,18 +11,20 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from .._mechanics.augmented_inertia import unit_lengths, units_of_mass
+from .._mechanics.contact import in_contact
 from .._mechanics.friction_elements import FrictionElements, find_elements
 from .._mechanics.lagrange import applied_force, constraint_rows, inertia, inertial_force
 from .._mechanics.pseudo_inverse import FOLLOWS, SEEN
 from .._mechanics.saddle_point import saddle_point
-from .._mechanics.stick_slip import in_mode, slip_of, sticking
+from .._mechanics.stick_slip import bounds, in_mode, slip_of, sticking
 from .._model.flat import Flat, StatesAt, bind
 from .._model.state_values import Layout, start_values
 from .._model.system import System
 from .._model.validation import checked
 from .._program.jit import compiled
 from .descent import minimum_near
-from .newton import Root, is_nothing, least_change, root_near, units_beside
+from .newton import Root, differentiable_root, is_nothing, least_change, root_near, units_beside
+from .rest_on_contacts import on_contacts, touched
 
 
 class Search(NamedTuple):
@@ -84,13 +86,16 @@ class Unknowns(NamedTuple):
 
 
 class Given(NamedTuple):
-    """The data on which a steady state depends; `open`: mask of the running velocities that stay as given."""
+    """The data on which a steady state depends; masks of the running velocities that stay as given, which are `open`, and of the contacts
+    that are `closed`.
+    """
 
     numbers: PyTree  # of params
     t: Float[Array | np.ndarray, ""]
     q: Float[Array, " n"]
     v: Float[Array, " n"]
     open: Bool[Array, " b"]
+    closed: Bool[Array, " c"]
 
 
 class Equations:
@@ -104,6 +109,7 @@ class Equations:
         self.running = np.array(search.running, int)
         elements = find_elements(flat)
         self.friction_rows = elements.element_of_row.size if elements is not None and search.held else 0
+        self.rows_of_bilateral = flat.rows_of_bilateral
         self.sizes = np.cumsum([self.moving.size, self.running.size, ravel_pytree(values)[0].size, flat.rows])
 
     def taken_apart(self, given: Given, w: Float[Array, " u"]) -> tuple[Flat, Float[Array, " n"], Float[Array, " n"], Unknowns]:
@@ -111,7 +117,7 @@ class Equations:
         of = Unknowns(*jnp.split(w, self.sizes))
         q, v = given.q.at[self.moving].set(of.q), given.v.at[self.running].set(of.v)
         at = StatesAt(self.unravel_states(of.states), given.t, q, v)
-        return bind(self.system, self.like, eqx.combine(given.numbers, self.rest), at), q, v, of
+        return in_contact(bind(self.system, self.like, eqx.combine(given.numbers, self.rest), at), given.closed), q, v, of
 
     def __call__(self, given: Given, w: Float[Array, " u"]) -> Float[Array, " r"]:
         """The residual of the equations at w."""
@@ -131,10 +137,29 @@ class Equations:
             sigma = directions_of_slip(elements, given)
             flat = flat._replace(dissipations=in_mode(flat, elements, sigma).dissipations)
             if self.friction_rows:
-                holding = jnp.where(sticking(elements, sigma)[elements.element_of_row], of.friction, 0)
+                holds = sticking(elements, sigma) & self.loaded(elements, given, q, v)
+                holding = jnp.where(holds[elements.element_of_row], of.friction, 0)
                 held = jax.vjp(lambda v: elements.slip(t, q, v), v)[1](holding)[0]
         _, G, _ = constraint_rows(flat, t, q, v)
         return inertial_force(flat, t, q, v) + applied_force(flat, t, q, v, of.multipliers) + G.T @ of.multipliers + held
+
+    def loaded(self, elements: FrictionElements, given: Given, q: Array, v: Array) -> Bool[Array, " e"]:
+        """Which elements of friction are not of contacts that are open alone."""
+        if not given.closed.size:
+            return jnp.ones(elements.size, bool)
+        rows = self.rows_of_bilateral + np.arange(given.closed.size)
+        pressed = jnp.ones(self.sizes[3] - self.sizes[2], v.dtype).at[rows].set(given.closed)
+        return bounds(elements, directions_of_slip(elements, given), given.t, q, v, pressed) > 0
+
+    def multipliers_at(self, given: Given, w: Float[Array, " u"], units: Float[Array, " n"]) -> Float[Array, " u"]:
+        """w with the multipliers that best balance its forces."""
+        flat, q, v, of = self.taken_apart(given, w)
+        if not flat.rows:
+            return w
+        f, (_, G, _) = self.force(flat, given, q, v, of), constraint_rows(flat, given.t, q, v)
+        sizes = jnp.max(jnp.abs(G) * units[None], axis=1, initial=0.0)
+        of = of._replace(multipliers=least_change(G.T, -f, 1 / jnp.where(sizes > 0, sizes, 1)))
+        return jax.lax.stop_gradient(jnp.concatenate(of))
 
 
 def left_open(J: Float[Array, "r u"], which: np.ndarray) -> Bool[Array, " b"]:
@@ -158,7 +183,7 @@ def steady_state(search: Search, system: System, t: Any, q: PyTree, qdot: PyTree
     """The steady state near a guess."""
     flat, t, q0, v0 = checked(system, t, q, qdot, params, states)
     values = start_values(system, states, t, q, qdot, params)
-    given = Given(eqx.filter(params, eqx.is_array), t, q0, v0, jnp.zeros(len(search.running), bool))
+    given = Given(eqx.filter(params, eqx.is_array), t, q0, v0, jnp.zeros(len(search.running), bool), touched(flat, t, q0, v0))
     equations = Equations(search, system, q, params, values, given, flat)
     start = jax.lax.stop_gradient(q0)
     units = _units(inertia(flat, t, start, v0).as_matrix())
@@ -168,16 +193,18 @@ def steady_state(search: Search, system: System, t: Any, q: PyTree, qdot: PyTree
         start = minimum_near(V, lambda q: flat.holonomic(t, q), start, equations.moving, jnp.where(within > 0, within, 1))
     nothing = jnp.zeros(flat.rows, q0.dtype), jnp.zeros(equations.friction_rows, q0.dtype)
     of = Unknowns(start[equations.moving], v0[equations.running], ravel_pytree(values)[0].astype(q0.dtype), *nothing)
-    f, (_, G, _) = equations.force(flat, given, start, v0, of), constraint_rows(flat, t, start, v0)
-    sizes = jnp.max(jnp.abs(G) * units[None], axis=1, initial=0.0)
-    of = of._replace(multipliers=least_change(G.T, -f, 1 / jnp.where(sizes > 0, sizes, 1)) if flat.rows else of.multipliers)
     ease = jnp.ones(sum(x.size for x in of), q0.dtype).at[equations.sizes[2] :].set(1e8 if search.held else 1.0)  # q stays if it can
-    guess = jax.lax.stop_gradient(jnp.concatenate(of))
+    guess = equations.multipliers_at(given, jnp.concatenate(of), units)
     if search.running:
         J = jax.jacfwd(equations, 1)(jax.lax.stop_gradient(given), guess)
         given = given._replace(open=left_open(J, equations.sizes[0] + np.arange(len(search.running))))
     known = jnp.zeros_like(ease).at[: equations.moving.size].set(units[equations.moving])
-    return _described(equations, given, root_near(equations, given, guess, known, units, int(equations.sizes[2]), ease))
+    near = lambda given, guess: root_near(equations, given, guess, known, units, int(equations.sizes[2]), ease)
+    if flat.contacts:
+        given, root = on_contacts(equations, given, guess, near, units)
+    else:
+        root = near(given, guess)
+    return _described(equations, given, root._replace(w=differentiable_root(equations, given, root.w, root.units, units)))
 
 
 def _units(M: Float[Array, "n n"]) -> Float[Array, " n"]:
@@ -253,7 +280,7 @@ def _friction(
 
 def directions_of_slip(elements: FrictionElements, given: Given) -> Float[Array, " r"]:
     """The slip direction in the rows of each element that slips in the guess, as on a running belt; 0 for elements at rest there."""
-    _, t, q, v, _ = jax.lax.stop_gradient(given)
+    t, q, v = jax.lax.stop_gradient((given.t, given.q, given.v))
     slip = elements.slip(t, q, v)
     size = elements.norms(slip)
     at_rest = size <= slip_of(elements, t, q, v, 1e2 * jnp.finfo(v.dtype).eps * jnp.abs(v))

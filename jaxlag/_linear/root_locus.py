@@ -15,7 +15,7 @@ from .._model.numbers import number, numbers, refuse_nan
 from .._model.paths import leaf_names
 from .._model.state_values import given_states, sampled
 from .._model.system import System
-from .._model.validation import coordinates, parameters, state, without_contacts
+from .._model.validation import coordinates, parameters, state
 from .._program.jit import compiled, is_concrete, seen
 from .branches import Spectrum, Transition, finer, followed
 from .crossing import Crossing, located, moving
@@ -23,7 +23,7 @@ from .eigenvalues import eigen, rounding
 from .equilibrium import equilibrium, steady
 from .linear_system import LinearSystem
 from .linearise import linearise
-from .matrices import Choice, matrices
+from .matrices import Choice, Matrices, matrices
 from .not_differentiated import without_derivative
 from .zero_eigenvalues import Core
 
@@ -115,7 +115,6 @@ class _Family:
     """A steady state and its linear system as functions of a parameter."""
 
     def __init__(self, system: System, q: Any, qdot: Any, params: PyTree, over: str, t: Any, states: PyTree, first: float):
-        without_contacts(system, "`root_locus`")
         self.system, self.q, self.qdot, self.over = system, q, qdot, over
         like = q if not callable(q) else call(q, "`q`", params, t=0.0)
         like = coordinates(like, "q")
@@ -133,6 +132,7 @@ class _Family:
         refuse_nan(self.at(first, self.params))
         self.steady: dict[float, Any] = {}  # states that were found, from which others start
         self.choice = Choice((), None, self._linearised(first, seen(self.params)).coordinates.partition, 0)
+        self.closed = np.asarray(self._matrices(first, seen(self.params)).closed)
 
     def at(self, value: Any, params: PyTree) -> PyTree:
         """`params` with this value."""
@@ -142,7 +142,16 @@ class _Family:
 
     def matrix(self, value: Any, params: PyTree) -> Float[Array, "d d"]:
         """A."""
-        return matrices(self.choice, self.system, self.t, *self.state(value, params)).rates.by_state
+        found = self._matrices(value, params)
+        if is_concrete(found.closed) and np.any(np.asarray(found.closed) != self.closed):
+            raise ValueError(
+                f"`values` must be those at which contacts stay open or closed, but at {self.over} = {float(value):g} one changes. "
+                "Follow the branches up to there, and from there on."
+            )
+        return found.rates.by_state
+
+    def _matrices(self, value: Any, params: PyTree) -> Matrices:
+        return matrices(self.choice, self.system, self.t, *self.state(value, params))
 
     def state(self, value: Any, params: PyTree) -> tuple[PyTree, PyTree, PyTree, PyTree]:
         """The arguments of A: q, q̇, `params` and the first-order states."""

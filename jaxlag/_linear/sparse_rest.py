@@ -46,10 +46,10 @@ def many_at_rest(search: Search, system: System, t: Any, q: PyTree, qdot: PyTree
     """As `steady_state`; None if there are few coordinates, no structure, or more than forces and positions in the equations."""
     flat, t, q0, v0 = checked(system, t, q, qdot, params, states)
     beside = search.fixed or search.running or search.held or system.states or system.nonholonomic
-    if q0.size < MANY or beside or (search.stable and flat.rows) or find_elements(flat) is not None:
+    if q0.size < MANY or beside or system.unilateral or (search.stable and flat.rows) or find_elements(flat) is not None:
         return None
     values = start_values(system, states, t, q, qdot, params)
-    given = Given(eqx.filter(params, eqx.is_array), t, q0, v0, jnp.zeros(0, bool))
+    given = Given(eqx.filter(params, eqx.is_array), t, q0, v0, *[jnp.zeros(0, bool)] * 2)
     start = lax.stop_gradient(jnp.concatenate([q0, jnp.zeros(flat.rows, q0.dtype)]))
     of_rest = EquationsOfRest(search, system, q, params, values, given, flat)
     equations = SparseEquations.of(of_rest, given, start, q0.size)

@@ -22,7 +22,7 @@ from .._program.sparse_matrix import SparseMatrix, dense
 from .augmented_inertia import alike
 from .constrained_root import Linear, is_without_curvature, root_of
 from .constraint_residuals import off, off_constraints, terms
-from .contact import in_contact
+from .contact import in_contact, in_current_mode
 from .friction_elements import find_elements, with_all_masses
 from .lagrange import inertia, position_rows, velocity_residual, velocity_rows
 from .massless import inertial_part, with_first_order_rates
@@ -239,7 +239,16 @@ def consistent_state(
     jl.consistent_state(rod, jnp.array([3.0, 4.0]), jnp.array([1.0, 0.0]), {"l": 10.0})  # [6, 8], [0.64, −0.48]
     ```
     """
-    core = _StateOn(_fixed_indices(coordinates(q, "q"), listed(fixed)))
+    return _state(_StateOn(_fixed_indices(coordinates(q, "q"), listed(fixed))), system, q, qdot, params, t, states)
+
+
+def state_in_contact(system: System, q: PyTree, qdot: PyTree, params: PyTree, t: Any, states: PyTree) -> tuple[PyTree, PyTree]:
+    """`consistent_state`, and on the contacts that are closed."""
+    return _state(_StateOn((), closes=True), system, q, qdot, params, t, states)
+
+
+def _state(core: "_StateOn", system: System, q: PyTree, qdot: PyTree, params: PyTree, t: Any, states: PyTree) -> tuple[PyTree, PyTree]:
+    """The state, or a reason why there is none."""
     (new_q, new_qdot), (reached, determined, affine, defined) = at_state(core, system, q, qdot, params, t, states)
     if is_concrete(reached):
         passed = {
@@ -256,11 +265,16 @@ def consistent_state(
 
 @dataclasses.dataclass(frozen=True)
 class _StateOn:
-    """`nearest_state` with some coordinates fixed; compared by these, so that it is compiled once."""
+    """`nearest_state` with some coordinates fixed, and on closed contacts if it `closes` them; compared by these, so that it is compiled
+    once.
+    """
 
     held: tuple[int, ...]
+    closes: bool = False
 
     def __call__(self, flat: Flat, t, q, v):
+        if self.closes and flat.contacts:
+            flat = in_contact(flat, in_current_mode(flat, t, q, v).closed)
         free = [i for i in range(q.size) if i not in self.held]
         q, v, *flags = nearest_state(flat, t, q, v, free)
         known = jnp.all(jnp.stack(flags))

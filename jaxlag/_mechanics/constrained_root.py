@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import lineax as lx
 from jaxtyping import Array, Float
 
-from .._program.implicit import implicit_root
+from .._program.implicit import implicit_root, open_function
 from .._program.sparse_matrix import SparseMatrix
 from .pseudo_inverse import Constraints
 from .saddle_point import Rows, SaddlePoint, saddle_point, saddle_solver
@@ -43,8 +43,8 @@ def is_without_curvature(M: Any, G: Any) -> bool:
 
 def root_of(residual: Callable, linear: Callable, search: Callable, args: tuple, like: Float[Array, " w"]) -> tuple[Array, Any]:
     """w with residual(args, w) = 0, as `search(linear, args)` finds it, and what else that says; linear(args, w) is the slope there."""
-    residual, of_residual = jax.closure_convert(residual, args, like)
-    linear, of_linear = jax.closure_convert(linear, args, like)
+    residual, of_residual = open_function(residual, args, like)
+    linear, of_linear = open_function(linear, args, like)
     fixed, within = jax.lax.stop_gradient((args, of_linear))
     step_at = lambda args, w, within: jax.tree.map(jnp.asarray, linear(args, w, *within))  # JAX may hand numbers on as NumPy's arrays
     w, aux = search(lambda args, w: step_at(args, w, within), fixed)

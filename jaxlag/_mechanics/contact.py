@@ -18,7 +18,7 @@ from jaxtyping import Array, Bool, Float
 from .._model.flat import Flat, variant
 from .._program.implicit import implicit_root, open_function
 from .._program.scalarise import scalarised
-from .augmented_inertia import augmented
+from .augmented_inertia import augmented, unit_lengths
 from .constrained_acceleration import Impulse, constrained_acceleration
 from .constrained_slip import on_constraints
 from .friction_elements import FrictionElements, find_elements, with_all_masses
@@ -359,6 +359,20 @@ def idle(flat: Flat, elements: FrictionElements, sigma: Float[Array, " r"], boun
 def touching(flat: Flat, t, q, v, scales: GapScales) -> Bool[Array, " c"]:
     """Which contacts touch, and neither open nor close."""
     return (flat.gaps(t, q) <= scales.gap) & (jnp.abs(gap_rates(flat, t, q, v)) <= scales.rate)
+
+
+def barely_touching(mode: Flat, t, q, v, multipliers: Float[Array, " m"], forces: Float[Array, " n"]) -> Bool[Array, " c"]:
+    """Which contacts touch, and neither open nor close, where nothing presses them: the motion is another one on either side of such a
+    state. `mode`: `in_current_mode`; `multipliers`: those in it; `forces`: the size of those that act on each coordinate.
+    """
+    if mode.closed is None:
+        return jnp.zeros(0, bool)
+    t, q, v, multipliers, forces = jax.lax.stop_gradient((t, q, v, multipliers, forces))
+    G = jax.jacfwd(mode.gaps, argnums=1)(t, q)
+    lengths = unit_lengths(inertia(mode, t, q, v).as_matrix(), G)
+    pushes, others = (jnp.max(jnp.where(G != 0, x * lengths[None], 0), axis=1) for x in (jnp.abs(G), forces[None]))
+    pressed = mode.closed & (contact_rows(mode, multipliers) * pushes > jnp.finfo(q.dtype).eps ** 0.5 * others)
+    return touching(mode, t, q, v, gap_scales(mode, t, q, v, *roundings_beside(mode, t, q, v))) & ~pressed
 
 
 def in_current_mode(flat: Flat, t, q, v) -> Flat:

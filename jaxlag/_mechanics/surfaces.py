@@ -7,7 +7,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
-from jaxtyping import PyTree
+from jaxtyping import Array, PyTree
 
 from .._model.event import Event
 from .._model.flat import Flat, StatesAt, bind, read_once
@@ -135,9 +135,14 @@ def with_surfaces(flat: Flat) -> Flat:
     """With the functions that pass through zero at surfaces among the witnesses of events, behind these."""
 
     def witnesses(t, q, v, multipliers):
-        return jnp.concatenate([flat.witnesses(t, q, v, multipliers), _boundaries(flat, t, q, v).values])
+        return jnp.concatenate([flat.witnesses(t, q, v, multipliers), surface_values(flat, t, q, v)])
 
     return flat._replace(witnesses=witnesses)
+
+
+def surface_values(flat: Flat, t: Any, q: Any, v: Any) -> Array:
+    """The functions that pass through zero at surfaces."""
+    return _boundaries(flat, t, q, v).values
 
 
 def _known(flat: Flat) -> tuple[tuple[int, ...], tuple[str, ...]]:

@@ -133,6 +133,11 @@ class EquationsOfMotion:
         elements = on_constraints(flat, elements, t, parts.q, parts.v, lambda: _left_by_constraints(self, t, parts, args))
         return flat, in_mode(flat, elements, parts.sigma), elements
 
+    @property
+    def as_written(self) -> "EquationsOfMotion":
+        """The same, whose functions are not held on the sides of surfaces: as programs that tell what follows the time."""
+        return dataclasses.replace(self, sided=False)
+
     def on_held_sides(self, t, parts: Parts, args: Arguments) -> tuple[Any, Parts]:
         """The time and the state at which forces are taken: those themselves, unless functions jump or bend, or nearest by."""
         return on_held_sides(self.contents(t, parts, args)[0], t, parts, args, self.levels) if self.sided else (t, parts)

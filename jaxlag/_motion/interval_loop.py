@@ -255,6 +255,7 @@ class IntervalLoop(NamedTuple):
         args = args._replace(params=self.inputs(given[0]).pieces(steps.following))
         state = eqx.combine(moving.solver_state, steps.solver_state)
         y, error, dense, new, result = self.solver.step(self._term(), t, t1, moving.y, args, state, steps.has_jumped)
+        t1 = self.solver.end_of(new, t1) if hasattr(self.solver, "end_of") else t1
         changing, rest = eqx.partition(new, eqx.is_inexact_array)
         result = None if result is dfx.RESULTS.successful else result  # always, as of an explicit scheme: to compare them would be compiled
         return Tried(t1, node, y, error, changing, dense if self.dense else None), jax.lax.stop_gradient((result, rest))

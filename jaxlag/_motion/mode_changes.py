@@ -31,7 +31,7 @@ from .first_order import EquationsOfMotion
 from .path_bounds import PathBounds
 from .protocol import Arguments
 from .state_vector import Parts, Start
-from .witnesses import margins_at, plain_witnesses, witness_margins
+from .witnesses import margins_at, plain_witnesses, sides_at_start, witness_margins
 
 CONVERGED = 1e-9  # of the motion, the time that infinitely many impacts may yet take when they are summed up,
 OFTEN = 64  # parts of a step, in each of which what has no bounds is looked at
@@ -95,7 +95,7 @@ def _contact_margins(flat: Flat, t, q, closed, forces, args: Arguments):
 
 class Approach(NamedTuple):
     """What is known of gaps and witnesses along the path of a step: whether none is zero from one time to another, if that can be known at
-    all, and of the margins of all modes, whether they may be negative between two times.
+    all, and of the margins of all modes, whether they may be negative between two times at which they are known.
     """
 
     stays_away: Callable | None
@@ -103,8 +103,9 @@ class Approach(NamedTuple):
 
 
 def approach(equations: EquationsOfMotion, path: Callable, t0, t1, args: Arguments) -> Approach:
-    """Bounds of gaps and witnesses and of their rates, where there are any, along the path over shares of a step. What rises or falls all
-    the time is seen at the ends; what has no bounds is looked at more often.
+    """Bounds of gaps and witnesses, of their rates and of theirs, where there are any, along the path over shares of a step. What rises or
+    falls all the time is seen at the ends, and so is what is bent too little to pass zero between them; what has no bounds is looked at
+    more often.
     """
     t, bounds = t0, PathBounds.of(path, t0, t1)
     y, parts = bounds.y, equations.parts(bounds.y)
@@ -118,23 +119,30 @@ def approach(equations: EquationsOfMotion, path: Callable, t0, t1, args: Argumen
             return function(equations.flat_at(args.params, equations.states_of(t, parts)), t, parts)
 
         rate = lambda t, y, ydot: jax.jvp(at, (t, y), (jnp.ones_like(t), ydot))[1]
-        of_value, of_rate = bounds_over_boxes(at, t, y), bounds_over_boxes(rate, t, y, y)
-        value = of_value and (lambda start, end: of_value((start, end), bounds.between(start, end)[0]))
-        return value, of_rate and (lambda start, end: of_rate((start, end), *bounds.between(start, end)))
+        curvature = lambda t, y, ydot, yddot: jax.jvp(rate, (t, y, ydot), (jnp.ones_like(t), ydot, yddot))[1]
+        found = [bounds_over_boxes(of, t, *[y] * count) for count, of in enumerate((at, rate, curvature), 1)]
+        if any(of is None for of in found):
+            return found[0] and (lambda start, end: found[0]((start, end), bounds.between(start, end)[0])), None
+        within = lambda start, end: bounds.between(start, end)
+        all_of = lambda start, end: [of((start, end), *within(start, end)[:count]) for count, of in enumerate(found, 1)]
+        return (lambda start, end: all_of(start, end)[0]), all_of
 
     of_gaps = along(lambda flat, t, parts: flat.gaps(t, parts.q))
     of_events = along(lambda flat, t, parts: sign * plain_witnesses(flat, t, parts.q, parts.v))
     known = [(of, watched) for of, watched in ((of_gaps, ~closed), (of_events, jnp.ones(equations.events, bool))) if watched.size]
     is_known = not flat.events_need_multipliers and all(bound is not None for of, _ in known for bound in of)
 
-    def may_arrive(start, end):
-        found = [jnp.zeros(equations.elements, bool)]
-        for (value, rate), watched in known:
-            if value is None or rate is None:
+    def may_arrive(start, end, before, behind):
+        found, first = [jnp.zeros(equations.elements, bool)], equations.elements
+        for (_, all_of), watched in known:
+            if all_of is None:
                 found.append(watched & often(start, end))
             else:
-                (low, _), (falls, rises) = value(start, end), rate(start, end)
-                found.append(watched & (low < 0) & (falls < 0) & (rises > 0))
+                (low, _), (falls, rises), (_, curvature) = all_of(start, end)
+                ends = jnp.minimum(before, behind)[first : first + watched.size]
+                dips = ends < jnp.maximum(curvature, 0) * (end - start) ** 2 / 8  # below the chord by no more
+                found.append(watched & (low < 0) & (falls < 0) & (rises > 0) & dips)
+            first += watched.size
         if flat.events_need_multipliers:
             found[-1] = found[-1] | often(start, end)
         return jnp.concatenate(found)
@@ -401,6 +409,8 @@ def unstarted(equations: EquationsOfMotion, at: StatesAt, params) -> Start:
     if equations.elements:
         _, sigma = slipping(elements, t, parts.q, parts.v)
         parts = parts._replace(q=returned(flat, elements, t, parts.q, parts.v), sigma=sigma)
+    if equations.sided:
+        parts = parts._replace(sign=sides_at_start(equations, t, parts, args))
     is_outside = _is_outside(flat, t, parts) if equations.contacts else yes
     return Start(parts.y, yes, yes, is_outside, yes, yes)
 

@@ -48,15 +48,16 @@ class OneEvaluationSolver(StickSlipSolver):
         """The state of the scheme, which the first step makes, and what there is to be found of the start."""
         rate, is_new = super().init(terms, t0, t1, y0, args)
         no = jnp.array(False)
-        return rate, is_new, Found(y0, jnp.zeros(self.equations.size, y0.dtype), no, no) if self.begins else None
+        found = Found(y0, jnp.zeros(self.equations.size, y0.dtype), no, no) if self.begins else None
+        return rate, is_new, found, jnp.asarray(t1, y0.dtype)
 
     def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
-        rate, is_new, start = solver_state
+        rate, is_new, start, _ = solver_state
         kind = ContactStep if self.equations.contacts else Step if self.equations.elements else EventStep
         done = kind.of(self, t0, t1, y0, args, ~start.known if self.begins else None).run(rate, made_jump | is_new)
         ended = done.split.seen.ended
         first = jax.tree.map(lambda cut, whole: jnp.where(ended, cut, whole), done.split.first, done.piece)
-        split = done.split._replace(first=first, second=done.piece)
+        split, t1 = done.split._replace(first=first, second=done.piece), done.end
         y1, error, dense, rate, result = self._joined(split, t0, t1, y0, args)
         if self.begins:
             begins, fine, begun = ~start.known, jnp.array(True), done.begun
@@ -67,7 +68,11 @@ class OneEvaluationSolver(StickSlipSolver):
             y1, error = jnp.where(fails, y0, y1), jnp.where(fails, 0, error)
             found = Found(begun.y, begun.loads, jnp.array(True), fine)
             start = jax.tree.map(lambda new, old: jnp.where(begins, new, old), found, start)
-        return y1, error, dense, (rate, jnp.array(False), start), result
+        return y1, error, dense, (rate, jnp.array(False), start, t1), result
+
+    def end_of(self, solver_state: Any, t1: Any) -> Any:
+        """Where a step has ended that was to go to t1: before a second mode ends in it."""
+        return solver_state[3]
 
     def start_of(self, solver_state: Any, y0: Any) -> tuple[Any, Any]:
         """y at the start of the motion, as far as that was found, and whether it is as it must be."""
@@ -81,5 +86,5 @@ class OneEvaluationSolver(StickSlipSolver):
     @staticmethod
     def knowing(solver_state: Any, known: Any) -> Any:
         """The state of the solver where the mode at the start may be known."""
-        rate, is_new, start = solver_state
-        return rate, is_new, start._replace(known=known)
+        rate, is_new, start, end = solver_state
+        return rate, is_new, start._replace(known=known), end

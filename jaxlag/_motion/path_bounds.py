@@ -37,15 +37,17 @@ class PathBounds(NamedTuple):
         changes = jax.vmap(lambda share: path(share) - y)(NODES.astype(y.dtype))
         return cls(start, end, y, jnp.sum(TO_COEFFICIENTS.astype(y.dtype)[:, :, None] * changes[None], axis=1))
 
-    def between(self, low, high) -> tuple[Interval, Interval]:
-        """Bounds of y and of its rates from one time to another within."""
+    def between(self, low, high) -> tuple[Interval, Interval, Interval]:
+        """Bounds of y, of its rates and of theirs from one time to another within."""
         length = jnp.where(self.end == self.start, 1, self.end - self.start)
         a, b = ((t - self.start) / length for t in (low, high))
         part = _until((b - a) / jnp.where(a == 1, 1, 1 - a), _from(a, self.coefficients))
-        slope = DEGREE * jnp.diff(part, axis=0) / jnp.where(high == low, 1, high - low)
+        duration = jnp.where(high == low, 1, high - low)
+        slope = DEGREE * jnp.diff(part, axis=0) / duration
+        curvature = (DEGREE - 1) * jnp.diff(slope, axis=0) / duration
         rounding = ROUNDING * jnp.finfo(part.dtype).eps * jnp.max(jnp.abs(self.coefficients), axis=0)
-        of_y, of_rates = ((jnp.min(x, axis=0), jnp.max(x, axis=0)) for x in (part, slope))
-        return (self.y + of_y[0] - rounding, self.y + of_y[1] + rounding), of_rates
+        of_y, of_rates, of_curvature = ((jnp.min(x, axis=0), jnp.max(x, axis=0)) for x in (part, slope, curvature))
+        return (self.y + of_y[0] - rounding, self.y + of_y[1] + rounding), of_rates, of_curvature
 
 
 def _from(s, coefficients):

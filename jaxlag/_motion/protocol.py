@@ -44,6 +44,10 @@ class FirstOrderSystem(Protocol):
         """Whether functions of the system depend on the time."""
 
     @property
+    def as_written(self) -> "FirstOrderSystem":
+        """The same, whose functions are not held on the sides of surfaces: as programs that tell what follows the time."""
+
+    @property
     def controlled(self) -> tuple[bool, ...]:
         """Which of the first entries of y set the steps by their error: positions, velocities, states of first order."""
 
@@ -80,6 +84,11 @@ class AugmentedSystem(abc.ABC):
     def follows_time(self) -> bool:
         """The same as of the equations alone."""
         return self.equations.follows_time
+
+    @property
+    def as_written(self) -> "AugmentedSystem":
+        """The same of the equations as they are written."""
+        return dataclasses.replace(self, equations=self.equations.as_written)
 
     @property
     def controlled(self) -> tuple[bool, ...]:

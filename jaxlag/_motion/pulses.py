@@ -41,7 +41,7 @@ def hides_pulse(equations: FirstOrderSystem, nodes: np.ndarray, t0, t1, y, args:
     if not equations.follows_time:
         return jnp.array(False)
     t0, t1, y, args = undifferentiated((t0, t1, y, args))
-    functions = time_functions(lambda t, y: equations.rates(t, y, args), t0, y)
+    functions = time_functions(lambda t, y: equations.as_written.rates(t, y, args), t0, y)
     if functions is None:
         return jnp.array(False)
     assert args.scales is not None  # of every motion

@@ -11,8 +11,8 @@ from .step_monitor import Seen
 
 # Phases of a step: the whole step, watched for the end of a mode; where one was seen, Newton's steps for its time, each of them the
 # step up to there (the first makes the time right and its derivative, the others its higher derivatives), after the last of which the
-# mode changes; and the rest of the step, watched for a second end.
-WHOLE, NEWTON, CHANGE, REST = range(4)
+# mode changes; and the rest of the step, watched for a second end. Where there is one, the step may end before it: a shorter rest.
+WHOLE, NEWTON, CHANGE, REST, SHORT = range(5)
 PHASES = np.array([WHOLE, NEWTON, NEWTON, CHANGE, REST], np.int32)
 SEEN_LATE = np.array([WHOLE, NEWTON, NEWTON, NEWTON, CHANGE, REST], np.int32)  # as gaps and witnesses are, by their rounding
 SIMULTANEOUS = 1e3  # modes that end within this many roundings of time end together

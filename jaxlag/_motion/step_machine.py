@@ -40,7 +40,7 @@ from .loads import loads_within
 from .mode_changes import Approach, AtEnd, approach, at_rest_within, exactly, in_other_mode, margins, margins_of
 from .protocol import Arguments, undifferentiated
 from .runge_kutta import ExplicitRungeKutta, weighted, with_row
-from .split import CHANGE, PHASES, REST, SEEN_LATE, WHOLE, Cut, Piece, Split, next_estimate
+from .split import CHANGE, PHASES, REST, SEEN_LATE, SHORT, WHOLE, Cut, Piece, Split, next_estimate
 from .state_vector import Parts
 from .step_monitor import CHEBYSHEV, LOOKS, Looks, Monitor, Seen, changes_by_time, reach_of_time, slopes_of_interpolant
 from .step_turn import BACK, BEGIN, COUNT, DONE, END, LOOK, SELECT, STAGE, TURN, Back, Begun, Choice, Decision, Point, Turn, Watch
@@ -65,7 +65,7 @@ class Step:
         t, y, still = undifferentiated((t0, y0, args))
         equations = solver.equations
         assert isinstance(equations, EquationsOfMotion)  # as `has_one_evaluation` has it
-        of_time = time_dependence(lambda t, y: margins(equations, t, y, still, y), t, y) if equations.follows_time else None
+        of_time = time_dependence(lambda t, y: margins(equations.as_written, t, y, still, y), t, y) if equations.follows_time else None
         return cls(solver, t0, t1, y0, args, of_time, begins)
 
     @property
@@ -82,8 +82,9 @@ class Step:
 
     @property
     def phases(self) -> Array:
-        """Those of a step."""
-        return jnp.asarray(SEEN_LATE if self.equations.contacts or self.equations.events else PHASES)
+        """Those of a step, the last for one that ends before a second end of a mode."""
+        phases = SEEN_LATE if self.equations.contacts or self.equations.events else PHASES
+        return jnp.asarray([*phases, SHORT])
 
     @property
     def may_turn(self) -> bool:
@@ -315,7 +316,7 @@ class Step:
         piece = piece._replace(y=y, error=error, dense=piece.dense | {"y1": y})
         phase, monitor = self.phases[turn.phase], self._monitor(turn.start, turn.end)
         search, looks_along = monitor.start(piece.y.dtype), jnp.where(turn.start < turn.end, LOOK, DONE)
-        kind = jnp.where((phase == WHOLE) | (phase == REST), looks_along, END)
+        kind = jnp.where((phase == WHOLE) | (phase == REST), looks_along, jnp.where(phase == SHORT, DONE, END))
         watch = turn.watch._replace(search=search, ts=monitor.times(search))
         turn = turn._replace(kind=kind, first=jnp.array(0), piece=piece, watch=watch)
         return Decision(self.unless_far(turn, turn.kind == LOOK), jnp.array(False), turn.end, y)
@@ -333,18 +334,23 @@ class Step:
         looks = Looks(values, slopes_of_interpolant(low, high, nodes, ts), changes_by_time(self.of_time_alone, steepness, ts))
         hides = self.arriving(turn.piece, start, end)
         search = dataclasses.replace(monitor, hides=hides).closer(search, ts, looks)
-        more, seen = monitor.going_on(search, ~rest), monitor.seen(search)
-        fine = more | ~rest | ~(seen.ended | seen.unsure | seen.negative)
+        before = search.low > start  # up to there no mode ends
+        more, seen = monitor.going_on(search, ~(rest & before)), monitor.seen(search)
+        shorter = rest & ~more & seen.ended & ~seen.unsure & before
+        fine = more | ~rest | shorter | ~(seen.ended | seen.unsure | seen.negative)
         if not self.equations.elements:
             fine |= ~cut.consistent  # nothing can follow
         cuts = ~more & ~rest & seen.ended
+        halfway = (start + search.low) / 2
+        shorter &= cut.usable & fine & (halfway > jax.lax.stop_gradient(self.t0))
+        onward, later = cuts | shorter, jnp.where(rest, halfway, seen.time)
         cut = cut._replace(usable=cut.usable & fine, estimate=jnp.where(rest, cut.estimate, seen.time))
         kept = jax.tree.map(lambda new, old: jnp.where(rest, old, new), seen, turn.split.seen)
         turn = turn._replace(
-            kind=jnp.where(more, LOOK, jnp.where(cuts, STAGE, DONE)),
-            first=jnp.where(cuts, 1, 0),
-            phase=turn.phase + cuts,
-            end=jnp.where(cuts, seen.time, turn.end),
+            kind=jnp.where(more, LOOK, jnp.where(onward, STAGE, DONE)),
+            first=jnp.where(onward, 1, 0),
+            phase=turn.phase + onward,
+            end=jnp.where(onward, later, turn.end),
             split=turn.split._replace(seen=kept, cut=cut),
             watch=Watch(search, monitor.times(search), values, smooth, steepness),
         )

@@ -67,8 +67,9 @@ class Search(NamedTuple):
 class Monitor:
     """The search for the first end of a mode along a path from t0 to t1, look by look: at some times each, of which it says the next.
 
-    `hides(low, high)` are those of the margins that may be negative between two times, for all that is known of them; `bounded`: whether
-    there are bounds of all that follows the time alone. It is looked at `nodes` of an interval, from 0 to 1, until there is an end in it.
+    `hides(low, high, before, behind)` are those of the margins that may be negative between two times at which they are known, for all that
+    is known of them; `bounded`: whether there are bounds of all that follows the time alone. It is looked at `nodes` of an interval, from 0
+    to 1, until there is an end in it.
     """
 
     elements: int
@@ -102,12 +103,16 @@ class Monitor:
         hidden = jnp.zeros((len(ts) - 1, value.shape[1]), bool)
         if (hides := self.hides) is not None:
             none = np.zeros(self.elements, bool)
-            hidden = jax.vmap(lambda low, high: jnp.concatenate([hides(low, high), none]))(ts[:-1], ts[1:]) & (part > brief)
+            of_margins = value[:, : self.elements]
+            given = ts[:-1], ts[1:], of_margins[:-1], of_margins[1:]
+            hidden = jax.vmap(lambda *given: jnp.concatenate([hides(*given), none]))(*given) & (part > brief)
         largest = jnp.maximum(search.largest, jnp.max(jnp.abs(value), axis=0))
         is_bound = np.arange(2 * self.elements) >= self.elements  # a bound of zero is none that is negative
         value = value + jnp.where(is_bound, 1e-9 * largest, 0)[None]
         beyond = jnp.any(value[1:] < 0, axis=1)
-        doubtful = jnp.any(_dips(value, slope, part) & (part > near) | hidden | (value[:-1] + value[1:] < change) & (part > brief), axis=1)
+        doubtful = jnp.any(
+            _dips(value, slope, part) & (part > near) | hidden | (jnp.maximum(value[:-1], value[1:]) < change) & (part > brief), axis=1
+        )
         wanted = beyond | (doubtful & ~found)
         i = jnp.where(jnp.any(wanted), jnp.argmax(wanted), LOOKS - 1)  # the end itself may be beyond by rounding alone
         onward = ~found & ~jnp.any(wanted)
@@ -143,13 +148,22 @@ class Monitor:
 
 
 def first_end(
-    margins: Callable, path: Callable, t0, t1, elements: int, scales: Any, exactly: Any = True, between: Callable | None = None
+    margins: Callable,
+    path: Callable,
+    t0,
+    t1,
+    elements: int,
+    scales: Any,
+    exactly: Any = True,
+    between: Callable | None = None,
+    as_written: Callable | None = None,
 ) -> Seen:
     """When the first of `margins(t, y, start)` turns negative along a `path`; the elements' bounds come after their margins, and count.
 
     `start` is y at the start, where what stays as it is along the path may be taken from. `exactly`, `between`: as of a `Monitor`.
+    `as_written`: margins as programs that tell what follows the time, if others do.
     """
-    of_time_alone = time_dependence(lambda t, y: margins(t, y, y), t0, path(t0))
+    of_time_alone = time_dependence(lambda t, y: (as_written or margins)(t, y, y), t0, path(t0))
     bounded = of_time_alone is None or of_time_alone.is_bounded
     monitor, look = Monitor(elements, scales, t0, t1, bounded, between), _looking(margins, path, t0, t1, of_time_alone)
 

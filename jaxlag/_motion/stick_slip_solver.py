@@ -133,11 +133,12 @@ class StickSlipSolver(ProjectedSolver):
         """What is seen of the margins along a piece, on its dense output; not differentiated."""
         make, zero = self.solver.interpolation_cls, jnp.zeros_like(t0)
         path = make(t0=t0, t1=t1, **dense)
-        of, modes = lambda t, y, start: margins(self.equations, t, y, args, start), self.equations.modes
+        of, as_written = (lambda t, y, start, e=e: margins(e, t, y, args, start) for e in (self.equations, self.equations.as_written))
+        modes, along = self.equations.modes, (path.evaluate, t0, t1)
         if not (self.equations.contacts or self.equations.events):
-            return first_end(of, path.evaluate, t0, t1, modes, args.scales, exactly)
+            return first_end(of, *along, modes, args.scales, exactly)
         between = approach(self.equations, make(t0=zero, t1=zero + 1, **dense).evaluate, t0, t1, args)
-        watched = lambda: first_end(of, path.evaluate, t0, t1, modes, args.scales, exactly, between.may_arrive)
+        watched = lambda: first_end(of, *along, modes, args.scales, exactly, between.may_arrive, as_written)
         if between.stays_away is None:
             return watched()
         no = jnp.array(False)

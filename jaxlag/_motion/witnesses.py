@@ -108,6 +108,16 @@ def _sides(equations, t, parts, args, qddot):
     return side, jnp.abs(value) > scale_of(of_q, of_v)
 
 
+def sides_at_start(equations: EquationsOfMotion, t, parts: Parts, args: Arguments) -> Float[Array, " w"]:
+    """The signs of the surfaces on which a motion begins and which velocities tell it leaves, and to which side: the mode is that there."""
+    t, q, v = jax.lax.stop_gradient((t, parts.q, parts.v))
+    flat = equations.contents(t, parts, args)[0]
+    of_state = lambda t, q: plain_witnesses(flat, t, q, v)
+    value, rate = jax.jvp(of_state, (t, q), (jnp.ones_like(t), v))
+    leaves = (value == 0) & (parts.sign == 0) & _is_surface(equations)
+    return jnp.where(leaves, jnp.sign(rate), parts.sign)
+
+
 def signs_behind_step(equations: EquationsOfMotion, t, parts: Parts, args: Arguments) -> Float[Array, " w"]:
     """The signs of the witnesses behind a step. One that stayed at zero and has left it takes its present sign, without an event."""
     assert args.scales is not None  # events are located

@@ -498,3 +498,34 @@ def test_inputs_that_move_a_constraint_are_refused_along_a_trajectory():
     assert jl.linearise(bob, motion, inputs=["q[0]"]).B.shape == (3, 2, 1)
     with pytest.raises(ValueError, match="`inputs` must not move a constraint along a trajectory"):
         jl.linearise(bob, motion, inputs=["rod"])
+
+
+# Where functions bend
+
+
+BENDING = {
+    "maximum": (lambda q, qdot, a: 0.5 * qdot**2 - 0.5 * q**2 - 2 * jnp.maximum(q - a, 0.0) ** 2, 1.0),
+    "where": (lambda q, qdot, a: 0.5 * qdot**2 - 0.5 * q**2 - 2 * jnp.where(q > a, (q - a) ** 2, 0.0), 1.0),
+    "at zero": (lambda q, qdot, a: 0.5 * qdot**2 - 0.5 * q**2 - 2 * jnp.maximum(q, 0.0) ** 2, 0.0),
+    "jumps": (lambda q, qdot, a: 0.5 * qdot**2 - jnp.abs(q - a), 1.0),
+    "two": (lambda q, qdot, a: 0.5 * jnp.sum(qdot**2) - 0.5 * jnp.sum(q**2) - 2 * jnp.maximum(q[0] - q[1] - a, 0.0) ** 2, [1.5, 0.5]),
+}
+
+
+@pytest.mark.parametrize("unit", [1.0, 1e-9])
+@pytest.mark.parametrize("kind", BENDING)
+def test_a_state_where_a_function_bends_is_refused(kind, unit):
+    """The motion is another one on either side, to which the state may be moved by as little as there is."""
+    energy, at = BENDING[kind]
+    system, params = jl.System(energy), {"a": 1.0 * unit}
+    with pytest.raises(ValueError, match="on one side of what bends or jumps, but `(maximum|where|abs)` of `lagrangian`"):
+        jl.linearise(system, np.array(at) * unit, params=params, frozen=True)
+    if kind in ("maximum", "where"):
+        for side, stiffness in ((1, 5.0), (-1, 1.0)):
+            near = jl.linearise(system, unit * (1 + 1e-12 * side), params=params, frozen=True)
+            np.testing.assert_allclose(near.A[1, 0], -stiffness)
+
+
+def test_what_is_smooth_is_not_refused_for_how_it_is_written():
+    system = jl.System(lambda q, qdot: 0.5 * qdot**2 - 0.5 * q**2 - 2 * jnp.abs(q) ** 3)
+    np.testing.assert_allclose(jl.linearise(system, 0.0).A, [[0, 1], [-1, 0]])

@@ -91,13 +91,10 @@ def test_friction_that_is_not_proportional_to_the_force():
 @pytest.mark.parametrize(
     "use",
     [
-        lambda: jl.linearise(ball, 1.0),
-        lambda: jl.equilibrium(ball, 1.0),
-        lambda: jl.root_locus(ball, 1.0, params={"v": 1.0}, over="v", values=[0.0, 1.0]),
         lambda: jl.equations(ball, 1.0, linearised_at=0.0),
         lambda: jl.regress(ball, jl.Experiment(jnp.linspace(0, 1, 11), jnp.linspace(0, 1, 11), 1.0, 0.0), {"m": 1.0}, free=("m",)),
     ],
-    ids=["linearise", "equilibrium", "root_locus", "equations", "regress"],
+    ids=["equations", "regress"],
 )
 def test_where_contacts_are_refused(use):
     with pytest.raises(ValueError, match="`system` must have no contacts that open and close"):

@@ -87,6 +87,16 @@ def test_rest_after_infinitely_many_impacts():
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("unit", [1.0, 1e-9])
+def test_a_step_ends_before_a_second_impact(unit):
+    """None is refused for it, so that there are little more steps than impacts, however their intervals shrink."""
+    height, g = H * unit, G * unit
+    motion = jl.simulate(ball, height, 0.0, jnp.array([0.0, 1000.0]), PARAMS | {"e": 0.5, "g": g})
+    impacts = int(motion.contacts["floor"].impacts[-1])
+    assert motion.stats["num_rejected_steps"] == 0 and impacts < motion.stats["num_steps"] < impacts + 20
+    np.testing.assert_allclose(motion.contacts["floor"].changed[-1], end_of_bouncing(height, 0.5, g), rtol=1e-9)
+
+
 def test_derivatives_of_the_end_of_bouncing():
     """By h, e, g; forward, reverse and of second order."""
     at, together = jnp.array([H, E, G]), lambda function: lambda at: function(*at)

@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from scipy.integrate import solve_ivp
+from scipy.integrate import quad, solve_ivp
 from scipy.optimize import brentq
 
 import jaxlag as jl
@@ -268,3 +268,66 @@ def test_a_disc_that_slides_and_spins_on_three_points():
     np.testing.assert_allclose(motion.qdot["x"][2], 0, atol=1e-12)
     np.testing.assert_allclose(motion.qdot["turn"][2], 0, atol=1e-12)
     assert all(np.all(of.sticking[2]) for of in motion.friction.values())
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("unit", [1.0, 1e6])
+def test_painleves_rod_in_space(unit):
+    """It slides in its plane, where no force of the floor is admissible, or aside as well, which turns friction out of that plane: there it
+    goes on, with λ = −a/(n n − μ n t cos β) for an acceleration a without it and slip at an angle β.
+    """
+    slip = lambda q, qdot: jnp.stack([qdot[0] + unit * jnp.cos(q[3]) * qdot[3], qdot[2]])
+    rod = jl.System(
+        lambda q, qdot, g: 0.5 * qdot[:3] @ qdot[:3] + unit**2 * qdot[3] ** 2 / 6 - g * q[1],
+        dissipation=lambda q, qdot, multipliers, mu: mu * jnp.abs(multipliers["floor"]) * jl.dissipation.speed(slip(q, qdot)),
+        unilateral={"floor": lambda q: q[1] - unit * jnp.cos(q[3])},
+    )
+    mu, phi, rate, g = 2.5, 0.6, -0.5, 9.81
+    nn, nt = 1 + 3 * np.sin(phi) ** 2, 3 * np.sin(phi) * np.cos(phi)  # of a rod of length 2 and mass 1
+    free = np.cos(phi) * rate**2 - g
+    seen = []
+    for aside in (0.0, 0.1, 2.0, 5.0):
+        along = 1.0
+        velocity = np.array([along - np.cos(phi) * rate, -np.sin(phi) * rate, aside, rate])
+        q0 = unit * np.array([0.0, np.cos(phi), 0.0, phi / unit])
+        v0 = unit * np.array([*velocity[:3], velocity[3] / unit])
+        motion = jl.simulate(rod, q0, v0, np.array([0.0, 1e-6]), {"mu": mu, "g": unit * g}, throw=False)
+        gain = nn - mu * nt * along / np.hypot(along, aside)
+        seen.append(gain > 0)
+        if gain > 0:
+            np.testing.assert_allclose(motion.multipliers["floor"][0] / unit, -free / gain, rtol=1e-9)
+        else:
+            assert "Painlevé" in str(motion.result)
+    assert seen == [False, False, True, True]
+
+
+@pytest.mark.slow
+def test_a_ring_that_slides_and_spins():
+    """On 64 points, whose sum is as good as Coulomb and Contensou's integral over the ring while none is at rest: by SciPy's quadrature."""
+    at = np.stack([np.cos(2 * np.pi * np.arange(64) / 64), np.sin(2 * np.pi * np.arange(64) / 64)], axis=1)
+
+    def slip(q, qdot):
+        c, s = jnp.cos(q["turn"]), jnp.sin(q["turn"])
+        x, y = c * at[:, 0] - s * at[:, 1], s * at[:, 0] + c * at[:, 1]
+        return qdot["x"][None] + qdot["turn"] * jnp.stack([-y, x], axis=1)
+
+    ring = jl.System(
+        lambda qdot: 0.5 * qdot["x"] @ qdot["x"] + 0.5 * qdot["turn"] ** 2,
+        dissipation=lambda q, qdot, N: jnp.sum(N / 64 * jnp.linalg.norm(slip(q, qdot), axis=1)),
+    )
+    N, v0 = 3.0, np.array([1.0, 0.3, 2.5])
+
+    def rates(t, y):
+        size, spin = np.hypot(*y[3:5]), y[5]
+        slips = lambda angle: np.sqrt(size**2 + spin**2 - 2 * size * spin * np.sin(angle))
+        mean = lambda of: quad(of, 0, 2 * np.pi, epsabs=1e-12, epsrel=1e-12)[0] / (2 * np.pi)
+        along = mean(lambda angle: (size - spin * np.sin(angle)) / slips(angle))  # of the angle from the velocity
+        about = mean(lambda angle: (spin - size * np.sin(angle)) / slips(angle))
+        return [*y[3:], *(-N * along * y[3:5] / size), -N * about]
+
+    T = 0.25
+    expected = solve_ivp(rates, [0, T], [0, 0, 0, *v0], rtol=1e-10, atol=1e-12, method="DOP853").y[:, -1]
+    start = {"x": np.zeros(2), "turn": 0.0}, {"x": v0[:2], "turn": v0[2]}
+    motion = jl.simulate(ring, *start, np.array([0.0, T]), {"N": N}, rtol=1e-9, atol=1e-11)
+    found = [*motion.q["x"][-1], motion.q["turn"][-1], *motion.qdot["x"][-1], motion.qdot["turn"][-1]]
+    np.testing.assert_allclose(found, expected, rtol=1e-7)

@@ -143,7 +143,8 @@ def test_how_sliding_ends(rods):
         time, end, y = first_end(*given)
         ends.append(end)
         if end == "paradox":
-            assert named[j] in ("no_friction", "beyond_reach")
+            # a force without bounds: no step is short enough, or it overflows first
+            assert named[j] in ("no_friction", "beyond_reach", "undefined")
             assert abs(motions.stats["reached"][j] - time) < 1e-3
             continue
         assert named[j] == "successful"

@@ -1,4 +1,4 @@
-"""Bounds of polynomial paths and of their rates, beside what is seen at many times."""
+"""Bounds of polynomial paths, of their rates and of theirs, beside what is seen at many times."""
 
 import diffrax as dfx
 import jax
@@ -31,9 +31,14 @@ def test_paths_and_rates_lie_within_their_bounds(scale, start):
         at = (part[0] - between[0]) / length + share * (part[1] - part[0]) / length
         y = [offset + np.polynomial.polynomial.polyval(at, column) for column in coefficients.T]
         rates = [np.polynomial.polynomial.polyval(at, np.polynomial.polynomial.polyder(column)) / length for column in coefficients.T]
-        of_y, of_rates = jax.tree.map(np.asarray, bounds(coefficients, offset, between, part))
+        second = [
+            np.polynomial.polynomial.polyval(at, np.polynomial.polynomial.polyder(column, 2)) / length**2 for column in coefficients.T
+        ]
+        of_y, of_rates, of_curvature = jax.tree.map(np.asarray, bounds(coefficients, offset, between, part))
         sizes = np.sum(np.abs(coefficients), axis=0)
-        for seen, (least, most), rounding in ((y, of_y, 0.0), (rates, of_rates, 1e-8 * sizes / (length * (high - low)))):
+        span = length * (high - low)
+        of_both = (rates, of_rates, 1e-8 * sizes / span), (second, of_curvature, 1e-7 * sizes / span**2)
+        for seen, (least, most), rounding in ((y, of_y, 0.0), *of_both):
             seen = np.array(seen).T
             assert np.all(seen >= least - rounding - 1e-15 * offset)
             assert np.all(seen <= most + rounding + 1e-15 * offset)
@@ -62,5 +67,5 @@ def test_the_path_of_every_solver_is_known_by_its_values_at_the_nodes(name):
         *_, dense, _, _ = solver.step(term, *step, y0, none, state, made_jump=False)
     path = solver.interpolation_cls(t0=0.0, t1=1.0, **dense).evaluate
     for share in np.linspace(0.013, 0.977, 23):
-        (low, high), _ = PathBounds.of(path, jnp.array(0.0), jnp.array(1.0)).between(share, share)
+        (low, high), *_ = PathBounds.of(path, jnp.array(0.0), jnp.array(1.0)).between(share, share)
         np.testing.assert_allclose([low, high], [path(share)] * 2, atol=1e-12)
