@@ -52,7 +52,7 @@ def recovery(recovery: Recovery, names: Sequence[str] | None = None, *, axes: An
         ax.hist(np.clip(errors, -REACH, REACH), edges, density=True, color=colour(0), alpha=0.35)
         ax.plot(x, np.exp(-(x**2) / 2) / np.sqrt(2 * np.pi), color=GREY, linewidth=1.0)
         ax.axvline(np.mean(errors), color=colour(0), linewidth=1.5)
-        ax.set_title(f"{name}: {100 * recovery.coverage[i]:.0f} % of {100 * recovery.level:g} % intervals", fontsize="small")
+        ax.set_title(f"{name}: {100 * recovery.coverage[i]:.0f} % of intervals of {100 * recovery.level:g} % hold it", fontsize="small")
         ax.set_xlabel("error / predicted standard error")
     shown[0].set_ylabel("share of fits")
     return shown

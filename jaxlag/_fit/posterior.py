@@ -87,7 +87,7 @@ class Posterior:
             rows.append([name, *numbers, f"{self.r_hat[name]:.3f}", f"{self.effective[name]:.0f}"])
         widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
         lines = ["  " + "   ".join(x.ljust(width) for x, width in zip(row, widths, strict=True)).rstrip() for row in rows]
-        apart = [name for name, x in self.r_hat.items() if not x <= FEW]
+        apart = [name for name, x in self.r_hat.items() if x > FEW]
         if apart:
             lines.append(f"  ! chains do not agree on {', '.join(apart)}: draw more")
         if self.divergences:

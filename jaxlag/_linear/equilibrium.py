@@ -94,11 +94,13 @@ def equilibrium(
 
     Newton's method from the guess `q` to a nearby equilibrium, stable or not. Coordinates on which nothing depends stay where they are.
     With dry friction, equilibria form a band: the result is its middle, the equilibrium without friction, or, if there is none, the guess
-    itself, provided that friction can hold it.
+    itself, provided that friction can hold it. Of contacts those are closed that press, g = 0 and λ ≥ 0, first those that touch at the
+    guess; where these do not hold the system, it comes to rest on those that it would meet.
 
     **Arguments:** `q`, a guess, structured as for `simulate`; `params`, `t`, `states` (guesses, too) as for `acceleration`; `fixed`: names
     of coordinates that stay as given, to choose one of many equilibria (to hold a coordinate by a force, state a holonomic constraint);
-    `stable`: first descends in the potential energy to a minimum, which requires that all forces at rest come from L. Any consistent units.
+    `stable`: first descends in the potential energy to a minimum, which requires that all forces at rest come from L, and no contacts. Any
+    consistent units.
 
     **Returns:** an `Equilibrium`; print it. Differentiable in `params` to any order, by the implicit function theorem.
 
@@ -180,6 +182,8 @@ def _entries(q, names, label):
 
 def _found(system: System, q: PyTree, qdot: PyTree, params: PyTree, t: Any, states: PyTree, search: Search) -> Equilibrium:
     """The result of a search or, if it fails, of a search in which friction holds."""
+    if search.stable and system.unilateral:
+        raise ValueError("`stable` must be False where there are contacts, but is True. Start near the equilibrium that is meant.")
     if search.stable and system.force:
         terms = ", ".join(repr(name) for name, _ in system.force)
         raise ValueError(f"`stable` must be False where forces are not from L, but there are {terms}. Write their potential into L.")

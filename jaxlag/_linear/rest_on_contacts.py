@@ -89,7 +89,7 @@ def _order(equations: Any, given: Any, guess: Float[Array, " u"]) -> Int[Array, 
     return jnp.where(meets, jnp.argsort(jnp.argsort(time)), time.size)
 
 
-class Contacts(NamedTuple):
+class AtContacts(NamedTuple):
     """Of each contact at a state the gap and the force, in units of inertia, and what of either is rounding; and G, in these units."""
 
     gaps: Float[Array, " c"]
@@ -99,7 +99,7 @@ class Contacts(NamedTuple):
     G: Float[Array, "c n"]
 
     @classmethod
-    def of(cls, equations: Any, given: Any, w: Float[Array, " u"]) -> "Contacts":
+    def of(cls, equations: Any, given: Any, w: Float[Array, " u"]) -> "AtContacts":
         """Those of a root."""
         flat, q, v, of = equations.taken_apart(given, w)
         G, M = jax.jacfwd(flat.gaps, argnums=1)(given.t, q), inertia(with_all_masses(flat), given.t, q, v).as_matrix()
@@ -114,7 +114,7 @@ class Contacts(NamedTuple):
 
 def _wrong(equations: Any, given: Any, w: Float[Array, " u"]) -> Bool[Array, " c"]:
     """The contact that was passed farthest, if any was; or that which pulls most, or none."""
-    at = Contacts.of(equations, given, w)
+    at = AtContacts.of(equations, given, w)
     inside, pulls = jnp.where(given.closed, 0, -at.gaps) - at.little_gap, -at.forces - at.little_force
     most = jnp.where(jnp.any(inside > 0), inside, pulls)
     return (jnp.arange(most.size) == jnp.argmax(most)) & (most > 0)
@@ -122,7 +122,7 @@ def _wrong(equations: Any, given: Any, w: Float[Array, " u"]) -> Bool[Array, " c
 
 def _with_touching(equations: Any, given: Any, w: Float[Array, " u"]) -> Bool[Array, " c"]:
     """The closed contacts, with those that happen to touch, where all together can share the forces: four feet on a floor."""
-    at = Contacts.of(equations, given, w)
+    at = AtContacts.of(equations, given, w)
     touch = given.closed | (jnp.abs(at.gaps) <= at.little_gap)
     G = jnp.where(touch[:, None], at.G, 0)
     shared = least_change(G.T, G.T @ at.forces, 1.0)

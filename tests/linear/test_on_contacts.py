@@ -123,6 +123,8 @@ def test_a_table_on_four_feet(length, mass):
             np.testing.assert_allclose(forces, weight * (1 + feet @ centre / length) / 4, rtol=1e-10)
     with pytest.raises(ValueError, match="none was found: a force"):
         jl.equilibrium(table, start, {"m": 3.0 * mass, "centre": length * np.array([1.3, 0.0])})
+    with pytest.raises(ValueError, match="`stable` must be False where there are contacts"):
+        jl.equilibrium(table, start, {"m": 3.0 * mass, "centre": np.zeros(2)}, stable=True)
 
 
 @pytest.mark.parametrize("scale", [1.0, 1e-6])
