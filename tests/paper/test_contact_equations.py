@@ -1,6 +1,8 @@
 """Contacts on paper, against equations written by hand."""
 
+import jax
 import jax.numpy as jnp
+import numpy as np
 import pytest
 import sympy
 
@@ -62,6 +64,49 @@ def test_restitution(restitution, said):
     mass = jl.System(lambda q, qdot, m: 0.5 * m * qdot**2, unilateral={"stop": jl.Contact(lambda q, l: l - q, restitution)})
     printed = repr(jl.equations(mass, "x", {"m", "l", "a", "b"}))
     assert printed.startswith("m ẍ = −λ\n\ng_stop = l − x\n") and said in printed.splitlines()
+
+
+CORNERS = np.array([[1, 1], [1, -1], [-1, -1], [-1, 1]])
+
+
+def corners(q, a):
+    """The corners of a square, (4, 2)."""
+    c, s = jnp.cos(q["phi"]), jnp.sin(q["phi"])
+    return jnp.stack([q["x"], q["y"]])[None] + a * jnp.asarray(1.0 * CORNERS) @ jnp.array([[c, s], [-s, c]])
+
+
+def test_a_block_that_rubs_on_its_corners():
+    """Of four corners as one contact: the forces at each, against SymPy's derivatives of where the corners are."""
+
+    def rubbing(q, qdot, multipliers, mu, a):
+        _, velocities = jax.jvp(lambda q: corners(q, a), (q,), (qdot,))
+        return mu * jnp.sum(multipliers["table"] * jnp.abs(velocities[:, 0]))
+
+    block = jl.System(
+        lambda q, qdot, m, k, g: 0.5 * m * (qdot["x"] ** 2 + qdot["y"] ** 2 + k**2 * qdot["phi"] ** 2) - m * g * q["y"],
+        dissipation=rubbing,
+        unilateral={"table": lambda q, a: corners(q, a)[:, 1]},
+    )
+    params = {"m": 0.37, "k": 0.041, "g": 9810.0, "a": 50.0, "mu": 0.18}
+    on_paper = jl.equations(block, {"x", "y", "phi"}, set(params))
+    x, y, phi, xdot, phidot, a = sympy.symbols("x y phi xdot phidot a", real=True)
+    loads = sympy.symbols("lambda_table_1:5", real=True)
+    force = sympy.zeros(3, 1)
+    for (u, v), load in zip(CORNERS.tolist(), loads, strict=True):
+        place = sympy.Matrix([x + a * (u * sympy.cos(phi) - v * sympy.sin(phi)), y + a * (u * sympy.sin(phi) + v * sympy.cos(phi))])
+        jacobian = place.jacobian([phi, x, y])
+        slip = (jacobian[0, :] * sympy.Matrix([phidot, xdot, 0]))[0]
+        force += load * (jacobian[1, :].T - sympy.Symbol("mu", real=True) * sympy.sign(slip) * jacobian[0, :].T)
+        assert sympy.expand_trig(sympy.expand(on_paper.contacts[f"table_{loads.index(load) + 1}"] - place[1])) == 0
+    mass = sympy.Matrix([params["m"] * params["k"] ** 2, params["m"], params["m"]])
+    for random in np.random.default_rng(3).normal(size=(20, 4)):
+        state = {"phi": random[0], "xdot": 1e3 * random[1], "phidot": 30 * random[2]}
+        state |= {str(load): 5 + value for load, value in zip(loads, np.roll(random, 1), strict=True)}
+        numbers = {sympy.Symbol(name, real=True): value for name, value in (state | params).items()}
+        expected = [*(force.subs(numbers).evalf() + sympy.Matrix([0, 0, -params["m"] * params["g"]]))]
+        for name, inertia, of in zip(("phi", "x", "y"), mass, expected, strict=True):
+            found = on_paper.accelerations[name].subs(numbers).evalf()
+            np.testing.assert_allclose(float(found * inertia), float(of), rtol=1e-12, atol=1e-9)
 
 
 def test_contacts_beside_constraints():

@@ -327,6 +327,7 @@ IN_CELLS_THAT_SIMULATE = {"19_gear_friction.driven"}  # `test_gears`
 WITH_CONTACTS = {  # `test_contact_equations`
     *(f"15_bouncing_rocking_pecking.{name}" for name in ("ball", "block", "woodpecker")),
     *(f"20_backlash.{name}" for name in ("drive", "servo")),
+    "21_tosses.block",
 }
 WITHOUT_INERTIA = {f"16_viscoelastic.{name}" for name in ("mount", "iwan")}  # `test_equations_without_inertia`
 OF_A_THOUSAND = {f"18_whip_and_net.{name}" for name in ("rope", "net")}  # whose equations nobody would read
