@@ -18,7 +18,7 @@ TEXTS = {  # files of the repository, and the pages they become
 }
 REFERENCE = {  # names in `jaxlag`
     "Systems": "System Contact NewtonRestitution PoissonRestitution Event direction.Falling direction.Rising direction.Negative "
-    "Every State Sampled virtual_work rate substitute Signal interpolation.ZeroOrderHold interpolation.Linear "
+    "Every State Sampled virtual_work rate substitute Signal Multisine Chirp interpolation.ZeroOrderHold interpolation.Linear "
     "interpolation.Cubic dissipation.sliding dissipation.viscous dissipation.drag dissipation.power_law "
     "dissipation.stribeck dissipation.speed",
     "Bodies in space": "rigid.rotation_x rigid.rotation_y rigid.rotation_z rigid.rotation rigid.euler rigid.Euler rigid.quaternion "
@@ -43,12 +43,13 @@ REFERENCE = {  # names in `jaxlag`
     "results.RootLocus results.Crossing periodic results.PeriodicOrbit stability_map results.StabilityMap",
     "Identification": "Experiment Measurement ModalTest FrequencyResponseTest fit fit_each results.Fit results.Channel results.Interval "
     "results.Prediction regress results.Regression Regress MultiStart validate results.Validation compare results.Comparison "
-    "information results.Information recover results.Recovery "
+    "information results.Information design results.Design DOptimal AOptimal EOptimal Along Average Worst recover results.Recovery "
     "log_density results.LogDensity results.Posterior Huber learnt.ConvexDissipation learnt.PassiveDissipation learnt.Potential "
     "learnt.ConvexPotential",
     "On paper": "equations results.Equations results.LinearisedEquations to_sympy",
     "Pictures": "plot.motion plot.phase plot.forces plot.energy plot.balance plot.friction plot.bode plot.nyquist plot.root_locus "
-    "plot.mode_shapes plot.stability_map plot.fit plot.parameters plot.recovery plot.convergence plot.equations plot.animate",
+    "plot.mode_shapes plot.stability_map plot.fit plot.parameters plot.recovery plot.design plot.posterior "
+    "plot.convergence plot.equations plot.animate",
 }
 SHOWN = (".ipynb", ".png", ".gif", ".svg")  # files shown from the folder of notebooks
 WITHOUT_TOC = "---\nhide: [toc]\n---\n"

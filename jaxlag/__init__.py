@@ -32,6 +32,9 @@ from ._fit.measurement import Measurement as Measurement
 from ._fit.modal_test import ModalTest as ModalTest
 from ._fit.log_density import log_density as log_density
 from ._fit.recover import recover as recover
+from ._fit.design import design as design
+from ._fit.design_criteria import AOptimal as AOptimal, Along as Along, Average as Average
+from ._fit.design_criteria import DOptimal as DOptimal, EOptimal as EOptimal, Worst as Worst
 from ._fit.regress import regress as regress
 from ._motion.simulate import simulate as simulate
 from ._motion.load import load as load
@@ -45,6 +48,7 @@ from ._linear.periodic import periodic as periodic
 from ._linear.stability_map import stability_map as stability_map
 from ._program.compilation_cache import keep_compiled as keep_compiled
 from ._model.contact import Contact as Contact, NewtonRestitution as NewtonRestitution, PoissonRestitution as PoissonRestitution
+from ._model.excitation import Chirp as Chirp, Multisine as Multisine
 from ._model.event import Event as Event, Every as Every
 from ._model.kinematics import rate as rate, substitute as substitute, virtual_work as virtual_work
 from ._mechanics.consistent_state import consistent_state as consistent_state

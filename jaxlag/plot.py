@@ -11,14 +11,18 @@ import numpy as np
 from ._draw.animate import animate
 from ._draw.axes import COLOURS as COLOURS
 from ._draw.axes import pyplot
+from ._draw.design import design
 from ._draw.fit import convergence, fit, parameters
 from ._draw.forces import forces, friction
 from ._draw.linear import bode, nyquist, root_locus
 from ._draw.mode_shapes import mode_shapes
 from ._draw.motion import balance, energy, motion, phase
+from ._draw.posterior import posterior
 from ._draw.recovery import recovery
 from ._draw.report import report
 from ._draw.stability_map import stability_map
+from ._fit.design import Design
+from ._fit.posterior import Posterior
 from ._fit.recover import Recovery
 from ._fit.result import Fit
 from ._linear.modes import Modes
@@ -33,6 +37,7 @@ __all__ = [
     "balance",
     "bode",
     "convergence",
+    "design",
     "energy",
     "equations",
     "fit",
@@ -43,6 +48,7 @@ __all__ = [
     "nyquist",
     "parameters",
     "phase",
+    "posterior",
     "recovery",
     "root_locus",
     "stability_map",
@@ -93,6 +99,8 @@ SHORT_WAYS: tuple[tuple[type, str, Any], ...] = (  # what is computed knows noth
     (Fit, "plot", fit),
     (Fit, "report", report),
     (Recovery, "plot", recovery),
+    (Design, "plot", design),
+    (Posterior, "plot", posterior),
     (Modes, "plot", mode_shapes),
     (Modes, "animate", animate),
     (RootLocus, "plot", root_locus),

@@ -10,9 +10,9 @@ import numpy as np
 from jaxtyping import Array, Float, PyTree
 
 from .._model.injection import check_function
-from .._model.paths import entry_names, is_within, listed
+from .._model.paths import entry_names, is_within, labels, listed
 from .._model.recorded import delays, deviations, measured_values, with_events
-from .._model.tables import of_frame, of_text, scaled
+from .._model.tables import of_frame, of_text, scaled, write_text
 from .._model.validation import parameters, sample_times, state
 from .._program.jit import is_concrete
 
@@ -172,6 +172,34 @@ class Experiment(eqx.Module):
         """
         ts, values = scaled(*of_frame(frame), time, columns, from_zero)
         return cls(ts, values, q0, qdot0, **more)
+
+    def to_csv(self, file: str | Path, ts: Any = None) -> None:
+        """Writes a table: the column `t`, one for each entry of `params` that is a function of time, such as the input that a machine is to
+        be driven with, and one for each measured channel.
+
+        **Arguments:** `file`: a path. `ts`: the times of the rows, (T,), by default those of the samples; at others nothing was measured.
+
+        **Raises:** `ValueError` if the times are not numbers in order.
+
+        ```python
+        import jax.numpy as jnp
+        import jaxlag as jl
+        plan = jl.Experiment([0.0, 1.0], None, 0.0, 0.0, sigma=1e-3, params={"u": jl.Multisine(2.0, harmonics=3)})
+        plan.to_csv("drive.csv", jnp.arange(0.0, 1.0, 1e-3))  # columns t and u, at 1 kHz
+        ```
+        """
+        times = np.asarray(self.ts if ts is None else sample_times(ts, self.ts.dtype, repeated=True))
+        columns = {"t": times}
+        for name, entry in self.params.items():
+            if callable(entry):
+                course = np.asarray(jax.vmap(entry)(times))
+                columns |= dict(zip(labels(name, course.shape[1:]), course.reshape(len(times), -1).T, strict=True))
+        of_rows = [] if ts is not None else jax.tree_util.tree_flatten_with_path(self.values)[0]
+        for path, z in of_rows:
+            channel = jax.tree_util.keystr(path, simple=True, separator=".") or "value"
+            if channel not in self.events:
+                columns |= dict(zip(labels(channel, z.shape[1:]), np.reshape(z, (len(times), -1)).T, strict=True))
+        write_text(file, columns)
 
 
 def validate_inputs(

@@ -4,20 +4,18 @@ import dataclasses
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, PyTree
 
-from .._model.recorded import deviations
 from .._model.system import System
 from .arrow import gathered
 from .experiment import Experiment, validate_inputs
 from .identifiability import correlation_of, determined_by
 from .measurement import Test, split_by_kind
 from .parameters import Free
-from .problem import LeastSquaresProblem, failure_of, linearise, with_zero_values
+from .problem import LeastSquaresProblem, failure_of, linearise, with_expected_zeros
 from .residuals import Model
 
 
@@ -101,22 +99,11 @@ def information(
     jl.information(oscillator, plan, {"c": 4.0}, free=("c",)).standard_errors["c"]
     ```
     """
-    experiments, params = validate_inputs(experiments, params, planned=True, tests=(Test,))
-    for i, e in enumerate(experiments):
-        if e.sigma is None:
-            raise ValueError(
-                "`experiments` must say how well they measure, but one has no `sigma`. Give the standard deviation of the noise."
-            )
-        for name in e.events if isinstance(e, Experiment) else ():
-            if np.all(np.isnan(e.values[name])):
-                raise ValueError(
-                    f"`events[{name!r}]` of experiment {i} must hold the times that are expected, but all are missing. "
-                    "Take them from `simulate`."
-                )
+    experiments, params = planned(experiments, params)
     chosen = Free.of(params, free, bounds, priors)
     model = Model.of(system, numerics)
     recordings, tests = split_by_kind(experiments)
-    problem = LeastSquaresProblem.of(model, chosen, [_with_values(model, chosen, e) for e in recordings], tests)
+    problem = LeastSquaresProblem.of(model, chosen, [with_expected_zeros(model, chosen, e) for e in recordings], tests)
     found = linearise(problem, jnp.zeros(problem.size))
     reason = failure_of(found)
     if reason:
@@ -133,9 +120,18 @@ def information(
     return Information(chosen.entries, F, covariance, correlation_of(covariance), by_name(errors), by_name(chosen.start))
 
 
-def _with_values(model, free, e):
-    """The experiment with zeros for values, where it has none."""
-    if e.values is not None:
-        return e
-    zeros = with_zero_values(model, free, e).values
-    return eqx.tree_at(lambda e: (e.values, e.sigma), e, (zeros, deviations(e.sigma, zeros)), is_leaf=lambda x: x is None)
+def planned(experiments: Any, params: PyTree) -> tuple[tuple[Any, ...], PyTree]:
+    """Planned measurements as a tuple, and `params` as arrays, both checked."""
+    experiments, params = validate_inputs(experiments, params, planned=True, tests=(Test,))
+    for i, e in enumerate(experiments):
+        if e.sigma is None:
+            raise ValueError(
+                "`experiments` must say how well they measure, but one has no `sigma`. Give the standard deviation of the noise."
+            )
+        for name in e.events if isinstance(e, Experiment) else ():
+            if np.all(np.isnan(e.values[name])):
+                raise ValueError(
+                    f"`events[{name!r}]` of experiment {i} must hold the times that are expected, but all are missing. "
+                    "Take them from `simulate`."
+                )
+    return experiments, params

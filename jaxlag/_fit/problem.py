@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from .._model.recorded import deviations
 from .._motion.members import of_each
 from .._motion.results import reason_of
 from .._program.jit import compiled, numpy_for
@@ -286,6 +287,14 @@ def with_zero_values(model: Model, free: Free, experiment: Experiment, y: Any = 
     else:
         zeros = jax.tree.map(lambda s: jnp.zeros(s.shape, s.dtype), eqx.filter_eval_shape(of, one))
     return eqx.tree_at(lambda e: e.values, bare, zeros, is_leaf=lambda x: x is None)
+
+
+def with_expected_zeros(model: Model, free: Free, experiment: Experiment) -> Experiment:
+    """A planned experiment with zeros for values, and its own sigma; one that has values as it is."""
+    if experiment.values is not None:
+        return experiment
+    zeros = with_zero_values(model, free, experiment).values
+    return eqx.tree_at(lambda e: (e.values, e.sigma), experiment, (zeros, deviations(experiment.sigma, zeros)), is_leaf=lambda x: x is None)
 
 
 class NoMotion(ValueError):

@@ -105,3 +105,12 @@ def _date(text: str) -> datetime.datetime | None:
         return datetime.datetime.fromisoformat(iso.replace(",", "."))
     except ValueError:
         return None
+
+
+def write_text(file: str | Path, columns: Mapping[str, Any]) -> None:
+    """Columns by name, of one length, with all their digits; what is missing is an empty cell."""
+    with open(file, "w", newline="", encoding="utf-8") as stream:
+        rows = csv.writer(stream)
+        rows.writerow(columns)
+        cells = [[repr(float(x)) if np.isfinite(x) else "" for x in column] for column in columns.values()]
+        rows.writerows(zip(*cells, strict=True))

@@ -26,7 +26,7 @@ from .first_order import EquationsOfMotion
 from .formulation import Formulation
 from .integrated import integrated
 from .interval_loop import Resumed
-from .loads import told_of_loads
+from .loads import told_of_directions, told_of_loads
 from .mode_changes import started, unstarted
 from .one_evaluation_solver import OneEvaluationSolver, has_one_evaluation
 from .progress import Bar
@@ -286,8 +286,10 @@ def in_one_loop(
     meter, dense = Meter() if options.progress else dfx.NoProgressMeter(), not (has_nodes(equations, args.params) or resumed)
     back = in_one_kernel(equations.projected) if dense else equations.projected
     solver = _wrapped(options, equations, back if equations.projection else None, adjoint, (t0, y0, args), begins)
+    at_start = y0[(..., *[0] * len(directions))]
     if resumed is None:
-        args = told_of_loads(equations, t0, y0[(..., *[0] * len(directions))], args, begins)
+        args = told_of_loads(equations, t0, at_start, args, begins)
+    args = told_of_directions(equations, t0, at_start, args, directions)
     numbers = y0, t0, args, ts, tolerances
     kind = {"variations": _variations(equations), "reverse": reverse, "dense": dense, "resumed": resumed}
     ys, (result, stats) = integrated(equations, solver, options.max_steps, meter, *numbers, directions, **kind)

@@ -2,6 +2,7 @@
 
 from typing import Any
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import lineax as lx
@@ -21,6 +22,9 @@ from .batch import BatchedEquations
 from .first_order import EquationsOfMotion
 from .protocol import Arguments, AugmentedSystem, undifferentiated
 from .state_vector import Parts
+from .variational import split_varying
+
+LOOKS = (0.03, 0.21, 0.47, 0.68, 0.91)  # of a motion, at which forces are looked at
 
 
 def told_of_loads(equations: Any, t, y, args: Arguments, begins: bool = False) -> Arguments:
@@ -32,6 +36,32 @@ def told_of_loads(equations: Any, t, y, args: Arguments, begins: bool = False) -
     t, y, given = undifferentiated((t, y, args._replace(scales=args.scales._replace(driven=None))))
     found = _loads(equations, t, y, given, begins)
     return args if found is None else args._replace(scales=args.scales._replace(**found))
+
+
+def told_of_directions(equations: Any, t, y, args: Arguments, directions: tuple) -> Arguments:
+    """With what a change of params along each direction, for each order of (params, t0), makes of velocities by the forces that it
+    changes. Where constraints and friction hold these, their rounding is all that a variation has, even of a number that is zero.
+    """
+    directions = directions or args.directions
+    while isinstance(equations, AugmentedSystem):
+        equations, y = equations.equations, y[..., 0]
+    if not directions or args.scales is None or args.scales.held is None or not isinstance(equations, EquationsOfMotion):
+        return args
+    t, y, given = undifferentiated((t, y, args._replace(scales=None)))
+    parts, times = equations.parts(y), t + args.scales.duration * np.array(LOOKS)
+
+    def along(changed):
+        varying, constant = split_varying(given.params, changed)
+        flat_at = lambda t, params: equations.contents(t, parts, given._replace(params=eqx.combine(params, constant)))[0]
+        forces = lambda t, params: _forces(flat_at(t, params), t, parts.q, parts.v)
+        M = inertia(flat_at(t, varying), t, parts.q, parts.v)
+        of_one = lambda t, direction: _rate(M, jnp.abs(jax.jvp(lambda params: forces(t, params), (varying,), (direction,))[1]))
+        of_each = jax.vmap(lambda t: jax.vmap(lambda direction: of_one(t, direction), in_axes=-1, out_axes=-1)(changed))(times)
+        largest = jnp.max(jnp.where(jnp.isfinite(of_each), of_each, 0), axis=0)
+        return jnp.concatenate([jnp.zeros_like(largest[:, :1]), largest], axis=1)
+
+    along_each = tuple(along(undifferentiated(changed)) if jax.tree.leaves(changed) else None for changed, _ in directions)
+    return args._replace(scales=args.scales._replace(held_along=along_each))
 
 
 def _loads(equations: Any, t, y, args: Arguments, begins: bool = False) -> dict[str, Any] | None:

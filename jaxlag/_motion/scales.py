@@ -39,6 +39,7 @@ class Scales(NamedTuple):
     held: Any = None  # of each velocity, the rate that forces which may hold one another give it
     given: Any = None  # of each coordinate, whether a constraint alone gives it as a function of the time
     units: Any = None  # of each coordinate, what weighs as much as one of any other
+    held_along: tuple = ()  # for each order, of each velocity and direction of variations the rate that it makes of forces that may be held
     shares: tuple = ()  # of each direction of variations, for each order, the share by which it changes a number at most
 
     @classmethod
@@ -94,6 +95,15 @@ class Scales(NamedTuple):
             return SHARE * self.rtol * own
         n = len(self.of_q)
         return self.atol[:n] if jnp.ndim(self.atol) else jnp.full(n, self.atol)
+
+
+def shares_of(varying: PyTree, directions: PyTree) -> Array:
+    """Of the motion, 1; of each direction, last in its leaves, the share of itself by which a number that is not zero changes at most."""
+    pairs = zip(*map(jax.tree.leaves, (varying, directions)), strict=True)
+    of_each = [jnp.where(x == 0, 0, jnp.abs(dx) / jnp.where(x == 0, 1, jnp.abs(x))) for x, dx in ((x[..., None], dx) for x, dx in pairs)]
+    size = jax.tree.leaves(directions)[0].shape[-1]
+    most = functools.reduce(jnp.maximum, (jnp.max(share.reshape(-1, size), axis=0, initial=0.0) for share in of_each))
+    return jax.lax.stop_gradient(jnp.concatenate([jnp.ones(1, most.dtype), most]))
 
 
 def reaching(size: Array, coordinates: int, duration: Any) -> Array:

@@ -1,7 +1,6 @@
 """The solution map of a motion: from its inputs (start, params, tolerances) and sample times to its samples; and what differentiates it."""
 
 import dataclasses
-import functools
 from typing import Any, NamedTuple
 
 import diffrax as dfx
@@ -37,7 +36,7 @@ from .moments import ContactState, EventState, FrictionState
 from .protocol import Arguments
 from .provenance import Provenance
 from .sample import Sample, sample_at
-from .scales import Scales
+from .scales import Scales, shares_of
 from .search_for_start import Search
 from .trajectory import Trajectory
 from .variational import AccompaniedEquations, derived, pushforward, split_varying, with_variations
@@ -247,11 +246,7 @@ def _shares(inputs: Inputs, directions: Inputs, duration) -> Array:
     varying, _ = split_varying(inputs, directions)
     if varying.t0 is not None:
         varying = varying._replace(t0=duration * jnp.ones_like(varying.t0))
-    pairs = zip(*map(jax.tree.leaves, (varying, directions)), strict=True)
-    of_each = [jnp.where(x == 0, 0, jnp.abs(dx) / jnp.where(x == 0, 1, jnp.abs(x))) for x, dx in ((x[..., None], dx) for x, dx in pairs)]
-    size = jax.tree.leaves(directions)[0].shape[-1]
-    most = functools.reduce(jnp.maximum, (jnp.max(share.reshape(-1, size), axis=0, initial=0.0) for share in of_each))
-    return jax.lax.stop_gradient(jnp.concatenate([jnp.ones(1, most.dtype), most]))
+    return shares_of(varying, directions)
 
 
 def _first_time(inputs: Inputs, ts: Array) -> Array:

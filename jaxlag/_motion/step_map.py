@@ -16,9 +16,9 @@ from .jumps import after_jump
 from .loads import told_of_loads
 from .protocol import Arguments
 from .results import RESULTS
-from .scales import Scales
+from .scales import Scales, shares_of
 from .step_size import StepControl
-from .variational import varied_along
+from .variational import split_varying, varied_along
 
 HORIZON = 1000  # steps: what counts as small is judged as in a motion of as many, or, in a longer one, as long as it has been
 
@@ -87,6 +87,8 @@ class StepMap:
         if may_jump and not begins and equations.projection is not None:
             y0, fine = self._behind_jump(inputs, y0, ts, args, directions)
         along, steps = tuple((SinceOrigin(of_order.params, None), None) for of_order in directions), inputs.going.steps
+        shares = tuple(shares_of(split_varying(inputs, of_order)[0], of_order) for of_order in directions)
+        args = args._replace(scales=args.scales._replace(shares=shares))
         given = equations, self.options, ts[0], y0, ts, args, inputs.tolerances
         resumed = steps._replace(known=jnp.array(True) if inputs.jumps is None else ~inputs.jumps)
         ys, result, stats = in_one_loop(*given, directions=along, reverse=reverse, begins=begins, resumed=resumed)

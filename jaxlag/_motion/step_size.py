@@ -154,12 +154,18 @@ class StepControl(dfx.AbstractStepSizeController):
         """
         if getattr(args, "scales", None) is None or args.scales.held is None:
             return 0.0
-        moved = 10 * jnp.finfo(reach.dtype).eps * args.scales.held * h
-        moved = jnp.concatenate([moved * h, moved, jnp.zeros((len(reach) - 2 * len(moved), *moved.shape[1:]))]).astype(reach.dtype)
-        changes = self._changes(reach, args)
-        if shares := self._shares(args):
+        changes, shares = self._changes(reach, args), self._shares(args)
+        if shares:
             changes = jnp.maximum(changes, functools.reduce(jnp.multiply.outer, shares)[None])
-        moved = moved.reshape(*moved.shape, *[1] * (reach.ndim - moved.ndim)) * changes
+        held = args.scales.held
+        rate = held.reshape(*held.shape, *[1] * (reach.ndim - held.ndim)) * changes
+        axis = lambda of, i: of.reshape(*of.shape[:-1], *[1] * i, -1, *[1] * (self.variations - 1 - i))
+        for order, along in enumerate(args.scales.held_along):  # along the directions of others their numbers change by their shares
+            if along is not None:
+                others = [axis(of[None], i) for i, of in enumerate(shares) if i != order]
+                rate = jnp.maximum(rate, functools.reduce(jnp.multiply, others, axis(along, order)))
+        moved = 10 * jnp.finfo(reach.dtype).eps * rate * h
+        moved = jnp.concatenate([moved * h, moved, jnp.zeros((len(reach) - 2 * len(moved), *moved.shape[1:]))]).astype(reach.dtype)
         if args.scales.given is None:
             return moved
         given = args.scales.given
