@@ -43,7 +43,8 @@ REFERENCE = {  # names in `jaxlag`
     "results.RootLocus results.Crossing periodic results.PeriodicOrbit stability_map results.StabilityMap",
     "Identification": "Experiment Measurement ModalTest FrequencyResponseTest fit fit_each results.Fit results.Channel results.Interval "
     "results.Prediction regress results.Regression Regress MultiStart validate results.Validation compare results.Comparison "
-    "information results.Information design results.Design DOptimal AOptimal EOptimal Along Average Worst recover results.Recovery "
+    "information results.Information design results.Design DOptimal AOptimal EOptimal Along Average Worst "
+    "discover results.Discovery recover results.Recovery "
     "log_density results.LogDensity results.Posterior Huber learnt.ConvexDissipation learnt.PassiveDissipation learnt.Potential "
     "learnt.ConvexPotential",
     "On paper": "equations results.Equations results.LinearisedEquations to_sympy",

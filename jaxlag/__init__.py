@@ -32,6 +32,7 @@ from ._fit.measurement import Measurement as Measurement
 from ._fit.modal_test import ModalTest as ModalTest
 from ._fit.log_density import log_density as log_density
 from ._fit.recover import recover as recover
+from ._fit.discover import discover as discover
 from ._fit.design import design as design
 from ._fit.design_criteria import AOptimal as AOptimal, Along as Along, Average as Average
 from ._fit.design_criteria import DOptimal as DOptimal, EOptimal as EOptimal, Worst as Worst

@@ -5,6 +5,7 @@ from ._fit.validate import Validation as Validation
 from ._fit.comparison import Comparison as Comparison
 from ._fit.channels import Channel as Channel
 from ._fit.design import Design as Design
+from ._fit.discover import Discovery as Discovery
 from ._fit.log_density import LogDensity as LogDensity
 from ._fit.posterior import Posterior as Posterior
 from ._fit.recover import Recovery as Recovery

@@ -257,6 +257,8 @@ WINGS = {  # each imports only from those above it, and each file of a wing only
         "minimise",
         "fit",
         "validate",
+        "best_subset",
+        "discover",
         "recover",
         "constrained_minimum",
         "design_criteria",

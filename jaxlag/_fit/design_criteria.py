@@ -1,27 +1,17 @@
 """What makes one experiment better than another: numbers made of the information that it gives."""
 
-import abc
 import dataclasses
 from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
 
 from .._model.paths import is_within, listed
 
 
-class Criterion(abc.ABC):
-    """A cost of the information F (p, p) of parameters in units of their values; the smaller, the better."""
-
-    @property
-    def sharp(self) -> bool:
-        """Whether the cost has edges, which are rounded at first."""
-        return False
-
-    @abc.abstractmethod
-    def cost(self, F: Float[np.ndarray, "p p"], names: Sequence[str], sharpness: float) -> tuple[float, np.ndarray]:
-        """The cost and its derivative by F; edges are rounded to 1/`sharpness`."""
+@dataclasses.dataclass(frozen=True)
+class Criterion:
+    """What is asked of the information about parameters."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -37,10 +27,6 @@ class DOptimal(Criterion):
     jl.DOptimal()  # the default of `design`
     ```
     """
-
-    def cost(self, F: Float[np.ndarray, "p p"], names: Sequence[str], sharpness: float) -> tuple[float, np.ndarray]:
-        """−log det F."""
-        return -float(np.linalg.slogdet(F)[1]), -np.linalg.inv(F)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -59,10 +45,6 @@ class AOptimal(Criterion):
     ```
     """
 
-    def cost(self, F: Float[np.ndarray, "p p"], names: Sequence[str], sharpness: float) -> tuple[float, np.ndarray]:
-        """log tr F⁻¹."""
-        return _of_part(np.linalg.inv(F), np.ones(len(F)))
-
 
 @dataclasses.dataclass(frozen=True)
 class EOptimal(Criterion):
@@ -80,17 +62,6 @@ class EOptimal(Criterion):
     ```
     """
 
-    @property
-    def sharp(self) -> bool:
-        """At equal eigenvalues."""
-        return True
-
-    def cost(self, F: Float[np.ndarray, "p p"], names: Sequence[str], sharpness: float) -> tuple[float, np.ndarray]:
-        """log of the largest eigenvalue of F⁻¹."""
-        values, vectors = np.linalg.eigh(F)
-        largest, weights = _largest(-np.log(values), sharpness)
-        return largest, -(vectors * (weights / values)) @ vectors.T
-
 
 @dataclasses.dataclass(frozen=True)
 class Along(Criterion):
@@ -98,7 +69,7 @@ class Along(Criterion):
 
     $$ \min\; \log \sum_{j \in \text{names}} \left(\frac{\mathrm{se}(\theta_j)}{\theta_j}\right)^2 $$
 
-    **Arguments:** `names`: of `free`, one or several.
+    **Arguments:** `names`: of `free`, one or several. **Raises:** `ValueError`, in `design`, if one is not free.
 
     **Source:** Atkinson, Donev & Tobias, Optimum Experimental Designs, with SAS (2007), sections 10.2 and 10.3.
 
@@ -109,15 +80,6 @@ class Along(Criterion):
     """
 
     names: str | Sequence[str]
-
-    def cost(self, F: Float[np.ndarray, "p p"], names: Sequence[str], sharpness: float) -> tuple[float, np.ndarray]:
-        """log of the sum of some variances."""
-        wanted = listed(self.names)
-        for name in wanted:
-            if not any(is_within(entry, name) for entry in names):
-                raise ValueError(f"`Along` must name free parameters, but names {name!r}. Free are {', '.join(names)}.")
-        chosen = np.array([float(any(is_within(entry, name) for name in wanted)) for entry in names])
-        return _of_part(np.linalg.inv(F), chosen)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -130,14 +92,6 @@ class OverSamples(Criterion):
     def __post_init__(self):
         if not isinstance(self.samples, Mapping) or len({len(np.atleast_1d(x)) for x in self.samples.values()}) != 1:
             raise ValueError('`samples` must have a row for each sample, as many of each entry, but have not. Write `{"b": [0.1, 0.2]}`.')
-
-    @abc.abstractmethod
-    def together(self, costs: Float[np.ndarray, " K"], sharpness: float) -> tuple[float, np.ndarray]:
-        """One cost of many, and its derivatives by them."""
-
-    def cost(self, F: Float[np.ndarray, "p p"], names: Sequence[str], sharpness: float) -> tuple[float, np.ndarray]:
-        """That of one sample."""
-        return self.criterion.cost(F, names, sharpness)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -157,15 +111,6 @@ class Average(OverSamples):
     ```
     """
 
-    @property
-    def sharp(self) -> bool:
-        """As the criterion."""
-        return self.criterion.sharp
-
-    def together(self, costs: Float[np.ndarray, " K"], sharpness: float) -> tuple[float, np.ndarray]:
-        """The mean."""
-        return float(np.mean(costs)), np.full(len(costs), 1 / len(costs))
-
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Worst(OverSamples):
@@ -183,29 +128,44 @@ class Worst(OverSamples):
     ```
     """
 
-    @property
-    def sharp(self) -> bool:
-        """Where two cases are equally bad."""
-        return True
 
-    def together(self, costs: Float[np.ndarray, " K"], sharpness: float) -> tuple[float, np.ndarray]:
-        """The largest, rounded."""
-        return _largest(costs, sharpness)
+def is_sharp(criterion: Criterion) -> bool:
+    """Whether its cost has edges, which are rounded at first: at equal eigenvalues, and where two samples are equally bad."""
+    return isinstance(criterion, (EOptimal, Worst)) or (isinstance(criterion, Average) and is_sharp(criterion.criterion))
 
 
 def total(
     criterion: Criterion, informations: Sequence[tuple[np.ndarray, np.ndarray]], names: Sequence[str], sharpness: float
 ) -> tuple[float, np.ndarray]:
-    """The cost, and its derivatives by what the information of each sample is differentiated by: F (p, p) and dF (p, p, m)."""
-    costs, slopes = [], []
-    for F, dF in informations:
-        cost, slope = criterion.cost(F, names, sharpness)
-        costs.append(cost)
-        slopes.append(np.einsum("ij,ijm->m", slope, dF))
-    if not isinstance(criterion, OverSamples):
-        return costs[0], slopes[0]
-    together, weights = criterion.together(np.array(costs), sharpness)
-    return together, weights @ np.stack(slopes)
+    """The cost, and its derivatives by what the information of each sample is differentiated by: F (p, p) and dF (p, p, m), of parameters
+    in units of their values; edges are rounded to 1/`sharpness`.
+    """
+    of_each = criterion.criterion if isinstance(criterion, OverSamples) else criterion
+    pairs = [_cost(of_each, F, names, sharpness) for F, _ in informations]
+    costs = np.array([cost for cost, _ in pairs])
+    slopes = np.stack([np.einsum("ij,ijm->m", slope, dF) for (_, slope), (_, dF) in zip(pairs, informations, strict=True)])
+    if isinstance(criterion, Worst):
+        largest, weights = _largest(costs, sharpness)
+        return largest, weights @ slopes
+    return float(np.mean(costs)), np.mean(slopes, axis=0)
+
+
+def _cost(criterion: Criterion, F: np.ndarray, names: Sequence[str], sharpness: float) -> tuple[float, np.ndarray]:
+    """That of one sample, and its derivative by F."""
+    if isinstance(criterion, DOptimal):
+        return -float(np.linalg.slogdet(F)[1]), -np.linalg.inv(F)
+    if isinstance(criterion, AOptimal):
+        return _of_part(np.linalg.inv(F), np.ones(len(F)))
+    if isinstance(criterion, EOptimal):
+        values, vectors = np.linalg.eigh(F)
+        largest, weights = _largest(-np.log(values), sharpness)
+        return largest, -(vectors * (weights / values)) @ vectors.T
+    assert isinstance(criterion, Along)
+    wanted = listed(criterion.names)
+    for name in wanted:
+        if not any(is_within(entry, name) for entry in names):
+            raise ValueError(f"`Along` must name free parameters, but names {name!r}. Free are {', '.join(names)}.")
+    return _of_part(np.linalg.inv(F), np.array([float(any(is_within(entry, name) for name in wanted)) for entry in names]))
 
 
 def _of_part(C: np.ndarray, chosen: np.ndarray) -> tuple[float, np.ndarray]:

@@ -12,7 +12,7 @@ from jaxtyping import Array, Float, PyTree
 from .._model.injection import check_function
 from .._model.paths import is_within
 from .constrained_minimum import ASTRAY, KEPT, Minimum, constrained_minimum, nearest_to_limits
-from .design_criteria import Criterion, OverSamples, total
+from .design_criteria import Criterion, OverSamples, is_sharp, total
 from .design_plan import Planned, along_the_motion, informed, of_parameters
 from .parameters import Free
 
@@ -171,7 +171,7 @@ class DesignProblem:
 
     def searched(self, y: np.ndarray, steps: int, tolerance: float) -> Minimum:
         """The minimum near a start; where limits are exceeded between the times at which they are kept, they are moved inwards."""
-        problem, levels = self, list(SHARPNESS) if self.criterion.sharp else [SHARP]
+        problem, levels = self, list(SHARPNESS) if is_sharp(self.criterion) else [SHARP]
         for _ in range(ROUNDS):
             while True:
                 found = problem._step_by_step(levels[0], y, steps, tolerance)

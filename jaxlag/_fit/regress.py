@@ -175,13 +175,13 @@ def _start(records, given, free, bounds):
     """The free parameters, and whether the equations are linear in them: then those that are not given start at zero, which has no unit."""
     for unbounded in (0.0, 1.0):
         params = given.with_default_starts(unbounded)
-        linear = _is_linear(records, Free.of(params, free))
+        linear = is_linear(records, Free.of(params, free))
         if linear:
             break
     return Free.of(params, free, bounds), linear
 
 
-def _is_linear(records, free):
+def is_linear(records, free):
     """Whether the Jacobian is the same at another point; refuses linear equations without a known term."""
     y = jnp.zeros(free.size)
     nothing = rounding_of(y.dtype)

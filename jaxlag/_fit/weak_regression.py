@@ -83,6 +83,21 @@ class WeakFormProblem:
         size = self._sizes(r, J, found.y)
         return (_rms(r) ** 2 + variance) / np.where(size > 0, size, 1) ** 2
 
+    def blocks(self, found: Estimate, count: int) -> list[tuple[np.ndarray, np.ndarray, float]]:
+        """JᵀJ, Jᵀr and rᵀr of so many parts of the records, in the windows of an estimate; J by the free parameters, r where they are 0.
+
+        Equations count by the size of their terms: by their residuals, one that has none but free terms would have them all zero.
+        """
+        nothing, scale, blocks = -np.asarray(self.free.start / self.free.scale), np.asarray(self.free.scale), []
+        for r, J in self._integrated(found.half, found.near_rest)[2](nothing):
+            n, size = self.records[0].form.motion[0].shape[1], self._sizes(r, J, nothing)
+            weight = _one_over(size, size)[:n]  # of the equations of motion; those of constraints know no forces
+            rows, slopes = r[:, :n] * weight, J[:, :n] * weight[:, None] / scale
+            for part in np.array_split(np.arange(len(r)), -(-count // len(self.records))):
+                A, b = slopes[part].reshape(-1, J.shape[2]), rows[part].ravel()
+                blocks.append((A.T @ A, A.T @ b, float(b @ b)))
+        return blocks
+
     def jacobian(self, y: np.ndarray, found: Estimate) -> np.ndarray:
         """Of the residuals at y in the windows of an estimate, over the size of their terms."""
         parts = self._integrated(found.half, found.near_rest)[2](y)

@@ -139,6 +139,22 @@ class System:
             object.__setattr__(new, name, value)
         return new
 
+    def with_terms(self, lagrangian: Mapping[str, Callable] | None = None, dissipation: Mapping[str, Callable] | None = None) -> "System":
+        """The system with further terms of L and D.
+
+        **Arguments:** `lagrangian`, `dissipation`: functions by name, as for `System`. **Raises:** `ValueError` if it has a term of the name.
+        """
+        fields = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
+        for slot, given in (("lagrangian", lagrangian), ("dissipation", dissipation)):
+            for name in given or {}:
+                if name in dict(fields[slot]):
+                    raise ValueError(f"`{slot}` must have new names, but the system has a term {name!r} already. Rename it.")
+            fields[slot] = (*fields[slot], *_terms(slot, given or None))
+        new = object.__new__(System)
+        for name, value in fields.items():
+            object.__setattr__(new, name, value)
+        return new
+
     def __copy__(self) -> "System":
         return self
 
