@@ -220,7 +220,7 @@ class DesignProblem:
         if excess <= KEPT:
             reason = f"limits are exceeded by {100 * least.excess:.2g} % of their size. Allow more `steps`."
             return dataclasses.replace(least, reason=reason)
-        names = [repr(str(limit)) for limit, value in zip(self.limits, values, strict=True) if value < -0.9 * excess]
+        names = [repr(str(limit)) for limit, value in zip(self.limits, values, strict=True) if value < -0.5 * excess]
         which = " and ".join(names) + (" contradict each other" if len(names) > 1 else " cannot be kept")
         raise ValueError(
             f"`within` must leave room for an experiment, but {which}: exceeded by {100 * excess:.2g} % of its size at best. Widen it."

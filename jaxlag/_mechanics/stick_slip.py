@@ -458,10 +458,11 @@ def slip_of(elements: FrictionElements, t, q, v, errors: Float[Array, " n"]) -> 
 
 
 def redirected(elements: FrictionElements, sigma, held, t, q, v):
-    """σ, with the direction of slipping elements of several rows updated to their motion."""
+    """σ, with the direction of slipping elements of several rows updated to their motion; not of what has come past rest."""
     of, slip = elements.element_of_row, elements.slip(t, q, v)
-    several, size = elements.is_vector & ~elements.straight, elements.norms(slip)
-    turns = (several & (size > slip_of(elements, t, q, v, jnp.finfo(v.dtype).eps * jnp.abs(v))) & ~sticking(elements, sigma) & ~held)[of]
+    several, size, onward = elements.is_vector & ~elements.straight, elements.norms(slip), elements.sums(sigma * slip) > 0
+    moves = several & onward & (size > slip_of(elements, t, q, v, jnp.finfo(v.dtype).eps * jnp.abs(v)))
+    turns = (moves & ~sticking(elements, sigma) & ~held)[of]
     if not np.any(elements.is_vector):
         return sigma
     new = jax.lax.stop_gradient(jnp.where(turns, slip / jnp.where(turns, size[of], 1), directed(elements, sigma)))

@@ -142,7 +142,7 @@ class System:
     def with_terms(self, lagrangian: Mapping[str, Callable] | None = None, dissipation: Mapping[str, Callable] | None = None) -> "System":
         """The system with further terms of L and D.
 
-        **Arguments:** `lagrangian`, `dissipation`: functions by name, as for `System`. **Raises:** `ValueError` if it has a term of the name.
+        **Arguments:** `lagrangian`, `dissipation`: functions by name, as for `System`. **Raises:** `ValueError` if a name is taken.
         """
         fields = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
         for slot, given in (("lagrangian", lagrangian), ("dissipation", dissipation)):

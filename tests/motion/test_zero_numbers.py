@@ -121,3 +121,14 @@ def test_second_derivatives_at_rest():
     slopes = lambda a: np.asarray(jax.grad(of)(a))
     expected = np.stack([(slopes(e) - slopes(-e)) / (2 * h) for e in h * np.eye(2)])
     np.testing.assert_allclose(jax.hessian(of)(jnp.zeros(2)), expected, atol=1e-4 * np.max(np.abs(expected)))
+
+
+def test_friction_of_zero_holds_what_rests_without_a_load():
+    """A known gap: with F = 0 and no load the body could slip, but it counts as stuck, and so do its derivatives."""
+    free = jl.System(
+        lambda qdot, m: 0.5 * m * qdot**2, dissipation={"dry": lambda qdot, F: F * jnp.abs(qdot)}, force=lambda t, a: a * jnp.sin(9 * t)
+    )
+    of = lambda a: jl.simulate(free, 0.0, 0.0, jnp.linspace(0.0, 1.0, 5), {"m": 0.2, "F": 0.0, "a": a}).q
+    ts = np.linspace(0.0, 1.0, 5)
+    np.testing.assert_allclose(jax.jacfwd(of)(1.0), (ts / 9 - np.sin(9 * ts) / 81) / 0.2, atol=1e-7)
+    np.testing.assert_allclose(jax.jacfwd(of)(0.0), 0.0, atol=1e-12)
