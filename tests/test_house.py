@@ -264,6 +264,7 @@ WINGS = {  # each imports only from those above it, and each file of a wing only
         "design_criteria",
         "design_plan",
         "design_problem",
+        "design_search",
         "design",
         "posterior",
         "log_density",

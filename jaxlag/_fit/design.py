@@ -14,6 +14,7 @@ from .._model.system import System
 from .design_criteria import Criterion, DOptimal
 from .design_plan import Planned, entries_of
 from .design_problem import DesignProblem, Sample, limits_of, samples_of
+from .design_search import best, searched
 from .experiment import Experiment
 from .information import Information, information, planned
 from .measurement import Test
@@ -146,13 +147,13 @@ def design(
     parts = [Planned.of(model, without_priors, one, params, over, bounds or {}) for one in plans]
     samples = [_sample(system, wanted, one, already, about) for one in samples_of(criterion, params)]
     problem = DesignProblem.of(parts, samples, criterion, limits_of(within, parts))
-    found = [problem.searched(y, steps, tolerance) for y in problem.starts(starts, jax.random.key(0) if key is None else key)]
-    best = problem.best(found)
-    experiments = tuple(part.measurement(*pair) for part, *pair in zip(problem.parts, plans, problem.split(best.y), strict=True))
+    found = [searched(problem, y, steps, tolerance) for y in problem.starts(starts, jax.random.key(0) if key is None else key)]
+    chosen = best(problem, found)
+    experiments = tuple(part.measurement(*pair) for part, *pair in zip(problem.parts, plans, problem.split(chosen.y), strict=True))
     after = information(system, [*already, *experiments], params, **about)
     costs = tuple(one.cost for one in found)
     start = problem.cost(np.zeros(problem.size))[0]
-    return Design(experiments, before, after, start, best.cost, problem.binding(best.y), best.reason is None, best.reason, costs)
+    return Design(experiments, before, after, start, chosen.cost, problem.binding(chosen.y), chosen.reason is None, chosen.reason, costs)
 
 
 def _sample(system: System, wanted: Free, params: PyTree, already: Sequence[Any], about: dict[str, Any]) -> Sample:

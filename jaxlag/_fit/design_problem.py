@@ -11,8 +11,8 @@ from jaxtyping import Array, Float, PyTree
 
 from .._model.injection import check_function
 from .._model.paths import is_within
-from .constrained_minimum import ASTRAY, KEPT, Minimum, constrained_minimum, nearest_to_limits
-from .design_criteria import Criterion, OverSamples, is_sharp, total
+from .constrained_minimum import KEPT
+from .design_criteria import Criterion, OverSamples, total
 from .design_plan import Planned, along_the_motion, informed, of_parameters
 from .parameters import Free
 
@@ -20,9 +20,7 @@ FAINT = 1e-10  # of the information that makes a relative error of one: what kee
 CLOSE = 1e-13  # to one, as a correlation of two parameters may come: rounding
 SHARPNESS, SHARP = (10.0, 1e3, 1e5), 1e12  # of edges of a criterion, one search after the other; and of none
 SPREAD = 0.5  # of further starts, in units of what is chosen
-REACH, SMALLEST, BOXES = 1.0, 1e-4, 30  # of one search, in units of what is chosen, and how many follow each other
-ALONG, FINER = 201, 8  # times at which limits are kept in the search, and how many more at which that is checked
-ROUNDS = 5  # of searches with limits moved by what was found between those times
+ALONG = 201  # times at which limits are kept in the search
 NEAR = 1e-3  # of its size, at which a limit binds
 
 
@@ -168,63 +166,6 @@ class DesignProblem:
             y = np.where(both, np.where(both, lower, 0) + share * np.where(both, upper - lower, 1), normal)
             found.append(np.concatenate([part.in_order(own) for part, own in zip(self.parts, self.split(y), strict=True)]))
         return found
-
-    def searched(self, y: np.ndarray, steps: int, tolerance: float) -> Minimum:
-        """The minimum near a start; where limits are exceeded between the times at which they are kept, they are moved inwards."""
-        problem, levels = self, list(SHARPNESS) if is_sharp(self.criterion) else [SHARP]
-        for _ in range(ROUNDS):
-            while True:
-                found = problem._step_by_step(levels[0], y, steps, tolerance)
-                y, exact = found.y, self.cost(found.y)[0]
-                if len(levels) == 1 or abs(found.cost - exact) <= tolerance:  # no edge is near
-                    break
-                levels = levels[1:]
-            fine = np.array([min(np.min(margins), 0.0) for margins, *_ in self.of_limits(y, FINER)])
-            excess = -min(np.min(fine, initial=0.0), np.min(self.margins(y)[0], initial=0.0))
-            found = dataclasses.replace(found, cost=exact, excess=float(excess))
-            if found.excess <= KEPT or not self.limits or not np.isfinite(found.cost):
-                break
-            problem = dataclasses.replace(problem, moved=problem.moved - fine)
-        return found
-
-    def _step_by_step(self, sharpness: float, y: np.ndarray, steps: int, tolerance: float) -> Minimum:
-        """The minimum, begun on the constraints; where a search goes astray, from box to box about what was found last."""
-        (lower, upper), reach, last = self.bounds, np.inf, np.inf
-        cost = lambda y: self.cost(y, sharpness)
-        for _ in range(BOXES):
-            found = constrained_minimum(
-                cost, self.margins, (np.maximum(lower, y - reach), np.minimum(upper, y + reach)), y, steps, tolerance
-            )
-            is_at_edge = np.any((np.abs(found.y - y) > reach * (1 - KEPT)) & (found.y > lower) & (found.y < upper))
-            y = np.concatenate([part.settled(own) for part, own in zip(self.parts, self.split(found.y), strict=True)])
-            if found.reason == ASTRAY:
-                if reach < SMALLEST or (reach < REACH / 100 and last - found.cost < tolerance):
-                    return found
-                reach = min(reach / 4, REACH)
-            elif not is_at_edge or found.reason or not np.isfinite(found.cost):
-                return found
-            else:
-                reach *= 2
-            last = min(last, found.cost)
-        return dataclasses.replace(found, reason="there is no end to what is better. Give `bounds`, or limits by `within`.")
-
-    def best(self, found: Sequence[Minimum]) -> Minimum:
-        """Of those that keep the limits the one with the smallest cost; refuses limits that cannot be kept."""
-        kept = [one for one in found if np.isfinite(one.cost) and one.excess <= KEPT]
-        if kept:
-            return min(kept, key=lambda one: one.cost)
-        least = min(found, key=lambda one: one.excess)
-        nearest = nearest_to_limits(self.margins, self.bounds, least.y)
-        values = [np.min(margins) for margins, *_ in self.of_limits(nearest)]
-        excess = -np.min(values, initial=0.0)
-        if excess <= KEPT:
-            reason = f"limits are exceeded by {100 * least.excess:.2g} % of their size. Allow more `steps`."
-            return dataclasses.replace(least, reason=reason)
-        names = [repr(str(limit)) for limit, value in zip(self.limits, values, strict=True) if value < -0.5 * excess]
-        which = " and ".join(names) + (" contradict each other" if len(names) > 1 else " cannot be kept")
-        raise ValueError(
-            f"`within` must leave room for an experiment, but {which}: exceeded by {100 * excess:.2g} % of its size at best. Widen it."
-        )
 
     def binding(self, y: np.ndarray) -> dict[str, float]:
         """Limits that are touched, and when; and bounds, at no time."""

@@ -168,7 +168,7 @@ def discover(
     kept = tuple(name for name in names if name not in idle)
     free = Free.of(of_all, kept, {name: (0.0, None) for name in candidates["dissipation"]} if passive else None)
     problem = WeakFormProblem.of(records, free, True)
-    found = best_estimate(problem, half_widths(records) if width is None else np.array([width / 2]))
+    found = best_estimate(problem, half_widths(records, width))
     if found is None:
         raise ValueError("`experiments` must be long enough for windows on which the equations are tested, but are not. Record more.")
     blocks = Blocks(*map(np.stack, zip(*problem.blocks(found, BLOCKS), strict=True)))
@@ -257,7 +257,7 @@ def _refuse_dependent(blocks: Blocks, names: Sequence[str]) -> None:
         alike = [name for name, x in zip(names, vectors[:, 0], strict=True) if abs(x) > 0.05]
         raise ValueError(
             f"candidates must be independent, but {', '.join(alike)} are not: one is a sum of the others, on this recording at least. "
-            "Leave one out."
+            "Leave one out, or record a wider range of motions."
         )
 
 

@@ -12,8 +12,8 @@ from jaxtyping import Array, Float, PyTree
 from .._motion.members import of_each
 from .._program.jit import compiled
 from .experiment import Experiment
+from .experiment_batch import map_batch
 from .problem import LeastSquaresProblem, with_zero_values
-from .residuals import predict_batch
 from .result import Interval
 
 Density = Any  # a `LogDensity`, which makes use of what is here
@@ -65,18 +65,33 @@ class Posterior:
             raise ValueError(f"`name` must be one of the draws, but is {name!r}. There are {', '.join(self.draws)}.")
         return Interval(*map(float, np.quantile(self.draws[name], _ends(level))))
 
-    def bands(self, experiment: Experiment, *, level: float = 0.95, count: int = 200) -> tuple[PyTree, PyTree, PyTree]:
-        """What an experiment should show: the lower end, the median and the upper end of the predictions of its sensors.
+    def bands(self, experiment: Experiment, of: Any = None, *, level: float = 0.95, count: int = 200) -> tuple[PyTree, PyTree, PyTree]:
+        """What an experiment should show: the lower end, the median and the upper end of the predictions of its sensors, or of whatever is
+        computed of the motion: coordinates, forces of constraints, friction, instants of sticking.
 
-        **Arguments:** `experiment`: its start is taken as exact, and its `values` may be None; what `observe` returns is predicted, be it
-        coordinates, forces of constraints or what a user computes of them. `level`: of the band; `count`: of the draws that are used.
+        **Arguments:** `experiment`: its start is taken as exact, and its `values` may be None. `of`: a function of the motion, a
+        `Trajectory`, that returns a tree of arrays; without it what `observe` returns is predicted. `level`: of the band; `count`: of the
+        draws that are used.
 
-        **Returns:** three trees like the values of the experiment. **Raises:** `ValueError` if `level` is out of range.
+        **Returns:** three trees like the values of the experiment, or like what `of` returns; a motion that cannot be computed does not
+        count. **Raises:** `ValueError` if `level` is out of range, `TypeError` if `of` is no function.
+
+        ```python
+        import jax, jax.numpy as jnp
+        import jaxlag as jl
+        oscillator = jl.System(lambda q, qdot, c: 0.5 * qdot**2 - 0.5 * c * q**2)
+        ts = jnp.linspace(0.0, 3.0, 50)
+        record = jl.Experiment(ts, jnp.cos(2.0 * ts), 1.0, 0.0, sigma=0.1)
+        posterior = jl.log_density(oscillator, record, {"c": 3.0}, free=("c",)).sample(jax.random.key(0), 200, chains=2)
+        lower, median, upper = posterior.bands(record, lambda motion: {"end": motion.q[-1], "fastest": jnp.max(jnp.abs(motion.qdot))})
+        ```
         """
         ends = (_ends(level)[0], 0.5, _ends(level)[1])
+        if not (of is None or callable(of)):
+            raise TypeError(f"`of` must be a function of a motion, but is {of!r}. Give e.g. `lambda motion: motion.multipliers`.")
         every = self.unbounded.reshape(-1, self.unbounded.shape[-1])
         chosen = every[np.linspace(0, len(every) - 1, min(count, len(every))).astype(int)]
-        seen = _predictions(self.density, jnp.asarray(chosen), experiment)
+        seen = _predictions(self.density, jnp.asarray(chosen), experiment, of)
         return tuple(jax.tree.map(lambda x, q=q: jnp.nanquantile(x, q, axis=0), seen) for q in ends)  # type: ignore[return-value]
 
     def __repr__(self) -> str:
@@ -163,21 +178,24 @@ def _shown(density: Density, u: Array) -> Array:
     return jax.vmap(of_one)(u)
 
 
-def _predictions(density: Density, u: Array, experiment: Experiment) -> PyTree:
-    """What the sensors of an experiment show at some draws."""
+def _predictions(density: Density, u: Array, experiment: Experiment, of: Callable | None) -> PyTree:
+    """What is seen of an experiment at some draws."""
     problem = density.problem
     single = LeastSquaresProblem.of(problem.model, problem.free, [with_zero_values(problem.model, problem.free, experiment)])
-    return _predicted_at(density, single, u)
+    return _predicted_at(density, single, u, of)
 
 
 @compiled
-def _predicted_at(density: Density, single: Any, u: Array) -> PyTree:
-    free = density.problem.free
+def _predicted_at(density: Density, single: Any, u: Array, of: Callable | None) -> PyTree:
+    free, (batch,) = density.problem.free, single.batches
 
-    def of_one(u):
+    def of_one(e, z, theta):
+        seen, motion = single.model.predicted(free.insert(theta), e, z)
+        seen = seen if of is None else jax.tree.map(jnp.asarray, of(motion))
+        return jax.tree.map(lambda x: jnp.where(motion.succeeded, x.astype(u.dtype), jnp.nan), seen)
+
+    def of_draw(u):
         theta, _ = density.unbounded.theta(u[: free.size])
-        (batch,) = single.batches
-        found = predict_batch(single.model, free, batch, (theta - free.start) / free.scale, jnp.zeros((1, batch.unknowns), u.dtype))
-        return jax.tree.map(lambda x: x[0], found.channels)
+        return jax.tree.map(lambda x: x[0], map_batch(of_one, batch, jnp.zeros((1, batch.unknowns), u.dtype), theta))
 
-    return of_each(of_one, u)
+    return of_each(of_draw, u)

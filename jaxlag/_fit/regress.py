@@ -9,7 +9,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import PyTree
 
-from .._model.numbers import number
 from .._model.system import System
 from .._model.validation import without_contacts, without_events
 from .base_parameters import nearby
@@ -144,11 +143,10 @@ def regress(
     if given.size == 0:
         raise ValueError("`free` must name at least one entry of params, but is empty. Say which parameters to identify.")
     params = given.with_default_starts()
-    half = None if width is None else _half(width, experiments)
     records = [Record.of(system, e, params) for e in experiments]
     chosen, linear = _start(records, given, free, bounds)
     problem = WeakFormProblem.of(records, chosen, linear)
-    found = best_estimate(problem, half_widths(records) if half is None else np.array([half]))
+    found = best_estimate(problem, half_widths(records, width))
     if found is None:
         raise ValueError(
             "`experiments` must be long enough for windows on which the equations of motion are tested, as many as free parameters, and "
@@ -158,17 +156,6 @@ def regress(
     errors = chosen.by_name(jnp.asarray(found.errors * slope))
     windows = 2 * found.half, found.windows, found.near_rest > SLIDING
     return Regression(chosen.insert(theta), chosen.by_name(theta), errors, chosen.entries, linear, *windows, _remarks(problem, found))
-
-
-def _half(width, experiments):
-    width = float(number(width, "`width`", cure="Give the width of the windows, a time."))
-    longest = max(float(e.ts[-1] - e.ts[0]) for e in experiments)
-    if not 0 < width <= longest:
-        raise ValueError(
-            f"`width` must be positive and at most the length of the longest record, {longest:g}, but is {width:g}. "
-            "Give the width of the windows, a time, or leave it out."
-        )
-    return width / 2
 
 
 def _start(records, given, free, bounds):

@@ -33,10 +33,11 @@ def uncertainty_of(minimum: Minimum) -> Uncertainty:
     """From the Jacobian at the minimum, without the weight of the gaps between segments."""
     p, size = minimum.size, minimum.x.size
     J = _jacobian(minimum)
-    if J is None or not np.all(np.isfinite(gathered(J))):  # there is no motion to differentiate, or it ended on the way
+    small = None if J is None else gathered(J)
+    if small is None or not np.all(np.isfinite(small)):  # there is no motion to differentiate, or it ended on the way
         known = Determined(np.full((size, size), np.nan), np.ones(size, bool), np.zeros((size, 0)))
         return Uncertainty(known, None, np.ones(p), 0)
-    known = determined_by(gathered(J), np.asarray(minimum.found.gaps_jacobian), precision=minimum.x.dtype)
+    known = determined_by(small, np.asarray(minimum.found.gaps_jacobian), precision=minimum.x.dtype)
     covariance, correlated = sandwich(minimum, J, known.covariance, _influences(minimum))
     np.fill_diagonal(covariance, np.maximum(np.diag(covariance), 0))  # where nothing is determined, rounding may leave less
     after, before = (np.diag(c)[:p] for c in (covariance, known.covariance))

@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 import numpy as np
 
+from .._model.numbers import number
 from .identifiability import determined_by
 from .levenberg_marquardt import levenberg_marquardt
 from .parameters import Free
@@ -290,9 +291,17 @@ def best_estimate(problem: WeakFormProblem, halves: np.ndarray) -> Estimate | No
     return best._replace(errors=with_scatter(best.y, best.errors, [(one.y, one.errors) for one in as_good]), as_good=tuple(as_good))
 
 
-def half_widths(records: Sequence[Record]) -> np.ndarray:
-    """Half widths that are tried, the widest first."""
-    longest = max(record.span[1] - record.span[0] for record in records)
+def half_widths(records: Sequence[Record], width: float | None = None) -> np.ndarray:
+    """Half widths that are tried, the widest first: half of the given one, where there is one."""
+    longest = max(float(record.span[1] - record.span[0]) for record in records)
+    if width is not None:
+        width = float(number(width, "`width`", cure="Give the width of the windows, a time."))
+        if not 0 < width <= longest:
+            raise ValueError(
+                f"`width` must be positive and at most the length of the longest record, {longest:g}, but is {width:g}. "
+                "Give the width of the windows, a time, or leave it out."
+            )
+        return np.array([width / 2])
     shortest = NARROWEST * min(record.interval for record in records)
     count = max(int(np.log(WIDEST * longest / shortest) / np.log(GROWTH)) + 1, 1)
     return WIDEST * longest / GROWTH ** np.arange(count)

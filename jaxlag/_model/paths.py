@@ -23,7 +23,7 @@ def entry_names(tree: PyTree, bare: str = "") -> tuple[str, ...]:
 
 def labels(name: str, shape: tuple[int, ...]) -> list[str]:
     """A label for each number of an array, e.g. "c[1]"; of a single number, its name."""
-    return [f"{name}[{', '.join(map(str, index))}]" if index else name for index in np.ndindex(shape)]
+    return [f"{name}[{', '.join(map(str, index))}]" for index in np.ndindex(shape)] if shape else [name]
 
 
 def is_within(entry: str, name: str) -> bool:

@@ -222,6 +222,9 @@ def test_wrong_use():
         of(params={"k": 1.0}, lagrangian={"k": lambda q: -0.5 * q["a"] ** 2})
     with pytest.raises(ValueError, match="'two words' is none"):
         of(lagrangian={"two words": lambda q: -0.5 * q["a"] ** 2})
+    for width in (-1.0, 1e3, np.nan):
+        with pytest.raises(ValueError, match="`width` must be (positive and at most the length of the longest record|finite)"):
+            of(lagrangian={"spring": lambda q: -0.5 * q["a"] ** 2}, width=width)
     alike = {"sin": lambda q: s(q["a"]) ** 2, "cos": lambda q: c(q["a"]) ** 2, "spring": lambda q: -0.5 * q["a"] ** 2}
     with pytest.raises(ValueError, match="candidates must be independent, but sin, cos are not"):
         of(lagrangian=alike)

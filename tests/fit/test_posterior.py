@@ -168,3 +168,33 @@ def test_draws_with_friction():
         interval = posterior.interval(name, 0.99)
         assert interval.lower < truth[name] < interval.upper
     assert np.all(posterior.draws["F"] > 0) and np.all(posterior.draws["sigma"] > 0)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("unit", UNITS)
+def test_bands_of_forces_and_of_the_instant_of_sticking(unit):
+    """A block that friction F stops after v₀/F, and holds with what pushes it; a quantile of a function that rises is that of F."""
+    pytest.importorskip("blackjax")
+    pushed = jl.System(
+        lambda qdot: 0.5 * (qdot["x"] ** 2 + qdot["z"] ** 2),
+        force=lambda t, P: {"x": P * (t - 2.0) * (t > 2.0), "z": 0.0},
+        dissipation={"dry": lambda qdot, F: F * jnp.abs(qdot["x"])},
+        holonomic={"floor": lambda q: q["z"]},
+    )
+    ts, start = np.linspace(0.0, 3.0, 61), ({"x": 0.0, "z": 0.0}, {"x": 3.0 * unit, "z": 0.0})
+    params = {"F": 2.0 * unit, "P": unit}
+    x = np.where(ts < 1.5, 3.0 * ts - ts**2, 2.25) * unit + 0.05 * unit * np.random.default_rng(2).normal(size=61)
+    record = jl.Experiment(ts, {"x": x}, *start, sigma=0.05 * unit, observe=lambda q: {"x": q["x"]})
+    posterior = jl.log_density(pushed, record, params, free=("F",)).sample(jax.random.key(0), 100, chains=2, warmup=100)
+
+    def seen(motion):
+        return {"stopped": 3.0 - motion.stats["time_stuck"][-1, 0], "force": motion.friction["dry"].force, "at": motion.q["x"][-1]}
+
+    low, middle, high = posterior.bands(record, seen)
+    quantiles = np.quantile(posterior.draws["F"], [0.025, 0.5, 0.975])
+    np.testing.assert_allclose([high["stopped"], middle["stopped"], low["stopped"]], 3.0 * unit / quantiles, rtol=1e-4)
+    np.testing.assert_allclose([high["at"], middle["at"], low["at"]], 4.5 * unit**2 / quantiles, rtol=1e-4)
+    np.testing.assert_allclose(low["force"][-1], -unit, rtol=1e-8)  # it sticks, so that F is not to be seen
+    np.testing.assert_allclose(-high["force"][10], quantiles[0], rtol=1e-4)
+    with pytest.raises(TypeError, match="`of` must be a function of a motion"):
+        posterior.bands(record, "q")

@@ -321,8 +321,10 @@ NOTEBOOK_SYSTEMS = {  # by notebook and name: its coordinates
     "17_gyroscope.gyroscope": {"psi", "theta", "phi"},
     "17_gyroscope.racket": {"p": np.zeros(4)},
     "17_gyroscope.wheel": {"x", "y", "z", "psi", "theta", "phi"},
+    "23_bearing.rotor": None,
+    "23_bearing.pendulum": None,
 }
-RECORDED = {"11_driven_pendulum.pendulum", "19_gear_friction.winch"}  # driven by a `Signal`, which has no formula
+RECORDED = {"11_driven_pendulum.pendulum", "19_gear_friction.winch", "22_experiment.carriage"}  # driven by a signal without a formula
 IN_CELLS_THAT_SIMULATE = {"19_gear_friction.driven"}  # `test_gears`
 WITH_CONTACTS = {  # `test_contact_equations`
     *(f"15_bouncing_rocking_pecking.{name}" for name in ("ball", "block", "woodpecker")),
