@@ -46,6 +46,7 @@ from ._linear.linearise import linearise as linearise
 from ._linear.root_locus import root_locus as root_locus
 from ._linear.lowest_modes import lowest_modes as lowest_modes
 from ._linear.periodic import periodic as periodic
+from ._optimal.optimise_motion import optimise_motion as optimise_motion
 from ._linear.stability_map import stability_map as stability_map
 from ._program.compilation_cache import keep_compiled as keep_compiled
 from ._model.contact import Contact as Contact, NewtonRestitution as NewtonRestitution, PoissonRestitution as PoissonRestitution

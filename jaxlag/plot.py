@@ -17,6 +17,7 @@ from ._draw.forces import forces, friction
 from ._draw.linear import bode, nyquist, root_locus
 from ._draw.mode_shapes import mode_shapes
 from ._draw.motion import balance, energy, motion, phase
+from ._draw.optimal_motion import optimal_motion
 from ._draw.posterior import posterior
 from ._draw.recovery import recovery
 from ._draw.report import report
@@ -29,6 +30,7 @@ from ._linear.modes import Modes
 from ._linear.root_locus import RootLocus
 from ._linear.stability_map import StabilityMap
 from ._motion.trajectory import Trajectory
+from ._optimal.solution import OptimalMotion
 from ._paper.linearised_result import LinearisedEquations
 from ._paper.result import Equations
 
@@ -46,6 +48,7 @@ __all__ = [
     "mode_shapes",
     "motion",
     "nyquist",
+    "optimal_motion",
     "parameters",
     "phase",
     "posterior",
@@ -101,6 +104,7 @@ SHORT_WAYS: tuple[tuple[type, str, Any], ...] = (  # what is computed knows noth
     (Recovery, "plot", recovery),
     (Design, "plot", design),
     (Posterior, "plot", posterior),
+    (OptimalMotion, "plot", optimal_motion),
     (Modes, "plot", mode_shapes),
     (Modes, "animate", animate),
     (RootLocus, "plot", root_locus),

@@ -30,5 +30,6 @@ from ._motion.trajectory import (
     Interpolated as Interpolated,
     Trajectory as Trajectory,
 )
+from ._optimal.solution import OptimalMotion as OptimalMotion
 from ._paper.linearised_result import LinearisedEquations as LinearisedEquations
 from ._paper.result import Equations as Equations

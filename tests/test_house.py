@@ -215,6 +215,19 @@ WINGS = {  # each imports only from those above it, and each file of a wing only
         "parameter_plane",
         "stability_map",
     ],
+    "_optimal": [
+        "radau",
+        "block_system",
+        "interior_point",
+        "sensitivity",
+        "input",
+        "boundary",
+        "transcription",
+        "solution",
+        "guess",
+        "statement",
+        "optimise_motion",
+    ],
     "_fit": [
         "experiment",
         "parameters",
@@ -312,6 +325,7 @@ WINGS = {  # each imports only from those above it, and each file of a wing only
         "recovery",
         "design",
         "posterior",
+        "optimal_motion",
         "report",
     ],
 }

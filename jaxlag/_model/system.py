@@ -133,26 +133,29 @@ class System:
 
     def with_events(self, events: Mapping[str, Event] | None) -> "System":
         """The system with these `events`, by name, in place of its own; None removes them."""
-        fields = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
-        new = object.__new__(System)
-        for name, value in (fields | {"events": events_of(events, [name for name, _ in self.unilateral])}).items():
-            object.__setattr__(new, name, value)
-        return new
+        return self._with(events=events_of(events, [name for name, _ in self.unilateral]))
 
     def with_terms(self, lagrangian: Mapping[str, Callable] | None = None, dissipation: Mapping[str, Callable] | None = None) -> "System":
         """The system with further terms of L and D.
 
         **Arguments:** `lagrangian`, `dissipation`: functions by name, as for `System`. **Raises:** `ValueError` if a name is taken.
         """
-        fields = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
+        changed = {}
         for slot, given in (("lagrangian", lagrangian), ("dissipation", dissipation)):
             for name in given or {}:
-                if name in dict(fields[slot]):
+                if name in dict(getattr(self, slot)):
                     raise ValueError(f"`{slot}` must have new names, but the system has a term {name!r} already. Rename it.")
-            fields[slot] = (*fields[slot], *_terms(slot, given or None))
+            changed[slot] = (*getattr(self, slot), *_terms(slot, given or None))
+        return self._with(**changed)
+
+    def with_functions(self, change: Callable[[Callable], Callable]) -> "System":
+        """The system with each of its terms as `change(term)` makes it."""
+        return self._with(**{slot: tuple((name, change(function)) for name, function in getattr(self, slot)) for slot in SLOTS})
+
+    def _with(self, **changed: Any) -> "System":
         new = object.__new__(System)
-        for name, value in fields.items():
-            object.__setattr__(new, name, value)
+        for field in dataclasses.fields(self):
+            object.__setattr__(new, field.name, changed.get(field.name, getattr(self, field.name)))
         return new
 
     def __copy__(self) -> "System":

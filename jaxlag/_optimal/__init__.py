@@ -1,0 +1,1 @@
+"""Best motions: which input leads from here to there at the least cost."""

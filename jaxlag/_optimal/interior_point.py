@@ -1,0 +1,361 @@
+r"""Minima of sums over a chain of intervals, with equations and bounds, by an interior-point method.
+
+    min Σ f_k(ζ_k)   such that   c_k(ζ_k) = 0,   l ≤ x ≤ u,        ζ_k = what interval k depends on
+
+Newton's method on the equations of a minimum of f - μ Σ ln(x - l) - μ Σ ln(u - x), with μ → 0. The symmetric system is solved by the
+positive definite matrix W + JᵀJ/δ of the chain, refined until it is that of J alone: so constraints may be redundant. Where it is not
+positive, W is raised. Steps are taken back until a filter of violation and cost accepts them; where none is, the violation alone is made
+smaller, by Levenberg and Marquardt's method.
+
+Source: Wächter & Biegler, Mathematical Programming 106 (2006) 25-57 (its numbers in brackets); Nocedal & Wright, Numerical Optimization,
+2nd ed., chapter 19; Friedlander & Orban, Math. Prog. Comp. 4 (2012) 71-107 (the regularised system).
+"""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from .block_system import Shape, factors, solved
+
+FIRST, LAST = 0.1, 0.1  # μ at first; at last, over the tolerance
+FALL, FASTER = 0.2, 1.5  # of μ, when its minimum is near: to a part, or to a power (7)
+NEAR = 10.0  # of μ, an error at which its minimum counts as near
+INSIDE = 1e-2  # how far a start is moved off its bounds, over its size and the width
+TO_BOUND = 0.99  # of the way to a bound that a step may take, at least (8)
+RAISED, MORE, LESS, MOST = 1e-4, 8.0, 1 / 3, 1e12  # W at first, then times, where it is not positive, and what is left of it for next time
+SHORT = 0.3  # share of a step of restoration, of which the next is damped more
+REFINED = 3  # solutions of what is left
+LARGEST, SMALLEST = 2.0, 1e-4  # of violations, over those at the start (21)
+MARGIN, ARMIJO = 1e-5, 1e-4  # by which a step must be better (18, 20)
+SHARES = 30  # of a step, each half of the one before
+KEPT = 60  # points in the filter
+SPREAD = 1e10  # by which a multiplier of a bound may differ from μ over the distance (16)
+CONVERGED, STEP_LIMIT, INFEASIBLE, STUCK = 0, 1, 2, 3
+
+
+class Chain(NamedTuple):
+    """A problem: of each interval its cost and its equations, `interval(ζ, data, args)` → (f, c), and bounds of all numbers."""
+
+    shape: Shape
+    interval: Callable[[Array, Any, Any], tuple[Array, Array]]
+    data: Any  # of each interval
+    args: Any
+    lower: Float[Array, " n"]
+    upper: Float[Array, " n"]
+
+    def values(self, x: Array) -> tuple[Array, Array]:
+        """f and c (N, m)."""
+        f, c = jax.vmap(lambda z, data: self.interval(z, data, self.args))(self.shape.gathered(x), self.data)
+        return jnp.sum(f), c
+
+    def stationary(self, x: Array, y: Array) -> tuple[Array, Array]:
+        """∇f + Jᵀy (n,), and c."""
+
+        def one(z, data, y):
+            (_, c), pull = jax.vjp(lambda z: self.interval(z, data, self.args), z)
+            return pull((jnp.ones((), z.dtype), y))[0], c
+
+        gradient, c = jax.vmap(one)(self.shape.gathered(x), self.data, y)
+        return self.shape.scattered(gradient), c
+
+    def linearised(self, x: Array, y: Array) -> tuple[Array, Array, Array, Array, Array]:
+        """f, c, the gradient of f (N, l), the Jacobian J (N, m, l), and the Hessian of f + y·c (N, l, l)."""
+
+        def one(z, data, y):
+            def both(z):
+                (f, c), pull = jax.vjp(lambda z: self.interval(z, data, self.args), z)
+                return (f, c, pull((jnp.ones_like(f), y))[0]), (f, c)
+
+            (df, J, H), (f, c) = jax.jacfwd(both, has_aux=True)(z)
+            return f, c, df, J, (H + H.T) / 2
+
+        f, c, df, J, H = jax.vmap(one)(self.shape.gathered(x), self.data, y)
+        return jnp.sum(f), c, df, J, H
+
+
+class Point(NamedTuple):
+    """x; multipliers y of the equations, and those of the bounds."""
+
+    x: Float[Array, " n"]
+    y: Float[Array, "N m"]
+    below: Float[Array, " n"]
+    above: Float[Array, " n"]
+
+
+class Found(NamedTuple):
+    """Where an iteration ended, with f there; the largest error, of the equations alone, and the steps."""
+
+    point: Point
+    f: Float[Array, ""]
+    error: Float[Array, ""]
+    violation: Float[Array, ""]
+    steps: Int[Array, ""]
+    status: Int[Array, ""]
+
+
+class _State(NamedTuple):
+    point: Point
+    mu: Array
+    filter: Array  # (KEPT, 2): violations and costs that must not come back
+    raised: Array  # of W at the last step
+    damping: Array  # of steps of restoration
+    restoring: Bool[Array, ""]
+    before: Array  # the violation when restoration began
+    limits: Array  # of violations
+    steps: Array
+    status: Array
+    error: Array
+
+
+def minimum(chain: Chain, start: Float[Array, " n"], *, tolerance: float, steps: int) -> Found:
+    """The minimum near a start."""
+    x = _inside(chain, start)
+    _, c = chain.values(x)
+    finite = lambda bound, value: jnp.where(jnp.isfinite(bound), value, 0.0)
+    point = Point(x, jnp.zeros_like(c), finite(chain.lower, 1.0), finite(chain.upper, 1.0))
+    theta = jnp.sum(jnp.abs(c))
+    limits = jnp.stack([LARGEST * jnp.maximum(1, theta), SMALLEST * jnp.maximum(1, theta)])
+    zero, count = jnp.zeros((), x.dtype), jnp.zeros((), int)
+    state = _State(
+        point, zero + FIRST, _empty(x.dtype), zero, zero + RAISED, jnp.array(False), zero, limits, count, count - 1, zero + jnp.inf
+    )
+    state = jax.lax.while_loop(lambda s: (s.status < 0) & (s.steps < steps), lambda s: _step(chain, s, tolerance), state)
+    f, c = chain.values(state.point.x)
+    status = jnp.where(state.status < 0, STEP_LIMIT, state.status)
+    return Found(state.point, f, state.error, jnp.max(jnp.abs(c)), state.steps, status)
+
+
+def best_of(every: Found) -> Int[Array, ""]:
+    """Which of several minima is the best: of those that were found the least, or what comes closest to one."""
+    converged = every.status == CONVERGED
+    rank = jnp.where(jnp.any(converged), jnp.where(converged, every.f, jnp.inf), every.violation)
+    return jnp.argmin(jnp.where(jnp.isnan(rank), jnp.inf, rank))
+
+
+def _inside(chain, x):
+    """Moved off the bounds (3.6)."""
+    width = jnp.where(jnp.isfinite(chain.upper - chain.lower), chain.upper - chain.lower, jnp.inf)
+    off = lambda bound: jnp.minimum(INSIDE * jnp.maximum(1, jnp.abs(bound)), INSIDE * width)
+    x = jnp.where(jnp.isfinite(chain.lower), jnp.maximum(x, chain.lower + off(chain.lower)), x)
+    return jnp.where(jnp.isfinite(chain.upper), jnp.minimum(x, chain.upper - off(chain.upper)), x)
+
+
+def _empty(dtype):
+    return jnp.full((KEPT, 2), jnp.inf, dtype)
+
+
+def _distances(chain, x):
+    """To the bounds, infinite where there are none."""
+    return x - chain.lower, chain.upper - x
+
+
+def _barrier(chain, x, f, mu):
+    below, above = _distances(chain, x)
+    logs = lambda gap: jnp.sum(jnp.where(jnp.isfinite(gap), jnp.log(jnp.where(jnp.isfinite(gap), gap, 1)), 0))
+    return f - mu * (logs(below) + logs(above))
+
+
+def _error(chain, point, c, gradient, mu):
+    """How far a point is from the minimum of a barrier (5), with what multipliers are large divided out."""
+    below, above = _distances(chain, point.x)
+    sizes = jnp.sum(jnp.abs(point.below)) + jnp.sum(jnp.abs(point.above))
+    count = max(2 * point.x.size, 1)
+    dual = jnp.maximum(100, (jnp.sum(jnp.abs(point.y)) + sizes) / (point.y.size + count)) / 100
+    product = lambda gap, z: jnp.max(jnp.where(jnp.isfinite(gap), jnp.abs(jnp.where(jnp.isfinite(gap), gap, 0) * z - mu), 0))
+    slope = jnp.max(jnp.abs(gradient - point.below + point.above))
+    complementary = jnp.maximum(product(below, point.below), product(above, point.above))
+    return jnp.maximum(jnp.maximum(slope, complementary) / dual, jnp.max(jnp.abs(c), initial=0.0))
+
+
+def _step(chain: Chain, s: _State, tolerance: float) -> _State:
+    shape, (x, y, zl, zu) = chain.shape, s.point
+    f, c, df, J, H = chain.linearised(x, y)
+    gradient = shape.scattered(df + jnp.einsum("kml,km->kl", J, y))
+    error = _error(chain, s.point, c, gradient, 0.0)
+    mu = _barrier_now(chain, s, c, gradient, tolerance)
+    kept = jnp.where(mu < s.mu, _empty(x.dtype), s.filter)
+    below, above = _distances(chain, x)
+    of_barrier = mu * (1 / above - 1 / below)  # where there is no bound, 1/∞
+    dx, dy, raised = _direction(chain, s, (c, J, H), gradient + of_barrier)
+    phi, theta = _barrier(chain, x, f, mu), jnp.sum(jnp.abs(c))
+    slope = jnp.sum((shape.scattered(df) + of_barrier) * dx)
+    most = jnp.maximum(TO_BOUND, 1 - mu)
+    trials = _Trials(chain, x, mu, theta, phi, slope, kept, s.limits)
+    alpha_max = jnp.minimum(_way(below, dx, most), _way(above, -dx, most))
+    ways = lambda: trials.restored(dx, alpha_max, c, s.before), lambda: trials.searched(dx, alpha_max)
+    alpha, new_x, accepted, of_cost, left = jax.lax.cond(s.restoring, *ways)
+    zl, zu = _multipliers_of_bounds(chain, s.point, dx, new_x, mu, most)
+    point = Point(new_x, jnp.where(s.restoring, jnp.where(left, 0.0, y), y + alpha * dy), zl, zu)
+    begins = ~accepted & ~s.restoring
+    entry = jnp.stack([(1 - MARGIN) * theta, phi - MARGIN * theta])
+    enters = (accepted & ~of_cost & ~s.restoring) | begins
+    kept = jnp.where(enters, kept.at[jnp.argmax(kept[:, 0])].set(entry), kept)  # in an empty place
+    done, stuck = error <= tolerance, begins & (theta <= tolerance * y.size)
+    status = jnp.where(done, CONVERGED, jnp.where(stuck, STUCK, jnp.where(~accepted & s.restoring, INFEASIBLE, -1)))
+    damping = jnp.where(alpha < SHORT, MORE * s.damping, jnp.where(alpha > 1 - SHORT, s.damping / MORE, s.damping))
+    return _State(
+        jax.tree.map(lambda new, old: jnp.where(done | ~accepted, old, new), point, s.point),
+        mu,
+        kept,
+        raised=jnp.where(raised > 0, raised, s.raised),
+        damping=jnp.where(s.restoring, jnp.maximum(damping, RAISED**2), RAISED),
+        restoring=begins | (s.restoring & ~left),
+        before=jnp.where(begins, theta, s.before),
+        limits=s.limits,
+        steps=s.steps + jnp.where(done, 0, 1),
+        status=status,
+        error=error,
+    )
+
+
+def _barrier_now(chain, s, c, gradient, tolerance):
+    """μ, lower where its minimum is near (7)."""
+
+    def lower(mu):
+        return jnp.maximum(LAST * tolerance, jnp.minimum(FALL * mu, mu**FASTER))
+
+    near = lambda mu: (_error(chain, s.point, c, gradient, mu) <= NEAR * mu) & (mu > LAST * tolerance) & ~s.restoring
+    return jax.lax.while_loop(near, lower, s.mu)
+
+
+def _direction(chain, s, of, slope):
+    """A step of x and y, and by how much W was raised: Newton's; or Levenberg and Marquardt's to satisfy the equations alone, short where
+    a bound is near.
+    """
+    shape, (c, J, H) = chain.shape, of
+    below, above = _distances(chain, s.point.x)
+
+    def newton():
+        kkt, raised = factorised(shape, H, J, s.point.below / below + s.point.above / above, s.raised)
+        return *kkt(-slope, -c), raised
+
+    def to_equations():
+        damped = factors(shape, jnp.einsum("kml,kmj->klj", J, J), s.damping * (1 + 1 / below**2 + 1 / above**2))
+        return solved(shape, damped, -shape.scattered(jnp.einsum("kml,km->kl", J, c))), jnp.zeros_like(c), s.raised
+
+    return jax.lax.cond(s.restoring, to_equations, newton)
+
+
+def _multipliers_of_bounds(chain, point, dx, new_x, mu, most):
+    """Those after a step."""
+    below, above = _distances(chain, point.x)
+    dzl, dzu = (mu - point.below * dx) / below - point.below, (mu + point.above * dx) / above - point.above
+    alpha = jnp.minimum(_way(point.below, dzl, most), _way(point.above, dzu, most))
+    gaps = _distances(chain, new_x)
+    return tuple(_near_mu(z + alpha * dz, mu, gap) for z, dz, gap in zip((point.below, point.above), (dzl, dzu), gaps, strict=True))
+
+
+def _near_mu(z, mu, gap):
+    """A multiplier of a bound, as μ over the distance has it, within wide limits."""
+    return jnp.where(jnp.isfinite(gap), jnp.clip(z, mu / (SPREAD * gap), SPREAD * mu / gap), 0.0)
+
+
+def _way(gap, change, most):
+    """The share of a step after which a positive gap is nearly used up."""
+    shrinks = jnp.isfinite(gap) & (change < 0)
+    return jnp.min(jnp.where(shrinks, -most * gap / jnp.where(shrinks, change, -1), 1.0), initial=1.0)
+
+
+def factorised(shape, H, J, sigma, raised):
+    """The solution of the symmetric system as a function of its right-hand sides, and by how much W was raised."""
+    eps = jnp.finfo(J.dtype).eps
+    small = eps**0.4
+    squares = jnp.einsum("kml,kmj->klj", J, J) / small
+
+    def attempt(raised):
+        return factors(shape, H + squares, sigma + raised + small)
+
+    def more(state):
+        raised, _ = state
+        raised = jnp.where(raised > 0, MORE * raised, RAISED)
+        return raised, attempt(raised)
+
+    fails = lambda of: ~jnp.all(jnp.isfinite(of.corner)) | ~jnp.all(jnp.isfinite(of.chain))
+    first = attempt(jnp.zeros_like(raised))
+    before = jnp.maximum(LESS * raised, eps)
+    state = jax.lax.cond(fails(first) & (raised > 0), lambda: (before, attempt(before)), lambda: (0 * raised, first))
+    raised, of = jax.lax.while_loop(lambda s: fails(s[1]) & (s[0] < MOST), more, state)
+
+    def kkt(r1, r2):
+        product = lambda dx: shape.scattered(jnp.einsum("klj,kj->kl", H, shape.gathered(dx))) + (sigma + raised) * dx
+        rows = lambda dx: jnp.einsum("kml,kl->km", J, shape.gathered(dx))
+        columns = lambda dy: shape.scattered(jnp.einsum("kml,km->kl", J, dy))
+
+        def once(r1, r2):
+            dx = solved(shape, of, r1 + columns(r2) / small)
+            return dx, (rows(dx) - r2) / small
+
+        def refine(_, found):
+            dx, dy = found
+            more = once(r1 - product(dx) - columns(dy), r2 - rows(dx))
+            return dx + more[0], dy + more[1]
+
+        return jax.lax.fori_loop(0, REFINED, refine, once(r1, r2))
+
+    return kkt, raised
+
+
+class _Trials(NamedTuple):
+    """What a step from x may lead to: shares of it, one half of the other, until one is accepted."""
+
+    chain: Chain
+    x: Array
+    mu: Array
+    theta: Array
+    phi: Array
+    slope: Array  # of φ along the step
+    filter: Array
+    limits: Array
+
+    def _looked_at(self, x):
+        f, c = self.chain.values(x)
+        return jnp.sum(jnp.abs(c)), _barrier(self.chain, x, f, self.mu), c
+
+    def _is_better(self, theta, phi, alpha):
+        """Whether the filter accepts, and whether the cost was what decided (19, 20)."""
+        finite = jnp.isfinite(theta) & jnp.isfinite(phi)
+        rounding = 10 * jnp.finfo(self.x.dtype).eps * jnp.abs(self.phi)
+        falls = (self.slope < 0) & (alpha * jnp.abs(self.slope) ** 2.3 > self.theta**1.1)
+        by_cost = falls & (self.theta <= self.limits[1])
+        armijo = phi - self.phi - rounding <= ARMIJO * alpha * self.slope
+        either = (theta <= (1 - MARGIN) * self.theta) | (phi - rounding <= self.phi - MARGIN * self.theta)
+        outside = jnp.all((theta < self.filter[:, 0]) | (phi - rounding < self.filter[:, 1])) & (theta <= self.limits[0])
+        return finite & outside & jnp.where(by_cost, armijo, either), by_cost
+
+    def searched(self, dx, alpha_max):
+        """α, x there, whether it was accepted, and whether for its cost"""
+
+        def at(alpha, dx):
+            x = self.x + alpha * dx
+            theta, phi, c_there = self._looked_at(x)
+            good, by_cost = self._is_better(theta, phi, alpha)
+            return alpha, x, good, by_cost, theta, c_there
+
+        first = at(alpha_max, dx)
+
+        def half(state):
+            count, (alpha, *_) = state
+            return count + 1, at(alpha / 2, dx)
+
+        _, found = jax.lax.while_loop(lambda s: ~s[1][2] & (s[0] < SHARES), half, (0, first))
+        return found[0], found[1], found[2], found[3], jnp.array(False)
+
+    def restored(self, dx, alpha_max, c, before):
+        """The same, where violations alone must fall; last, whether they did by enough."""
+
+        def at(alpha):
+            x = self.x + alpha * dx
+            theta, phi, c_there = self._looked_at(x)
+            falls = jnp.sum(c_there**2) <= (1 - ARMIJO * alpha) * jnp.sum(c**2)
+            return alpha, x, jnp.isfinite(theta) & falls, theta, phi
+
+        def half(state):
+            count, (alpha, *_) = state
+            return count + 1, at(alpha / 2)
+
+        _, (alpha, x, good, theta, phi) = jax.lax.while_loop(lambda s: ~s[1][2] & (s[0] < SHARES), half, (0, at(alpha_max)))
+        outside = jnp.all((theta < self.filter[:, 0]) | (phi < self.filter[:, 1]))
+        return alpha, x, good, jnp.array(False), good & outside & (theta <= 0.9 * before)

@@ -1,0 +1,234 @@
+"""What is asked, as a `Setting` and a `Task`: checked once."""
+
+from collections.abc import Iterable, Mapping, Sequence
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.flatten_util import ravel_pytree
+from jaxtyping import Array, PyTree
+
+from .._mechanics.friction_elements import find_elements
+from .._mechanics.lagrange import imbalance
+from .._model.flat import bind
+from .._model.injection import check_function
+from .._model.numbers import count, number, numbers, refuse_nan
+from .._model.paths import is_within, leaf_names, listed
+from .._model.system import System
+from .._model.validation import parameters, without_contacts, without_events
+from .._program.jit import compiled, is_concrete
+from .boundary import Boundary
+from .input import Held
+from .transcription import Limit, Setting, Task
+
+STATES = 3  # at random, at which it is asked whether a control does anything
+
+
+def stated(system: System, boundary: Boundary, params: PyTree, given: Mapping[str, Any]) -> tuple[Setting, Task]:
+    """Of the arguments of `optimise_motion`, `given` by name."""
+    limits = _refuse(system, given["control"], given["cost"], given["end_cost"], given["within"])
+    dtype, like = boundary.states.dtype, boundary.like
+    params = _parameters(params, like, given["control"])
+    bounds = {name: _pair(pair, f"`control[{name!r}]`", dtype) for name, pair in given["control"].items()}
+    shapes = tuple((name, np.shape(low)) for name, (low, _) in bounds.items())
+    is_signal = _is_signal(system, like, params, shapes)
+    held = {**params, **_held(shapes, is_signal, dtype)}
+    flat = bind(system, like, held)
+    if find_elements(flat) is not None:
+        raise ValueError(
+            "`system` must have a smooth dissipation in `optimise_motion`, but has dry friction, whose phases are not searched. Replace "
+            "it by a force where it slips, and by a holonomic constraint where it sticks, or smooth it."
+        )
+    _refuse_idle(_influence(system, like, held, shapes), shapes)
+    T, durations = _duration(given["duration"], dtype)
+    leaves, chosen = _chosen(given["over"], params, dtype)
+    of_limits, sizes = _limits(given["within"] or {}, dtype)
+    setting = Setting(
+        system,
+        given["cost"] or _of_time,
+        given["end_cost"],
+        limits,
+        controls=shapes,
+        over=leaves,
+        is_signal=is_signal,
+        intervals=count(given["nodes"], "`nodes`", cure="Give the number of intervals."),
+        is_free=durations is not None,
+        multipliers=flat.rows,
+        positions=flat.rows_of_bilateral,
+        limited=sizes,
+        chosen=chosen[0].size,
+        steps=count(given["steps"], "`steps`", cure="Give a number of steps."),
+        is_guessed=given["guess"] is not None,
+        starts=count(given["starts"], "`starts`", cure="Give the number of ways that are tried."),
+    )
+    task = Task(
+        like,
+        params,
+        number(given["t"], "`t`", dtype, cure="Give the time at the start."),
+        T,
+        jnp.stack(durations if durations is not None else (T, T)),
+        boundary.states[0],
+        nodes_of(boundary, setting.intervals),
+        jnp.asarray(boundary.returns, dtype),
+        inputs=_joined(bounds.values(), dtype),
+        limits=of_limits,
+        chosen=chosen,
+    )
+    return setting, task
+
+
+def _parameters(params: PyTree, like: PyTree, control: Mapping[str, Any]) -> Any:
+    params = parameters({} if params is None else params, like)
+    if not isinstance(params, Mapping):
+        raise TypeError("`params` must be a mapping, beside whose entries the controls stand by name, but is not. Use a dict.")
+    refuse_nan(params)
+    for name in control:
+        if name in params:
+            raise ValueError(f"`control` must have names of its own, but {name!r} is an entry of `params`, too. Remove it there.")
+    return params
+
+
+def _of_time() -> float:
+    """What least time costs."""
+    return 1.0
+
+
+def _refuse(system: System, control: Any, cost: Any, end_cost: Any, within: Any) -> tuple[Limit, ...]:
+    """Checks functions and what the system may have; the limits."""
+    if not isinstance(system, System):
+        raise TypeError(f"`system` must be a `System`, but is of class {type(system).__name__}. Build one from a Lagrangian.")
+    without_contacts(system, "`optimise_motion`")
+    without_events(system, "`optimise_motion`")
+    if system.states:
+        raise ValueError(
+            f"`system` must have no further states in `optimise_motion`, but has {', '.join(dict(system.states))}. Leave them out."
+        )
+    if not isinstance(control, Mapping) or not control:
+        raise ValueError('`control` must name inputs with their bounds, but does not. Write e.g. `control={"u": (-20, 20)}`.')
+    for function, label in ((cost, "`cost`"), (end_cost, "`end_cost`")):
+        if function is not None:
+            check_function(function, label)
+    limits = []
+    for name, given in (within or {}).items():
+        if not (isinstance(given, tuple) and len(given) == 3):
+            raise ValueError(f"`within[{name!r}]` must be (function, lower, upper), but is {given!r}. None is no limit.")
+        check_function(given[0], f"`within[{name!r}]`")
+        limits.append(Limit(str(name), given[0]))
+    return tuple(limits)
+
+
+def _pair(given: Any, label: str, dtype: Any) -> tuple[Array, Array]:
+    """(lower, upper) as arrays of one shape, infinite where there is no bound."""
+    if given is None:
+        given = None, None
+    if not (isinstance(given, (tuple, list)) and len(given) == 2):
+        raise ValueError(f"{label} must be (lower, upper), but is {given!r}. None is no bound.")
+    lower, upper = (numbers(end, label, dtype) if end is not None else sign * np.inf for end, sign in zip(given, (-1, 1), strict=True))
+    shape = np.broadcast_shapes(np.shape(lower), np.shape(upper))
+    lower, upper = (jnp.broadcast_to(jnp.asarray(end, dtype), shape) for end in (lower, upper))
+    if is_concrete((lower, upper)) and not bool(jnp.all(lower < upper)):
+        raise ValueError(f"{label} must be in order, but is {given!r}. Put the lower one first.")
+    return lower, upper
+
+
+def _joined(pairs: Iterable[tuple[Array, Array]], dtype: Any) -> tuple[Array, Array]:
+    """All lower bounds, one after the other, and all upper ones."""
+    lower, upper = zip(*pairs, strict=True) if (pairs := list(pairs)) else ((), ())
+    together = lambda ends: jnp.concatenate([jnp.zeros(0, dtype), *map(jnp.ravel, ends)])
+    return together(lower), together(upper)
+
+
+def _limits(within: Mapping[str, Any], dtype: Any) -> tuple[tuple[Array, Array], tuple[int, ...]]:
+    """Lower and upper limits, one after the other, and how many numbers each has."""
+    pairs = [_pair(given[1:], f"`within[{name!r}]`", dtype) for name, given in within.items()]
+    return _joined(pairs, dtype), tuple(pair[0].size for pair in pairs)
+
+
+def _chosen(over: Any, params: PyTree, dtype: Any) -> tuple[tuple[int, ...], tuple[Array, Array]]:
+    """Which leaves of params are to be chosen, and their bounds."""
+    given = over if isinstance(over, Mapping) else dict.fromkeys(listed(over))
+    names, every, found, pairs = leaf_names(params), jax.tree.leaves(params), [], []
+    for name, bounds in given.items():
+        within = [i for i, leaf in enumerate(names) if is_within(leaf, name)]
+        if not within:
+            raise ValueError(f"`over` must name entries of `params`, but holds {name!r}. There are {', '.join(names) or 'none'}.")
+        lower, upper = _pair(bounds, f"`over[{name!r}]`", dtype)
+        found += within
+        pairs += [(jnp.broadcast_to(lower, np.shape(every[i])), jnp.broadcast_to(upper, np.shape(every[i]))) for i in within]
+    return tuple(found), _joined(pairs, dtype)
+
+
+def _duration(given: Any, dtype: Any) -> tuple[Array, tuple[Array, Array] | None]:
+    """T, as a guess where it is to be found between two."""
+    cure = "Give a time, or (shortest, longest)."
+    if not isinstance(given, (tuple, list)):
+        return jnp.asarray(number(given, "`duration`", dtype, positive=True, cure=cure)), None
+    if len(given) != 2:
+        raise ValueError(f"`duration` must be a time or two, but is {given!r}. {cure}")
+    shortest, longest = (jnp.asarray(number(end, "`duration`", dtype, positive=True, cure=cure)) for end in given)
+    if is_concrete((shortest, longest)) and not shortest < longest:
+        raise ValueError(f"`duration` must be in order, but is {given!r}. {cure}")
+    return jnp.sqrt(shortest * longest), (shortest, longest)
+
+
+def _held(shapes: Sequence[tuple[str, tuple[int, ...]]], is_signal: bool, dtype: Any) -> dict[str, Any]:
+    values = {name: jnp.zeros(shape, dtype) for name, shape in shapes}
+    return {name: Held(value) for name, value in values.items()} if is_signal else values
+
+
+def _is_signal(system: System, like: PyTree, params: PyTree, shapes: Any) -> bool:
+    """Whether functions of the system call their inputs."""
+    dtype = jax.tree.leaves(like)[0].dtype
+    q = ravel_pytree(like)[0]
+
+    def forces(is_signal):
+        flat = bind(system, like, {**params, **_held(shapes, is_signal, dtype)})
+        state, multipliers = (jnp.zeros((), dtype), q, q), jnp.zeros(flat.rows, dtype)
+        terms = [*flat.lagrangians.values(), flat.nonholonomic, lambda t, q, v: flat.holonomic(t, q)]
+        terms += [partial(term, multipliers=multipliers) for term in (*flat.dissipations.values(), *flat.forces.values())]
+        return jax.eval_shape(lambda *state: [term(*state) for term in terms], *state)
+
+    try:
+        forces(False)
+    except TypeError as error:
+        if "not callable" not in str(error):
+            raise
+        forces(True)
+        return True
+    return False
+
+
+@compiled
+def _influence(system: System, like: PyTree, params: PyTree, shapes: Any) -> Array:
+    """Whether each control changes the equations of motion, at some states."""
+    q, held = ravel_pytree(like)[0], {name: params[name] for name, _ in shapes}
+    values, unravel = ravel_pytree(held)
+
+    def rows(u, q, v, multipliers):
+        flat = bind(system, like, {**params, **unravel(u)})
+        return ravel_pytree(imbalance(flat, jnp.zeros((), q.dtype), q, v, v, multipliers))[0]
+
+    m = bind(system, like, params).rows
+    states = jnp.asarray(np.random.default_rng(0).uniform(0.5, 1.5, (STATES, 2 * q.size + m + values.size)), q.dtype)
+    slopes = jax.vmap(lambda s: jax.jacfwd(rows)(s[: values.size], *jnp.split(s[values.size :], [q.size, 2 * q.size])))(states)
+    moves = jnp.any(slopes != 0, axis=(0, 1))  # where it is NaN, too
+    return jnp.stack([jnp.any(leaf) for leaf in jax.tree.leaves(unravel(moves.astype(values.dtype)))])
+
+
+def _refuse_idle(moves: Array, shapes: Sequence[tuple[str, tuple[int, ...]]]) -> None:
+    if is_concrete(moves):
+        for moved, (name, _) in zip(np.asarray(moves), sorted(shapes), strict=True):
+            if not moved:
+                raise ValueError(
+                    f"`control` must move the system, but {name!r} changes none of its equations. Let a `force` take it by that name."
+                )
+
+
+def nodes_of(boundary: Boundary, intervals: int) -> Array:
+    """What is given at the end of each interval."""
+    rows = jnp.full((intervals, boundary.states.shape[1]), jnp.nan, boundary.states.dtype)
+    for share, row in zip(boundary.shares[1:], boundary.states[1:], strict=True):
+        rows = rows.at[max(round(share * intervals), 1) - 1].set(row)
+    return rows

@@ -1,0 +1,353 @@
+r"""Lagrange's equations along a motion as equations of a chain of intervals, by collocation at Radau's points.
+
+    M q̈ = f + Gᵀλ,    q̇ = v + (∂g/∂q)ᵀμ,    g = 0,    ψ = 0        at each point
+
+q and v are polynomials over an interval, through their values at its points and at its start; their slopes there are q̇ and q̈. Constraints
+hold with their derivatives (Gear, Gupta and Leimkuhler), where μ is nothing but what is left of rounding and discretisation.
+
+Source: Hairer & Wanner, Solving Ordinary Differential Equations II, sections VI.1, VII.4 and VII.5 (of order 5 with three points); Betts,
+Practical Methods for Optimal Control, 2nd ed., chapter 4.
+"""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, PyTree
+
+from .._mechanics.lagrange import imbalance, velocity_residual
+from .._model.flat import Flat, bind
+from .._model.injection import call
+from .._model.system import System
+from .block_system import Shape
+from .input import Held
+from .interior_point import Chain
+from .radau import derivatives, interpolation, points, weights
+
+STAGES = 5  # points of an interval: order 9; a swing-up is off by 2e-9 with 40 intervals of 5 points, by 2e-4 with 3
+
+
+class Limit(NamedTuple):
+    """What a function of the motion may be."""
+
+    name: str
+    function: Callable
+
+
+class Setting(NamedTuple):
+    """What is asked, without numbers: functions, names and sizes."""
+
+    system: System
+    cost: Callable
+    end_cost: Callable | None
+    limits: tuple[Limit, ...]
+    controls: tuple[tuple[str, tuple[int, ...]], ...]  # with their shapes
+    over: tuple[int, ...]  # which leaves of the parameters are to be chosen
+    is_signal: bool  # whether functions of the system call `u(t)`
+    intervals: int
+    is_free: bool  # whether the duration is to be found
+    multipliers: int  # m, of all constraints
+    positions: int  # h, of the holonomic ones
+    limited: tuple[int, ...]  # how many numbers each limit has
+    chosen: int  # how many numbers these are
+    steps: int  # of the search
+    is_guessed: bool  # whether a motion was given to begin with
+    starts: int  # searches, otherwise
+
+    @property
+    def inputs_of(self) -> tuple[int, ...]:
+        """How many numbers each control is."""
+        return tuple(int(np.prod(shape)) for _, shape in self.controls)
+
+    @property
+    def inputs(self) -> int:
+        """How many numbers all controls are."""
+        return sum(self.inputs_of)
+
+
+class Task(NamedTuple):
+    """The numbers of what is asked: where the motion goes through, NaN where it is free, and bounds."""
+
+    like: PyTree  # coordinates
+    params: PyTree
+    t: Float[Array, ""]
+    duration: Float[Array, ""]  # as guessed, where it is free
+    durations: Float[Array, "2"]
+    start: Float[Array, " x"]
+    nodes: Float[Array, "N x"]  # at the end of each interval
+    returns: Float[Array, " x"]  # one, where the end is the start
+    inputs: tuple[Float[Array, " u"], Float[Array, " u"]]
+    limits: tuple[Float[Array, " l"], Float[Array, " l"]]
+    chosen: tuple[Float[Array, " p"], Float[Array, " p"]]  # bounds of the parameters
+
+
+class Sizes(NamedTuple):
+    """What a number of one is of each kind of unknown, and of each kind of equation."""
+
+    q: Float[Array, " n"]
+    v: Float[Array, " n"]
+    u: Float[Array, " u"]
+    multipliers: Float[Array, " m"]
+    drift: Float[Array, " h"]
+    limits: Float[Array, " l"]
+    chosen: Float[Array, " p"]
+    cost: Float[Array, ""]
+    balance: Float[Array, " n"]
+    position: Float[Array, " h"]
+    velocity: Float[Array, " m"]
+
+
+class Path(NamedTuple):
+    """Unknowns in their units: at all points of all intervals (N, s, ...), at the start, and of the whole."""
+
+    u: Float[Array, "N s u"]
+    multipliers: Float[Array, "N s m"]
+    drift: Float[Array, "N s h"]
+    slack: Float[Array, "N s l"]
+    q: Float[Array, "N s n"]
+    v: Float[Array, "N s n"]
+    start: Float[Array, " x"]
+    duration: Float[Array, ""]
+    chosen: Float[Array, " p"]
+
+
+class Moment(NamedTuple):
+    """One point of a motion."""
+
+    t: Any
+    q: Any
+    v: Any
+    a: Any
+    multipliers: Any
+    u: Any
+
+
+def wide(size: Array, like: Array) -> Array:
+    """With axes of one before its own, as many as another array has."""
+    return jnp.reshape(size, (1,) * (jnp.ndim(like) - jnp.ndim(size)) + jnp.shape(size))
+
+
+class Transcription:
+    """The problem of `Setting` and `Task` as a `Chain`, in numbers of about one."""
+
+    def __init__(self, setting: Setting, n: int):
+        self.setting, self.n = setting, n
+        self.c = points(STAGES)
+        self.D, self.b = derivatives(self.c), weights(self.c)
+        s, self.x = setting, 2 * n
+        self.widths = tuple(STAGES * k for k in (s.inputs, s.multipliers, s.positions, sum(s.limited), self.x))
+        self.shape = Shape(s.intervals, sum(self.widths), self.x, self.x + s.is_free + s.chosen)
+
+    # between unknowns and motions
+
+    def taken_apart(self, block: Array, border: Array, sizes: Sizes, task: Task) -> Path:
+        """The unknowns of one block or of all of them, by kind and in their units."""
+        parts = jnp.split(block, np.cumsum(self.widths)[:-1], axis=-1)
+        u, multipliers, drift, slack, x = (part.reshape(*block.shape[:-1], STAGES, -1) for part in parts)
+        state = jnp.concatenate([sizes.q, sizes.v])
+        start, rest = border[: self.x] * state, border[self.x :]
+        duration = rest[0] * task.duration if self.setting.is_free else task.duration
+        x, chosen = x * wide(state, x), rest[self.setting.is_free :] * sizes.chosen
+        of = (u, sizes.u), (multipliers, sizes.multipliers), (drift, sizes.drift), (slack, sizes.limits)
+        u, multipliers, drift, slack = (part * wide(size, part) for part, size in of)
+        return Path(u, multipliers, drift, slack, x[..., : self.n], x[..., self.n :], start, duration, chosen)
+
+    def put_together(self, path: Path, sizes: Sizes, task: Task) -> Array:
+        """The inverse."""
+        state = jnp.concatenate([sizes.q, sizes.v])
+        x = jnp.concatenate([path.q, path.v], axis=-1)
+        of = (path.u, sizes.u), (path.multipliers, sizes.multipliers), (path.drift, sizes.drift), (path.slack, sizes.limits)
+        parts = [part / wide(size, part) for part, size in (*of, (x, state))]
+        block = jnp.concatenate([part.reshape(len(x), -1) for part in parts], axis=-1)
+        duration = [path.duration[None] / task.duration] if self.setting.is_free else []
+        return jnp.concatenate([block.ravel(), path.start / state, *duration, path.chosen / sizes.chosen])
+
+    def whole(self, x: Array, sizes: Sizes, task: Task) -> Path:
+        """All unknowns in their units."""
+        block, border = self.shape.split(x)
+        return self.taken_apart(block, border, sizes, task)
+
+    # the mechanics at one point
+
+    def params(self, task: Task, chosen: Array) -> PyTree:
+        """With those that are chosen."""
+        leaves, structure = jax.tree.flatten(task.params)
+        begin = 0
+        for i in self.setting.over:
+            size, like = leaves[i].size, leaves[i]
+            leaves[i] = jnp.reshape(chosen[begin : begin + size], like.shape).astype(like.dtype)
+            begin += size
+        return jax.tree.unflatten(structure, leaves)
+
+    def controls(self, u: Array) -> dict[str, Array]:
+        """By name."""
+        found, begin = {}, 0
+        for name, shape in self.setting.controls:
+            size = int(np.prod(shape))
+            found[name] = u[begin : begin + size].reshape(shape)
+            begin += size
+        return found
+
+    def flat(self, task: Task, params: PyTree, u: Array) -> Flat:
+        """The system with these inputs."""
+        held = {name: Held(value) if self.setting.is_signal else value for name, value in self.controls(u).items()}
+        return bind(self.setting.system, task.like, params | held)
+
+    def rows(self, task: Task, params: PyTree, at: Moment) -> tuple[Array, Array, Array]:
+        """M q̈ − f − Gᵀλ, g, ψ."""
+        flat = self.flat(task, params, at.u)
+        left, _ = imbalance(flat, at.t, at.q, at.v, at.a, at.multipliers)
+        return left, flat.holonomic(at.t, at.q), velocity_residual(flat, at.t, at.q, at.v)
+
+    def carried(self, task: Task, params: PyTree, at: Moment, drift: Array) -> Array:
+        """(∂g/∂q)ᵀμ."""
+        if not self.setting.positions:
+            return jnp.zeros_like(at.q)
+        flat = self.flat(task, params, at.u)
+        return jax.vjp(lambda q: flat.holonomic(at.t, q), at.q)[1](drift)[0]
+
+    def said(self, function: Callable, label: str, task: Task, params: PyTree, at: Moment) -> Any:
+        """What a function says at a point."""
+        flat = self.flat(task, params, at.u)
+        state = {"t": at.t, "q": flat.unravel(at.q), "qdot": flat.unravel(at.v), "qddot": flat.unravel(at.a)}
+        return call(function, label, params | self.controls(at.u), **state, multipliers=flat.unravel_multipliers(at.multipliers))
+
+    def limited(self, task: Task, params: PyTree, at: Moment) -> Array:
+        """What all limits say."""
+        found = [jnp.ravel(self.said(limit.function, f"`within[{limit.name!r}]`", task, params, at)) for limit in self.setting.limits]
+        return jnp.concatenate([*found, jnp.zeros(0, at.q.dtype)])
+
+    # the chain
+
+    def interval(self, z: Array, k: Any, sizes: Sizes, task: Task) -> tuple[Array, Array]:
+        """The cost and the equations of interval k, over their sizes."""
+        s, N = self.setting, self.setting.intervals
+        state = jnp.concatenate([sizes.q, sizes.v])
+        before, block, border = jnp.split(z, [self.x, self.x + self.shape.block])
+        of = self.taken_apart(block, border, sizes, task)
+        params, h = self.params(task, of.chosen), of.duration / N
+        values = jnp.concatenate([(before * state)[None], jnp.concatenate([of.q, of.v], axis=1)])
+        slopes = self.D @ values / h
+        at = Moment(task.t + h * (k + self.c), of.q, of.v, slopes[:, self.n :], of.multipliers, of.u)
+        balance, position, velocity = jax.vmap(lambda at: self.rows(task, params, at))(at)
+        carried = jax.vmap(lambda at, drift: self.carried(task, params, at, drift))(at, of.drift)
+        cost = h * self.b @ jax.vmap(lambda at: jnp.asarray(self.said(s.cost, "`cost`", task, params, at)))(at)
+        last = jax.tree.map(lambda x: x[-1], at)
+        if s.end_cost is not None:
+            of_end = jnp.asarray(self.said(s.end_cost, "`end_cost`", task, params, last))
+            cost = cost + jnp.where(k == N - 1, of_end, 0)
+        limited = jax.vmap(lambda at: self.limited(task, params, at))(at)
+        target = task.nodes[k]
+        at_node = jnp.where(jnp.isfinite(target), values[-1] - jnp.where(jnp.isfinite(target), target, 0), 0)
+        at_start = jnp.where(jnp.isfinite(task.start) & (k == 0), of.start - jnp.where(jnp.isfinite(task.start), task.start, 0), 0)
+        again = jnp.where(k == N - 1, task.returns * (values[-1] - of.start), 0)
+        equations = [
+            balance / wide(sizes.balance, balance) / N,
+            (slopes[:, : self.n] - of.v - carried) / wide(sizes.v, of.v) / N,
+            position / wide(sizes.position, position),
+            velocity / wide(sizes.velocity, velocity),
+            (limited - of.slack) / wide(sizes.limits, limited),
+            at_node / state,
+            at_start / state,
+            again / state,
+        ]
+        return cost / sizes.cost, jnp.concatenate([jnp.ravel(x) for x in equations])
+
+    def chain(self, sizes: Sizes, task: Task) -> Chain:
+        """The problem."""
+        everywhere = lambda bound: jnp.broadcast_to(bound, (self.setting.intervals, STAGES, bound.size))
+        ends = []
+        for i, infinite in enumerate((-jnp.inf, jnp.inf)):
+            like = self.whole(jnp.full(self.shape.intervals * self.shape.block + self.shape.border, infinite), sizes, task)
+            like = like._replace(u=everywhere(task.inputs[i]), slack=everywhere(task.limits[i]))
+            like = like._replace(duration=task.durations[i], chosen=task.chosen[i])
+            ends.append(self.put_together(like, sizes, task))
+        evaluate = lambda z, k, args: self.interval(z, k, *args)
+        return Chain(self.shape, evaluate, jnp.arange(self.setting.intervals), (sizes, task), *ends)
+
+    # motions
+
+    def moments(self, path: Path, task: Task) -> Moment:
+        """All points of collocation, (N, s)."""
+        N = self.setting.intervals
+        times = task.t + path.duration / N * (np.arange(N)[:, None] + self.c)
+        before = jnp.concatenate([path.start[None], jnp.concatenate([path.q, path.v], axis=-1)[:-1, -1]])
+        values = jnp.concatenate([before[:, None], jnp.concatenate([path.q, path.v], axis=-1)], axis=1)
+        slopes = jnp.einsum("ij,kjx->kix", self.D, values) * N / path.duration
+        return Moment(times, path.q, path.v, slopes[..., self.n :], path.multipliers, path.u)
+
+    def with_start(self, path: Path, task: Task) -> Moment:
+        """The start, and all points of collocation one after the other."""
+        at = self.moments(path, task)
+        back = jnp.asarray(interpolation(self.c, 0.0))
+        first = jax.tree.map(lambda x: jnp.tensordot(back, x[0], axes=1), at)
+        first = first._replace(t=task.t, q=path.start[: self.n], v=path.start[self.n :])
+        return jax.tree.map(
+            lambda first, rest: jnp.concatenate([first[None], rest.reshape(STAGES * len(rest), *rest.shape[2:])]), first, at
+        )
+
+    def accelerations(self, task: Task, path: Path) -> Array:
+        """The largest that inputs and forces make along a path."""
+        params, zero = self.params(task, path.chosen), jnp.zeros(self.n, path.q.dtype)
+
+        def one(at):
+            balance = lambda a: self.rows(task, params, at._replace(a=a))[0]
+            return jnp.abs(jnp.linalg.pinv(jax.jacfwd(balance)(zero)) @ balance(zero))
+
+        ends = [jnp.where(jnp.isfinite(end), end, 1) for end in task.inputs]
+        at = jax.tree.map(lambda x: x[:, -1], self.moments(path, task)._replace(multipliers=0 * path.multipliers))
+        of_each = [jax.vmap(one)(at._replace(u=jnp.broadcast_to(wide(end, at.u), at.u.shape))) for end in (*ends, 0 * ends[0])]
+        return jnp.max(jnp.nan_to_num(jnp.stack(of_each)), axis=(0, 1))
+
+    # sizes
+
+    def sizes(self, task: Task, guess: Path, q: Array, v: Array) -> Sizes:
+        """From a first guess: equations by the sum of their terms, forces and inputs by what they do to these."""
+        s, params = self.setting, self.params(task, guess.chosen)
+        of = jax.tree.map(lambda x: x[:, -1], (guess.q, guess.v, guess.u))
+        times = task.t + guess.duration * jnp.arange(1, s.intervals + 1) / s.intervals
+        a = v / guess.duration
+        zero = lambda size: jnp.zeros((s.intervals, size), q.dtype)
+        at = Moment(times, of[0], of[1], zero(self.n), zero(s.multipliers), of[2])
+        kinds = {"q": 0, "v": 0, "a": 0, "multipliers": 0, "u": 0}
+
+        def slopes(at):
+            by = lambda changed: self.rows(task, params, at._replace(**changed))
+            return self.rows(task, params, at), jax.jacfwd(by)({name: getattr(at, name) for name in kinds})
+
+        (left, _, _), (of_balance, of_position, of_velocity) = jax.vmap(slopes)(at)
+        most = lambda x: jnp.max(jnp.abs(x), axis=0, initial=0.0)
+        known = lambda x: jnp.where(jnp.isfinite(x) & (x > 0), x, 1)
+        terms = most(left) + jnp.max(jnp.abs(of_balance["a"]) @ a, axis=0)
+        terms = terms + jnp.max(jnp.abs(of_balance["q"]) @ q, axis=0) + jnp.max(jnp.abs(of_balance["v"]) @ v, axis=0)
+        balance = known(terms)
+        position = known(jnp.max(jnp.abs(of_position["q"]) @ q, axis=0, initial=0.0))
+        velocity = known(jnp.max(jnp.abs(of_velocity["v"]) @ v, axis=0, initial=0.0))
+        inverse = lambda parts: 1 / known(jnp.max(jnp.stack([most(jnp.max(x, axis=1, initial=0.0)) for x in parts]), axis=0))
+        by_u = [jnp.abs(of_balance["u"]) / balance[None, :, None], jnp.abs(of_velocity["u"]) / velocity[None, :, None]]
+        width = (task.inputs[1] - task.inputs[0]) / 2
+        u = jnp.where(jnp.isfinite(width) & (width > 0), width, inverse([*by_u]))
+        multipliers = inverse([jnp.abs(of_balance["multipliers"]) / balance[None, :, None]])
+        for name, size in (("multipliers", multipliers), ("u", u)):
+            balance = jnp.maximum(balance, jnp.max(jnp.abs(of_balance[name]) @ size, axis=0))
+        drift = inverse([jnp.swapaxes(jnp.abs(of_position["q"]), 1, 2) / v[None, :, None]])
+        limited = jax.vmap(lambda at: self.limited(task, params, at))(at)
+        ends = jnp.stack([jnp.where(jnp.isfinite(end), jnp.abs(end), 0) for end in task.limits])
+        ends = jnp.max(ends, axis=0, initial=0.0)
+        limits = known(jnp.where(ends > 0, ends, most(limited)))
+        cost = self._size_of_cost(task, params, at, a, u, guess.duration)
+        chosen = known(jnp.abs(guess.chosen))
+        return Sizes(q, v, u, multipliers, drift, limits, chosen, cost, balance, position, velocity)
+
+    def _size_of_cost(self, task, params, at, a, u, duration):
+        """What it comes to with inputs, speeds and accelerations of their sizes."""
+        found = []
+        for sign in (0.0, 1.0, -1.0):
+            there = at._replace(u=at.u + sign * wide(u, at.u), a=at.a + sign * wide(a, at.a))
+            found.append(jnp.abs(jax.vmap(lambda at: jnp.asarray(self.said(self.setting.cost, "`cost`", task, params, at)))(there)))
+        size = duration * jnp.max(jnp.stack(found))
+        if self.setting.end_cost is not None:
+            size = size + jnp.max(jnp.abs(jax.vmap(lambda at: self.said(self.setting.end_cost, "`end_cost`", task, params, at))(at)))
+        return jnp.where(jnp.isfinite(size) & (size > 0), size, 1)

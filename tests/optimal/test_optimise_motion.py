@@ -1,0 +1,310 @@
+"""Best motions against closed forms, one machine in two forms, other software's numbers, and differences."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.optimize import brentq
+
+import jaxlag as jl
+
+block = jl.System(lambda qdot, m: 0.5 * m * qdot**2, force=lambda u: u)
+REST = (0.0, 0.0)
+
+
+def effort(u):
+    return u**2
+
+
+@pytest.mark.parametrize("unit", [1.0, 1e-6, 1e5])
+@pytest.mark.parametrize("second", [1.0, 1e-3])
+def test_a_block_with_the_least_effort(unit, second):
+    """1 kg over 1 m in 1 s: u = 6 − 12 t, and ∫u² dt = 12; in any units, and late."""
+    best = jl.optimise_motion(
+        block, REST, (unit, 0.0), {"m": 1.0}, duration=second, control={"u": None}, cost=effort, nodes=4, t=7e3 * second, starts=1
+    )
+    np.testing.assert_allclose(best.cost, 12.0 * unit**2 / second**3, rtol=1e-9)
+    share = (np.asarray(best.ts) - 7e3 * second) / second
+    np.testing.assert_allclose(best.u["u"], (6.0 - 12.0 * share) * unit / second**2, rtol=1e-6, atol=1e-6 * unit / second**2)
+    assert best.check() < 1e-9 and best.deviation < 1e-9
+    assert "cost 12" in str(best) or unit != 1 or second != 1
+
+
+def test_derivatives_of_the_least_effort():
+    """J = 12 m² s²/T³, by mass, way and time, forwards and backwards, also where the block is to stay where it is."""
+
+    def J(m, way, T):
+        return jl.optimise_motion(block, REST, (way, 0.0), {"m": m}, duration=T, control={"u": None}, cost=effort, nodes=4, starts=1).cost
+
+    for derivative in (jax.grad, jax.jacfwd):
+        np.testing.assert_allclose(derivative(J, argnums=(0, 1, 2))(2.0, 0.5, 1.5), np.array([12.0, 48.0, -24.0]) / 1.5**3, rtol=1e-8)
+        np.testing.assert_allclose(derivative(J, argnums=(0, 1, 2))(2.0, 0.0, 1.5), 0.0, atol=1e-9)
+
+
+def test_the_least_time_with_a_limited_force():
+    """2 s, full force one way and the other; dT/dm = T/(2 m), dT/dF = −T/(2 F)."""
+
+    def T(m, F):
+        return jl.optimise_motion(
+            block, REST, (1.0, 0.0), {"m": m}, duration=(0.1, 10.0), control={"u": (-F, F)}, nodes=10, starts=1
+        ).duration
+
+    best = jl.optimise_motion(block, REST, (1.0, 0.0), {"m": 1.0}, duration=(0.1, 10.0), control={"u": (-1.0, 1.0)}, nodes=10, starts=1)
+    np.testing.assert_allclose(best.duration, 2.0, rtol=1e-7)
+    inner = np.abs(np.asarray(best.ts) - 1.0) > 1e-6
+    np.testing.assert_allclose(np.asarray(best.u["u"])[inner], np.where(np.asarray(best.ts) < 1.0, 1.0, -1.0)[inner], atol=1e-4)
+    np.testing.assert_allclose(jax.grad(T, argnums=(0, 1))(1.0, 1.0), [1.0, -1.0], rtol=1e-6)
+
+
+def test_limits_of_the_motion():
+    """With |v| ≤ 1.2 the block of least effort runs at that speed between two parabolas; the end is cut off by no more than the limit."""
+    within = {"speed": (lambda qdot: qdot, -1.2, 1.2)}
+    best = jl.optimise_motion(
+        block, REST, (1.0, 0.0), {"m": 1.0}, duration=1.0, control={"u": None}, cost=effort, within=within, nodes=40, starts=1
+    )
+    # u falls linearly to zero within a, runs on, and again: v = 1.2 (1 − (1 − t/a)²), 1 = 1.2 (1 − 2a/3), J = 2 ∫(2.4/a)² (1 − t/a)² dt
+    a = 1.5 * (1 - 1 / 1.2)
+    np.testing.assert_allclose(best.cost, 2 * (2.4 / a) ** 2 * a / 3, rtol=1e-5)
+    assert np.max(best.limited["speed"]) <= 1.2 * (1 + 1e-8)
+
+
+def test_waypoints_a_free_end_and_an_end_like_the_start():
+    """By way of 1 at half time to wherever it likes, then nothing pushes; and an oscillator chosen so that it needs no force."""
+    best = jl.optimise_motion(
+        block,
+        REST,
+        (None, None),
+        {"m": 1.0},
+        duration=2.0,
+        control={"u": None},
+        cost=effort,
+        waypoints={0.5: (1.0, None)},
+        nodes=8,
+        starts=1,
+    )
+    np.testing.assert_allclose(best.cost, 3.0, rtol=1e-9)  # ∫u² with u = 3 (1 − t)
+    np.testing.assert_allclose(np.asarray(best.u["u"])[np.asarray(best.ts) > 1], 0.0, atol=1e-7)
+    spring = jl.System(lambda q, qdot, m, c: 0.5 * m * qdot**2 - 0.5 * c * q**2, force=lambda u: u)
+    best = jl.optimise_motion(
+        spring,
+        (0.0, None),
+        None,
+        {"m": 1.0, "c": 3.0},
+        duration=1.0,
+        control={"u": (-20, 20)},
+        cost=effort,
+        periodic=True,
+        waypoints={0.25: (1.0, None)},
+        over={"c": (1.0, 100.0)},
+        nodes=12,
+    )
+    np.testing.assert_allclose(best.params["c"], 4 * np.pi**2, rtol=1e-5)  # resonance
+    np.testing.assert_allclose(best.cost, 0.0, atol=1e-9)
+    np.testing.assert_allclose([best.q[-1], best.qdot[-1]], [best.q[0], best.qdot[0]], atol=1e-9)
+
+
+@pytest.mark.slow
+def test_the_brachistochrone():
+    """A bead whose path a force turns that does no work: the cycloid of Johann Bernoulli, whose direction turns evenly."""
+    bead = jl.System(lambda q, qdot, g: 0.5 * qdot @ qdot - g * q[1], force=lambda qdot, u: u * jnp.array([-qdot[1], qdot[0]]))
+    start, end = (jnp.zeros(2), jnp.zeros(2)), (jnp.array([1.0, -1.0]), None)
+    best = jl.optimise_motion(bead, start, end, {"g": 9.81}, duration=(0.2, 2.0), control={"u": (-10, 10)}, nodes=40, starts=1)
+    angle = brentq(lambda a: (a - np.sin(a)) / (1 - np.cos(a)) - 1, 0.1, 6)
+    radius = 1 / (1 - np.cos(angle))
+    np.testing.assert_allclose(best.duration, angle * np.sqrt(radius / 9.81), rtol=1e-6)
+    turned = np.sqrt(9.81 / radius) * np.asarray(best.ts)
+    cycloid = radius * np.stack([turned - np.sin(turned), np.cos(turned) - 1], axis=1)
+    np.testing.assert_allclose(best.q, cycloid, atol=2e-4)
+
+
+# Kelly, SIAM Review 59 (2017) 849-904, section 6: masses of cart and pole, length; 1 m in 2 s, a force of at most 20 N, a track of 2 m
+KELLY = {"m1": 1.0, "m2": 0.3, "l": 0.5, "g": 9.81}
+
+
+def cart_energy(q, qdot, m1, m2, l, g):
+    turning = m2 * l * jnp.cos(q["phi"]) * qdot["x"] * qdot["phi"] + 0.5 * m2 * l**2 * qdot["phi"] ** 2
+    return 0.5 * (m1 + m2) * qdot["x"] ** 2 + turning + m2 * g * l * jnp.cos(q["phi"])
+
+
+cart = jl.System(cart_energy, force={"motor": lambda u: {"x": u}})
+in_x_y = jl.System(
+    lambda q, qdot, m1, m2, g: 0.5 * m1 * qdot["x"] ** 2 + 0.5 * m2 * qdot["p"] @ qdot["p"] - m2 * g * q["p"][1],
+    force={"motor": lambda u: {"x": u}},
+    holonomic={"rod": lambda q, l: (q["p"][0] - q["x"]) ** 2 + q["p"][1] ** 2 - l**2},
+)
+HANGS, STANDS = {"x": 0.0, "phi": 0.0}, {"x": 1.0, "phi": np.pi}
+IN_X_Y = (
+    ({"x": 0.0, "p": jnp.array([0.0, -0.5])}, {"x": 0.0, "p": jnp.zeros(2)}),
+    ({"x": 1.0, "p": jnp.array([1.0, 0.5])}, {"x": 0.0, "p": jnp.zeros(2)}),
+)
+SWING = {"duration": 2.0, "control": {"u": (-20, 20)}, "cost": effort}
+
+
+@pytest.mark.slow
+def test_a_cart_pole_swings_up():
+    """Kelly's problem, from his straight guess, and from others, of which one is better; in φ and in x, y with a rod."""
+    stand = {"x": 0.0, "phi": 0.0}
+    straight = jl.optimise_motion(cart, (HANGS, stand), (STANDS, stand), KELLY, **SWING, starts=1)
+    np.testing.assert_allclose(straight.cost, 58.8077, rtol=1e-5)  # as CasADi and IPOPT have it, see `tests/benchmarks/bench_optimal.py`
+    best = jl.optimise_motion(cart, (HANGS, stand), (STANDS, stand), KELLY, **SWING, nodes=40)
+    assert best.cost <= straight.cost and max(best.check(), straight.check()) < 1e-6
+    with_rod = jl.optimise_motion(in_x_y, *IN_X_Y, KELLY, **SWING, nodes=40)
+    np.testing.assert_allclose(with_rod.cost, best.cost, rtol=1e-8)
+    assert with_rod.check() < 1e-6
+    # the rod pulls with m₂ (l φ̇² − ẍ sin φ + g cos φ), and λ is that over 2 l; both costs are flat in u, which is thus known less well
+    one, other = best.simulate(rtol=1e-10), with_rod.simulate(rtol=1e-10)
+    phi, phidot, a = one.q["phi"], one.qdot["phi"], one.qddot["x"]
+    pull = 0.3 * (0.5 * phidot**2 - a * jnp.sin(phi) + 9.81 * jnp.cos(phi))
+    for found in (other, with_rod):
+        np.testing.assert_allclose(-2 * 0.5 * found.multipliers["rod"], pull, atol=3e-4 * float(np.max(pull)))
+
+
+@pytest.mark.slow
+def test_a_limited_pull_in_the_rod():
+    """λ ≥ −11 N/m in place of −13.8 costs more, and is kept."""
+    within = {"pull": (lambda multipliers: multipliers["rod"], -11, None)}
+    best = jl.optimise_motion(in_x_y, *IN_X_Y, KELLY, **SWING, within=within, nodes=40)
+    assert np.min(best.multipliers["rod"]) > -11 * (1 + 1e-6) and 58 < best.cost < 80
+    assert best.check() < 1e-5
+    motion = best.simulate(rtol=1e-10)
+    np.testing.assert_allclose(motion.q["p"], best.q["p"], atol=1e-5)
+
+
+@pytest.mark.slow
+def test_derivatives_of_a_swing_up():
+    """By m₂ and l, against differences, on one mesh."""
+
+    def J(m2, l):
+        stand = {"x": 0.0, "phi": 0.0}
+        params = KELLY | {"m2": m2, "l": l}
+        return jl.optimise_motion(cart, (HANGS, stand), (STANDS, stand), params, **SWING, starts=1, refinements=0).cost
+
+    h = 1e-4
+    differences = [(J(0.3 + h, 0.5) - J(0.3 - h, 0.5)) / (2 * h), (J(0.3, 0.5 + h) - J(0.3, 0.5 - h)) / (2 * h)]
+    np.testing.assert_allclose(jax.grad(J, argnums=(0, 1))(0.3, 0.5), differences, rtol=1e-6)
+    np.testing.assert_allclose(jax.jacfwd(J, argnums=(0, 1))(0.3, 0.5), differences, rtol=1e-6)
+
+
+@pytest.mark.slow
+def test_an_acrobot():
+    """Two equal rods, moved by a moment at the elbow alone, hang and stand after 2 s (OptimTraj's parameters)."""
+    l, m, g = 0.5, 1.0, 9.81
+
+    def lagrangian(q, qdot):
+        kinetic = m * l**2 * (qdot["a"] ** 2 + 0.5 * qdot["b"] ** 2 + jnp.cos(q["a"] - q["b"]) * qdot["a"] * qdot["b"])
+        return kinetic + m * g * l * (2 * jnp.cos(q["a"]) + jnp.cos(q["b"]))
+
+    acrobot = jl.System(lagrangian, force={"elbow": lambda u: {"a": -u, "b": u}})
+    rest = {"a": 0.0, "b": 0.0}
+    best = jl.optimise_motion(
+        acrobot, (rest, rest), ({"a": np.pi, "b": np.pi}, rest), {}, duration=2.0, control={"u": (-20, 20)}, cost=effort
+    )
+    assert best.converged and best.check() < 2e-5
+    np.testing.assert_allclose(best.cost, 63.37157, rtol=1e-5)  # by this package alone: a change is to be seen
+
+
+@pytest.mark.slow
+def test_a_slider_crank_and_its_closed_form():
+    """A closed loop of two bars costs what the same machine costs in its one coordinate; a constraint twice changes nothing."""
+    r, b, m, I = 0.1, 0.3, 0.8, 2e-3
+
+    def place(phi):
+        return r * jnp.cos(phi) + jnp.sqrt(b**2 - (r * jnp.sin(phi)) ** 2)
+
+    alone = jl.System(lambda q, qdot: 0.5 * I * qdot**2 + 0.5 * m * (jax.grad(place)(q) * qdot) ** 2, force=lambda u: u)
+    loop = {
+        "along": lambda q: r * jnp.cos(q["phi"]) + b * jnp.cos(q["psi"]) - q["s"],
+        "across": lambda q: r * jnp.sin(q["phi"]) - b * jnp.sin(q["psi"]),
+    }
+    bars = lambda twice: jl.System(
+        lambda qdot: 0.5 * I * qdot["phi"] ** 2 + 0.5 * m * qdot["s"] ** 2 + 0.0 * qdot["psi"],
+        force={"motor": lambda u: {"phi": u}},
+        holonomic=loop | ({"again": loop["across"]} if twice else {}),
+    )
+    given = {"duration": 0.4, "control": {"u": None}, "cost": effort, "nodes": 16, "starts": 1}
+    one = jl.optimise_motion(alone, (0.4, 0.0), (2.5, 0.0), {}, **given)
+
+    def at(phi):
+        psi = float(np.arcsin(r * np.sin(phi) / b))
+        return {"phi": phi, "psi": psi, "s": float(place(phi))}, {"phi": 0.0, "psi": 0.0, "s": 0.0}
+
+    for twice in (False, True):
+        many = jl.optimise_motion(bars(twice), at(0.4), at(2.5), {}, **given)
+        np.testing.assert_allclose(many.cost, one.cost, rtol=1e-8)
+        assert many.check() < 1e-6
+
+
+@pytest.mark.slow
+def test_a_rolling_disc():
+    """A nonholonomic disc is steered to a place beside the start: it rolls all the way, and turns back to where it looked."""
+    R = 0.2
+    disc = jl.System(
+        lambda qdot: 0.5 * (qdot["x"] ** 2 + qdot["y"] ** 2) + 0.5 * 0.02 * qdot["roll"] ** 2 + 0.5 * 0.01 * qdot["turn"] ** 2,
+        force={"motors": lambda u: {"roll": u[0], "turn": u[1]}},
+        nonholonomic={
+            "x": lambda q, qdot: qdot["x"] - R * jnp.cos(q["turn"]) * qdot["roll"],
+            "y": lambda q, qdot: qdot["y"] - R * jnp.sin(q["turn"]) * qdot["roll"],
+        },
+    )
+    start = {"x": 0.0, "y": 0.0, "roll": 0.0, "turn": 0.0}
+    end = {"x": 1.0, "y": 1.0, "roll": None, "turn": 0.0}
+    both = (-np.full(2, 5.0), np.full(2, 5.0))
+    best = jl.optimise_motion(disc, (start, start), (end, start), {}, duration=2.0, control={"u": both}, cost=lambda u: u @ u)
+    assert best.check() < 1e-6
+    slip = best.qdot["y"] - R * jnp.sin(best.q["turn"]) * best.qdot["roll"]
+    np.testing.assert_allclose(slip, 0.0, atol=1e-9)
+    np.testing.assert_allclose([best.q["x"][-1], best.q["y"][-1]], 1.0, atol=1e-9)
+
+
+def test_a_system_that_calls_its_input_and_a_guess():
+    """`u(t)` in the system, a motion as the guess, and the result as the input of a simulation."""
+    called = jl.System(lambda qdot, m: 0.5 * m * qdot**2, force=lambda t, u: u(t))
+    given = {"duration": 1.0, "control": {"u": None}, "cost": effort, "nodes": 4}
+    guess = jl.simulate(called, 0.0, 0.5, np.linspace(0.0, 3.0, 7), {"m": 1.0, "u": jl.Multisine(1.0, amplitude=0.0)})
+    for way in (guess, jl.optimise_motion(called, REST, (1.0, 0.0), {"m": 1.0}, **given)):
+        best = jl.optimise_motion(called, REST, (1.0, 0.0), {"m": 1.0}, guess=way, **given)
+        np.testing.assert_allclose(best.cost, 12.0, rtol=1e-9)
+    motion = jl.simulate(called, *REST, np.linspace(0.0, 1.0, 5), {"m": 1.0, **best.signals})
+    t = np.linspace(0.0, 1.0, 5)
+    np.testing.assert_allclose(motion.q, 3 * t**2 - 2 * t**3, atol=1e-7)
+    np.testing.assert_allclose(best.simulate(t).q, motion.q, atol=1e-9)
+
+
+def test_in_a_batch_and_under_jit():
+    J = lambda m: (
+        jl.optimise_motion(block, REST, (1.0, 0.0), {"m": m}, duration=1.0, control={"u": (-30, 30)}, cost=effort, nodes=4, starts=1).cost
+    )
+    np.testing.assert_allclose(jax.jit(jax.vmap(J))(jnp.array([1.0, 2.0])), [12.0, 48.0], rtol=1e-8)
+
+
+def test_wrong_use():
+    of = lambda **given: jl.optimise_motion(block, REST, (1.0, 0.0), {"m": 1.0}, **({"duration": 1.0, "control": {"u": (-20, 20)}} | given))
+    with pytest.raises(ValueError, match=r"What stands against it: u \(lower\), u \(upper\). Widen it, or allow more time"):
+        of(control={"u": (-1, 1)}, nodes=4)
+    with pytest.raises(ValueError, match=r"What stands against it: .*speed \(upper\)"):
+        of(within={"speed": (lambda qdot: qdot, -0.5, 0.5)}, nodes=4)
+    idle = jl.System(lambda qdot, m: 0.5 * m * qdot**2, force=lambda u, w: u + 0.0 * w)
+    with pytest.raises(ValueError, match="`control` must move the system, but 'w' changes none"):
+        jl.optimise_motion(idle, REST, (1.0, 0.0), {"m": 1.0}, duration=1.0, control={"u": None, "w": None})
+    with pytest.raises(ValueError, match="must have a smooth dissipation"):
+        rubbed = jl.System(lambda qdot: 0.5 * qdot**2, force=lambda u: u, dissipation=lambda qdot: jnp.abs(qdot))
+        jl.optimise_motion(rubbed, REST, (1.0, 0.0), {}, duration=1.0, control={"u": None})
+    with pytest.raises(ValueError, match="must have no contacts"):
+        touching = jl.System(lambda qdot: 0.5 * qdot**2, force=lambda u: u, unilateral={"floor": lambda q: q})
+        jl.optimise_motion(touching, REST, (1.0, 0.0), {}, duration=1.0, control={"u": None})
+    with pytest.raises(ValueError, match="must have one structure, but have x and q"):
+        jl.optimise_motion(block, ({"x": 0.0}, 0.0), (1.0, 0.0), {"m": 1.0}, duration=1.0, control={"u": None})
+    for given, words in [
+        ({"duration": (2.0, 1.0)}, "`duration` must be in order"),
+        ({"control": {"u": (1, -1)}}, r"`control\['u'\]` must be in order"),
+        ({"control": {}}, "`control` must name inputs"),
+        ({"control": {"m": None}}, "`control` must have names of its own"),
+        ({"within": {"speed": 3.0}}, r"`within\['speed'\]` must be \(function, lower, upper\)"),
+        ({"over": "k"}, "`over` must name entries of `params`, but holds 'k'. There are m"),
+        ({"waypoints": {1.5: (0.5, None)}}, "`waypoints` must be at shares of the duration"),
+        ({"periodic": "phi"}, "`periodic` must name coordinates, but holds 'phi'. There are q"),
+    ]:
+        with pytest.raises(ValueError, match=words):
+            of(**given)
+    with pytest.raises(TypeError, match=r"`start` must be \(q, qdot\)"):
+        jl.optimise_motion(block, 0.0, (1.0, 0.0), {"m": 1.0}, duration=1.0, control={"u": None})
