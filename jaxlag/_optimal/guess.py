@@ -11,7 +11,7 @@ from .._mechanics.lagrange import position_residual
 from .boundary import Boundary
 from .radau import points
 from .solution import OptimalMotion
-from .transcription import STAGES, Path, Setting, Task, Transcription
+from .transcription import STAGES, Path, Setting, Task, Transcription, per_root
 
 WAYS, BEND = 8, 0.5  # of how many, bent by this part of their size, the smoothest are taken
 PROJECTIONS = 20  # of Newton's steps onto the constraints
@@ -66,8 +66,8 @@ def sizes_of_states(of: Transcription, task: Task, path: Path) -> tuple[Array, A
     given = jnp.where(jnp.isfinite(given), jnp.abs(given), 0)
     q = jnp.maximum(largest(path.q), jnp.max(given[:, : of.n], axis=0))
     v = jnp.maximum(largest(path.v), jnp.max(given[:, of.n :], axis=0))
-    a = of.accelerations(task, path)
-    q = jnp.where(q > 0, q, jnp.maximum(v * path.duration, a * path.duration**2))
+    reach = of.reach(task, path)
+    q = jnp.where(q > 0, q, jnp.maximum(v * path.duration, reach))
     q = jnp.where(q > 0, q, 1)
     return q, jnp.maximum(v, q / path.duration)
 
@@ -89,7 +89,10 @@ def bent(of: Transcription, task: Task, path: Path, size: Float[Array, " n"], st
 
         def step(_, q):
             g, G = position_residual(flat, t, q)
-            return q - size * (jnp.linalg.pinv(G * size[None]) @ g)
+            G = G * size[None]
+            lengths = jnp.linalg.norm(G, axis=1)
+            lengths = jnp.where(lengths > 0, lengths, 1)
+            return q - size * (jnp.linalg.pinv(G / lengths[:, None]) @ (g / lengths))
 
         return jax.lax.fori_loop(0, PROJECTIONS, step, q)
 
@@ -112,8 +115,13 @@ def balanced(of: Transcription, task: Task, path: Path) -> Path:
     at, params = of.moments(path, task), of.params(task, path.chosen)
 
     def forces(at):
-        left = lambda multipliers: of.rows(task, params, at._replace(multipliers=multipliers))[0]
+        left = lambda a, multipliers: of.rows(task, params, at._replace(a=a, multipliers=multipliers))[0]
         zero = jnp.zeros_like(at.multipliers)
-        return -jnp.linalg.pinv(jax.jacfwd(left)(zero)) @ left(zero)
+        M, slopes = jax.jacfwd(left, argnums=(0, 1))(at.a, zero)
+        size = per_root(jnp.diagonal(M))
+        slopes = size[:, None] * slopes
+        lengths = jnp.linalg.norm(slopes, axis=0)
+        lengths = jnp.where(lengths > 0, lengths, 1)
+        return -jnp.linalg.pinv(slopes / lengths[None]) @ (size * left(at.a, zero)) / lengths
 
     return path._replace(multipliers=jax.vmap(jax.vmap(forces))(at))

@@ -32,6 +32,7 @@ LARGEST, SMALLEST = 2.0, 1e-4  # of violations, over those at the start (21)
 MARGIN, ARMIJO = 1e-5, 1e-4  # by which a step must be better (18, 20)
 SHARES = 30  # of a step, each half of the one before
 KEPT = 60  # points in the filter
+ACCEPTABLE = 3e3  # times the tolerance, an error at which a search that comes no further has found a minimum: 1e-6
 SPREAD = 1e10  # by which a multiplier of a bound may differ from μ over the distance (16)
 CONVERGED, STEP_LIMIT, INFEASIBLE, STUCK = 0, 1, 2, 3
 
@@ -125,6 +126,8 @@ def minimum(chain: Chain, start: Float[Array, " n"], *, tolerance: float, steps:
     state = jax.lax.while_loop(lambda s: (s.status < 0) & (s.steps < steps), lambda s: _step(chain, s, tolerance), state)
     f, c = chain.values(state.point.x)
     status = jnp.where(state.status < 0, STEP_LIMIT, state.status)
+    nearly = (state.error <= ACCEPTABLE * tolerance) & (status != INFEASIBLE)
+    status = jnp.where(nearly, CONVERGED, status)
     return Found(state.point, f, state.error, jnp.max(jnp.abs(c)), state.steps, status)
 
 

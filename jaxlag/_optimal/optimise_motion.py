@@ -53,8 +53,8 @@ def optimise_motion(
        \quad\text{such that}\quad M\ddot q = f(q, \dot q, u) + G^T\lambda,\quad g = 0,\quad a \le h \le b $$
 
     The equations of motion are those of the system, with constraint forces as unknowns, collocated at Radau's points (order 9), where
-    limits hold, too; an interior-point method finds a minimum near the guess, a straight way and some beside it if there is none. The
-    motion found is simulated; where it is off by more than `tolerance`, the intervals are halved.
+    limits hold, too, and not between them; an interior-point method finds a minimum near the guess, a straight way and some beside it if
+    there is none. The motion found is simulated; where it is off by more than `tolerance`, the intervals are halved.
 
     Least time with an input that has no bound, or that the last moments do not depend on, may use errors of the polynomials: bound it.
 

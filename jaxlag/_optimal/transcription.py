@@ -129,6 +129,11 @@ def wide(size: Array, like: Array) -> Array:
     return jnp.reshape(size, (1,) * (jnp.ndim(like) - jnp.ndim(size)) + jnp.shape(size))
 
 
+def per_root(masses: Array) -> Array:
+    """1/√m of masses, and one of what has none: what makes rows of forces comparable, whatever their units."""
+    return 1 / jnp.sqrt(jnp.where(masses > 0, masses, 1))
+
+
 class Transcription:
     """The problem of `Setting` and `Task` as a `Chain`, in numbers of about one."""
 
@@ -283,18 +288,22 @@ class Transcription:
         at = self.moments(path, task)
         back = jnp.asarray(interpolation(self.c, 0.0))
         first = jax.tree.map(lambda x: jnp.tensordot(back, x[0], axes=1), at)
-        first = first._replace(t=task.t, q=path.start[: self.n], v=path.start[self.n :])
+        first = first._replace(t=task.t, q=path.start[: self.n], v=path.start[self.n :], u=jnp.clip(first.u, *task.inputs))
         return jax.tree.map(
             lambda first, rest: jnp.concatenate([first[None], rest.reshape(STAGES * len(rest), *rest.shape[2:])]), first, at
         )
 
-    def accelerations(self, task: Task, path: Path) -> Array:
-        """The largest that inputs and forces make along a path."""
+    def reach(self, task: Task, path: Path) -> Array:
+        """How far inputs and forces move each coordinate in the time: until the force that its own change makes holds it, if one does."""
         params, zero = self.params(task, path.chosen), jnp.zeros(self.n, path.q.dtype)
 
         def one(at):
-            balance = lambda a: self.rows(task, params, at._replace(a=a))[0]
-            return jnp.abs(jnp.linalg.pinv(jax.jacfwd(balance)(zero)) @ balance(zero))
+            balance = lambda a, q: self.rows(task, params, at._replace(a=a, q=q))[0]
+            M, stiffness = jax.jacfwd(balance, argnums=(0, 1))(zero, at.q)
+            size = per_root(jnp.diagonal(M))
+            inverse = jnp.outer(size, size) * jnp.linalg.pinv(M * jnp.outer(size, size))
+            slowest = 1 / path.duration**2
+            return jnp.abs(inverse @ balance(zero, at.q)) / jnp.maximum(jnp.abs(jnp.diagonal(inverse @ stiffness)), slowest)
 
         ends = [jnp.where(jnp.isfinite(end), end, 1) for end in task.inputs]
         at = jax.tree.map(lambda x: x[:, -1], self.moments(path, task)._replace(multipliers=0 * path.multipliers))

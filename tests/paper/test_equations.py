@@ -324,7 +324,12 @@ NOTEBOOK_SYSTEMS = {  # by notebook and name: its coordinates
     "23_bearing.rotor": None,
     "23_bearing.pendulum": None,
 }
-RECORDED = {"11_driven_pendulum.pendulum", "19_gear_friction.winch", "22_experiment.carriage"}  # driven by a signal without a formula
+RECORDED = {  # driven by a signal without a formula, or by an input that is searched for
+    "11_driven_pendulum.pendulum",
+    "19_gear_friction.winch",
+    "22_experiment.carriage",
+    "24_swing_up.cart",
+}
 IN_CELLS_THAT_SIMULATE = {"19_gear_friction.driven"}  # `test_gears`
 WITH_CONTACTS = {  # `test_contact_equations`
     *(f"15_bouncing_rocking_pecking.{name}" for name in ("ball", "block", "woodpecker")),
