@@ -32,7 +32,7 @@ LARGEST, SMALLEST = 2.0, 1e-4  # of violations, over those at the start (21)
 MARGIN, ARMIJO = 1e-5, 1e-4  # by which a step must be better (18, 20)
 SHARES = 30  # of a step, each half of the one before
 KEPT = 60  # points in the filter
-ACCEPTABLE = 3e3  # times the tolerance, an error at which a search that comes no further has found a minimum: 1e-6
+ACCEPTABLE = 2 / 3  # power of the tolerance, an error at which a search that comes no further has found a minimum: 5e-7
 SPREAD = 1e10  # by which a multiplier of a bound may differ from μ over the distance (16)
 CONVERGED, STEP_LIMIT, INFEASIBLE, STUCK = 0, 1, 2, 3
 
@@ -126,7 +126,7 @@ def minimum(chain: Chain, start: Float[Array, " n"], *, tolerance: float, steps:
     state = jax.lax.while_loop(lambda s: (s.status < 0) & (s.steps < steps), lambda s: _step(chain, s, tolerance), state)
     f, c = chain.values(state.point.x)
     status = jnp.where(state.status < 0, STEP_LIMIT, state.status)
-    nearly = (state.error <= ACCEPTABLE * tolerance) & (status != INFEASIBLE)
+    nearly = (state.error <= tolerance**ACCEPTABLE) & (status != INFEASIBLE)
     status = jnp.where(nearly, CONVERGED, status)
     return Found(state.point, f, state.error, jnp.max(jnp.abs(c)), state.steps, status)
 
@@ -268,19 +268,16 @@ def factorised(shape, H, J, sigma, raised):
     small = eps**0.4
     squares = jnp.einsum("kml,kmj->klj", J, J) / small
 
-    def attempt(raised):
-        return factors(shape, H + squares, sigma + raised + small)
-
-    def more(state):
-        raised, _ = state
-        raised = jnp.where(raised > 0, MORE * raised, RAISED)
-        return raised, attempt(raised)
+    def attempt(state):
+        count, now, _ = state
+        second = jnp.where(raised > 0, jnp.maximum(LESS * raised, eps), RAISED)
+        now = jnp.where(count == 0, 0.0, jnp.where(count == 1, second, MORE * now))
+        return count + 1, now, factors(shape, H + squares, sigma + now + small)
 
     fails = lambda of: ~jnp.all(jnp.isfinite(of.corner)) | ~jnp.all(jnp.isfinite(of.chain))
-    first = attempt(jnp.zeros_like(raised))
-    before = jnp.maximum(LESS * raised, eps)
-    state = jax.lax.cond(fails(first) & (raised > 0), lambda: (before, attempt(before)), lambda: (0 * raised, first))
-    raised, of = jax.lax.while_loop(lambda s: fails(s[1]) & (s[0] < MOST), more, state)
+    unknown = jax.tree.map(lambda x: jnp.full(x.shape, jnp.nan, x.dtype), jax.eval_shape(lambda *of: factors(shape, *of), H, sigma))
+    start = jnp.zeros((), int), jnp.zeros_like(raised), unknown
+    _, raised, of = jax.lax.while_loop(lambda s: fails(s[2]) & (s[1] < MOST), attempt, start)
 
     def kkt(r1, r2):
         product = lambda dx: shape.scattered(jnp.einsum("klj,kj->kl", H, shape.gathered(dx))) + (sigma + raised) * dx
@@ -331,34 +328,29 @@ class _Trials(NamedTuple):
     def searched(self, dx, alpha_max):
         """α, x there, whether it was accepted, and whether for its cost"""
 
-        def at(alpha, dx):
-            x = self.x + alpha * dx
-            theta, phi, c_there = self._looked_at(x)
-            good, by_cost = self._is_better(theta, phi, alpha)
-            return alpha, x, good, by_cost, theta, c_there
-
-        first = at(alpha_max, dx)
-
         def half(state):
-            count, (alpha, *_) = state
-            return count + 1, at(alpha / 2, dx)
+            count, alpha, *_ = state
+            alpha = jnp.where(count == 0, alpha_max, alpha / 2)
+            x = self.x + alpha * dx
+            theta, phi, _ = self._looked_at(x)
+            return count + 1, alpha, x, *self._is_better(theta, phi, alpha)
 
-        _, found = jax.lax.while_loop(lambda s: ~s[1][2] & (s[0] < SHARES), half, (0, first))
-        return found[0], found[1], found[2], found[3], jnp.array(False)
+        start = jnp.zeros((), int), alpha_max, self.x, jnp.array(False), jnp.array(False)
+        _, alpha, x, good, by_cost = jax.lax.while_loop(lambda s: ~s[3] & (s[0] <= SHARES), half, start)
+        return alpha, x, good, by_cost, jnp.array(False)
 
     def restored(self, dx, alpha_max, c, before):
         """The same, where violations alone must fall; last, whether they did by enough."""
 
-        def at(alpha):
+        def half(state):
+            count, alpha, *_ = state
+            alpha = jnp.where(count == 0, alpha_max, alpha / 2)
             x = self.x + alpha * dx
             theta, phi, c_there = self._looked_at(x)
             falls = jnp.sum(c_there**2) <= (1 - ARMIJO * alpha) * jnp.sum(c**2)
-            return alpha, x, jnp.isfinite(theta) & falls, theta, phi
+            return count + 1, alpha, x, jnp.isfinite(theta) & falls, theta, phi
 
-        def half(state):
-            count, (alpha, *_) = state
-            return count + 1, at(alpha / 2)
-
-        _, (alpha, x, good, theta, phi) = jax.lax.while_loop(lambda s: ~s[1][2] & (s[0] < SHARES), half, (0, at(alpha_max)))
+        start = jnp.zeros((), int), alpha_max, self.x, jnp.array(False), self.theta, self.phi
+        _, alpha, x, good, theta, phi = jax.lax.while_loop(lambda s: ~s[3] & (s[0] <= SHARES), half, start)
         outside = jnp.all((theta < self.filter[:, 0]) | (phi < self.filter[:, 1]))
         return alpha, x, good, jnp.array(False), good & outside & (theta <= 0.9 * before)

@@ -136,7 +136,7 @@ def _found(setting: Setting, task: Task, path: Path) -> OptimalMotion:
     q, v = sizes_of_states(of, fixed(task), fixed(path))
     paths = jax.tree.map(lambda x: x[None], fixed(path)) if setting.is_guessed else bent(of, fixed(task), fixed(path), q, setting.starts)
     sizes = fixed(of.sizes(fixed(task), jax.tree.map(lambda x: x[0], paths), q, v))
-    chain, tolerance = of.chain(sizes, fixed(task)), jnp.finfo(task.start.dtype).eps ** 0.6
+    chain, tolerance = of.chain(sizes, fixed(task)), float(jnp.finfo(task.start.dtype).eps) ** 0.6
 
     def from_one(path):
         at = of.moments(path, fixed(task))
@@ -174,6 +174,8 @@ def _motion(of: Transcription, path: Path, task: Task, cost: Array, found: Found
 
 def _against(found: OptimalMotion) -> str:
     """Why there is no motion."""
+    if not np.isfinite(found.violation):
+        return "`guess` must lead where the system has finite forces, but does not: they are NaN on its way. Give another motion."
     if int(found.status) != INFEASIBLE:
         off = f" The equations are off by {float(found.violation):.2g} of their size." if int(found.status) == STEP_LIMIT else ""
         return f"no best motion was found: {found.reason}{off}"

@@ -68,6 +68,7 @@ class OptimalMotion(eqx.Module):
     - `cost`, `duration`; `params`: with those that were chosen.
     - `status`: 0 where the conditions of a minimum hold to rounding; `reason` says it in words. `steps` of the interior-point method;
       `violation`: the largest of the equations that is left, over its size. `deviation`: what `check()` found; NaN under `jit`.
+    - `sizes` of q and of q̇, in which deviations are counted; `system`; `is_signal`: whether its functions call their inputs, `u(t)`.
 
     ```python
     import jax.numpy as jnp
