@@ -69,7 +69,7 @@ def boundary_of(start: Any, end: Any, waypoints: Mapping[float, Any] | None, per
             raise ValueError(
                 f"`start`, `end` and `waypoints` must have one structure, but have {', '.join(names)} and {', '.join(there)}. {CURE}"
             )
-    every = [[leaves for _, leaves, _ in known]][0]
+    every = [leaves for _, leaves, _ in known]
     shapes = [_shape([leaves[i] for leaves in every], names[i]) for i in range(len(names))]
     dtype = jnp.result_type(float, *(leaf.dtype for leaves in every for leaf in leaves if leaf is not None))
     rows, masks = [], []

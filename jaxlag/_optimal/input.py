@@ -8,6 +8,11 @@ from jaxtyping import Array, ArrayLike, Float
 from .radau import interpolation, points
 
 
+def is_called(error: TypeError) -> bool:
+    """Whether a function failed because it calls an input, `u(t)`, that was given as a number."""
+    return "not callable" in str(error)
+
+
 class Held(eqx.Module):
     """An input at one instant, as a signal."""
 

@@ -9,9 +9,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, PyTree
 
-from .._model.numbers import count
+from .._model.numbers import count, number
 from .._model.system import System
-from .._program.jit import compiled, is_concrete
+from .._program.jit import compiled, is_concrete, values
 from .boundary import boundary_of
 from .guess import bent, guessed, sizes_of_states
 from .input import Piecewise
@@ -63,7 +63,7 @@ def optimise_motion(
     - `start`, `end`: (q, q̇), structured as for `simulate`; None in place of a number, of q or of q̇ leaves them free.
     - `params`: as for `simulate`, without the controls.
     - `control`: by name the bounds (lower, upper) of an input, None where there is none; arrays for several numbers. Functions of the
-      system that take it by its name get its value; or they call it as a signal, `u(t)`.
+      system, `cost` and `within` that take it by its name get its value; or they call it as a signal, `u(t)`.
     - `duration`: T; or (shortest, longest), where it is to be found.
     - `cost`: c by the argument rule, of `t, q, qdot, qddot, multipliers`, inputs and params; without it the duration. `end_cost`: of the
       state at the end.
@@ -76,7 +76,7 @@ def optimise_motion(
     - `tolerance`: of `check()`, over the size of a coordinate; `refinements`: how often intervals are halved, at most. Under `jit`, `grad`
       and `vmap` the mesh stays as it is.
     - `starts`: how many searches there are, the first from a straight way, if no guess is given; the least cost counts.
-    - `steps`: of the interior-point method; `throw`: whether to raise where it fails.
+    - `steps`: of the interior-point method; `throw`: whether to raise where it fails. Under `jit` and `vmap` look at `converged`.
 
     Any consistent units.
 
@@ -104,12 +104,14 @@ def optimise_motion(
     boundary = boundary_of(start, end, waypoints, periodic)
     given = {"control": control, "duration": duration, "cost": cost, "end_cost": end_cost, "within": within, "over": over}
     setting, task = stated(system, boundary, params, given | {"nodes": nodes, "t": t, "guess": guess, "steps": steps, "starts": starts})
-    refinements = 0 if refinements == 0 else count(refinements, "`refinements`", cure="Give how often intervals are halved, or 0.")
+    refinements = count(refinements, "`refinements`", least=0, cure="Give how often intervals are halved, or 0.")
+    tolerance = float(number(tolerance, "`tolerance`", positive=True, cure="Give e.g. 1e-6."))
     found = _found(setting, task, guessed(setting, task, boundary, guess))
+    known = values(found)  # where it is differentiated, too
+    if throw and known is not None and not bool(known.converged):
+        raise ValueError(_against(known))
     if not is_concrete(found):
         return found
-    if throw and not bool(found.converged):
-        raise ValueError(_against(found))
     found = found.checked()
     for _ in range(refinements):
         if found.deviation <= tolerance or not bool(found.converged):
@@ -176,12 +178,14 @@ def _against(found: OptimalMotion) -> str:
     """Why there is no motion."""
     if not np.isfinite(found.violation):
         return "`guess` must lead where the system has finite forces, but does not: they are NaN on its way. Give another motion."
+    if not np.isfinite(found.cost):
+        return "`cost` must be finite, but is NaN on the way. Look for a root or a logarithm of what may be negative."
     if int(found.status) != INFEASIBLE:
         off = f" The equations are off by {float(found.violation):.2g} of their size." if int(found.status) == STEP_LIMIT else ""
         return f"no best motion was found: {found.reason}{off}"
     near = []
-    for name, values in (found.u | found.limited).items():
-        x, (low, high) = np.asarray(values).reshape(len(values), -1)[1:], map(np.asarray, found.bounds[name])
+    for name, said in (found.u | found.limited).items():
+        x, (low, high) = np.asarray(said).reshape(len(said), -1)[1:], map(np.asarray, found.bounds[name])
         near += [f"{name} (lower)"] if np.any(x - low <= NEAR * np.abs(low)) else []
         near += [f"{name} (upper)"] if np.any(high - x <= NEAR * np.abs(high)) else []
     what = (

@@ -20,7 +20,7 @@ from .._model.system import System
 from .._model.validation import parameters, without_contacts, without_events
 from .._program.jit import compiled, is_concrete
 from .boundary import Boundary
-from .input import Held
+from .input import Held, is_called
 from .transcription import Limit, Setting, Task
 
 STATES = 3  # at random, at which it is asked whether a control does anything
@@ -28,7 +28,7 @@ STATES = 3  # at random, at which it is asked whether a control does anything
 
 def stated(system: System, boundary: Boundary, params: PyTree, given: Mapping[str, Any]) -> tuple[Setting, Task]:
     """Of the arguments of `optimise_motion`, `given` by name."""
-    limits = _refuse(system, given["control"], given["cost"], given["end_cost"], given["within"])
+    limits = _refuse(system, given)
     dtype, like = boundary.states.dtype, boundary.like
     params = _parameters(params, like, given["control"])
     bounds = {name: _pair(pair, f"`control[{name!r}]`", dtype) for name, pair in given["control"].items()}
@@ -95,8 +95,9 @@ def _of_time() -> float:
     return 1.0
 
 
-def _refuse(system: System, control: Any, cost: Any, end_cost: Any, within: Any) -> tuple[Limit, ...]:
-    """Checks functions and what the system may have; the limits."""
+def _refuse(system: System, given: Mapping[str, Any]) -> tuple[Limit, ...]:
+    """Checks functions, the guess and what the system may have; the limits."""
+    control = given["control"]
     if not isinstance(system, System):
         raise TypeError(f"`system` must be a `System`, but is of class {type(system).__name__}. Build one from a Lagrangian.")
     without_contacts(system, "`optimise_motion`")
@@ -107,15 +108,18 @@ def _refuse(system: System, control: Any, cost: Any, end_cost: Any, within: Any)
         )
     if not isinstance(control, Mapping) or not control:
         raise ValueError('`control` must name inputs with their bounds, but does not. Write e.g. `control={"u": (-20, 20)}`.')
-    for function, label in ((cost, "`cost`"), (end_cost, "`end_cost`")):
-        if function is not None:
-            check_function(function, label)
+    for name in ("cost", "end_cost"):
+        if given[name] is not None:
+            check_function(given[name], f"`{name}`")
     limits = []
-    for name, given in (within or {}).items():
-        if not (isinstance(given, tuple) and len(given) == 3):
-            raise ValueError(f"`within[{name!r}]` must be (function, lower, upper), but is {given!r}. None is no limit.")
-        check_function(given[0], f"`within[{name!r}]`")
-        limits.append(Limit(str(name), given[0]))
+    for name, limit in (given["within"] or {}).items():
+        if not (isinstance(limit, (tuple, list)) and len(limit) == 3):
+            raise ValueError(f"`within[{name!r}]` must be (function, lower, upper), but is {limit!r}. None is no limit.")
+        check_function(limit[0], f"`within[{name!r}]`")
+        limits.append(Limit(str(name), limit[0]))
+    guess = given["guess"]
+    if guess is not None and not all(hasattr(guess, part) for part in ("ts", "q", "qdot")):
+        raise TypeError(f"`guess` must be a motion, but is of class {type(guess).__name__}. Give a `Trajectory` or an `OptimalMotion`.")
     return tuple(limits)
 
 
@@ -193,7 +197,7 @@ def _is_signal(system: System, like: PyTree, params: PyTree, shapes: Any) -> boo
     try:
         forces(False)
     except TypeError as error:
-        if "not callable" not in str(error):
+        if not is_called(error):
             raise
         forces(True)
         return True
@@ -229,6 +233,9 @@ def _refuse_idle(moves: Array, shapes: Sequence[tuple[str, tuple[int, ...]]]) ->
 def nodes_of(boundary: Boundary, intervals: int) -> Array:
     """What is given at the end of each interval."""
     rows = jnp.full((intervals, boundary.states.shape[1]), jnp.nan, boundary.states.dtype)
-    for share, row in zip(boundary.shares[1:], boundary.states[1:], strict=True):
-        rows = rows.at[max(round(share * intervals), 1) - 1].set(row)
+    ends = [max(round(share * intervals), 1) - 1 for share in boundary.shares[1:]]
+    if len(set(ends)) < len(ends):
+        raise ValueError(f"`nodes` must be enough for all `waypoints` and the end, but {intervals} are not: two fall on one. Give more.")
+    for k, row in zip(ends, boundary.states[1:], strict=True):
+        rows = rows.at[k].set(row)
     return rows

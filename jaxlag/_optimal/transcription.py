@@ -22,7 +22,7 @@ from .._model.flat import Flat, bind
 from .._model.injection import call
 from .._model.system import System
 from .block_system import Shape
-from .input import Held
+from .input import Held, is_called
 from .interior_point import Chain
 from .radau import derivatives, interpolation, points, weights
 
@@ -217,7 +217,20 @@ class Transcription:
         """What a function says at a point."""
         flat = self.flat(task, params, at.u)
         state = {"t": at.t, "q": flat.unravel(at.q), "qdot": flat.unravel(at.v), "qddot": flat.unravel(at.a)}
-        return call(function, label, params | self.controls(at.u), **state, multipliers=flat.unravel_multipliers(at.multipliers))
+        state["multipliers"], inputs = flat.unravel_multipliers(at.multipliers), self.controls(at.u)
+        try:
+            return call(function, label, params | inputs, **state)
+        except TypeError as error:
+            if not is_called(error):
+                raise
+            return call(function, label, params | {name: Held(value) for name, value in inputs.items()}, **state)
+
+    def costs(self, function: Callable, label: str, task: Task, params: PyTree, at: Moment) -> Array:
+        """What a cost says, one number."""
+        x = jnp.asarray(self.said(function, label, task, params, at))
+        if x.shape:
+            raise ValueError(f"{label} must return one number, but returns shape {x.shape}. Sum it up.")
+        return x
 
     def limited(self, task: Task, params: PyTree, at: Moment) -> Array:
         """What all limits say."""
@@ -238,11 +251,10 @@ class Transcription:
         at = Moment(task.t + h * (k + self.c), of.q, of.v, slopes[:, self.n :], of.multipliers, of.u)
         balance, position, velocity = jax.vmap(lambda at: self.rows(task, params, at))(at)
         carried = jax.vmap(lambda at, drift: self.carried(task, params, at, drift))(at, of.drift)
-        cost = h * self.b @ jax.vmap(lambda at: jnp.asarray(self.said(s.cost, "`cost`", task, params, at)))(at)
+        cost = h * self.b @ jax.vmap(lambda at: self.costs(s.cost, "`cost`", task, params, at))(at)
         last = jax.tree.map(lambda x: x[-1], at)
         if s.end_cost is not None:
-            of_end = jnp.asarray(self.said(s.end_cost, "`end_cost`", task, params, last))
-            cost = cost + jnp.where(k == N - 1, of_end, 0)
+            cost = cost + jnp.where(k == N - 1, self.costs(s.end_cost, "`end_cost`", task, params, last), 0)
         limited = jax.vmap(lambda at: self.limited(task, params, at))(at)
         target = task.nodes[k]
         at_node = jnp.where(jnp.isfinite(target), values[-1] - jnp.where(jnp.isfinite(target), target, 0), 0)
@@ -355,8 +367,8 @@ class Transcription:
         found = []
         for sign in (0.0, 1.0, -1.0):
             there = at._replace(u=at.u + sign * wide(u, at.u), a=at.a + sign * wide(a, at.a))
-            found.append(jnp.abs(jax.vmap(lambda at: jnp.asarray(self.said(self.setting.cost, "`cost`", task, params, at)))(there)))
+            found.append(jnp.abs(jax.vmap(lambda at: self.costs(self.setting.cost, "`cost`", task, params, at))(there)))
         size = duration * jnp.max(jnp.stack(found))
         if self.setting.end_cost is not None:
-            size = size + jnp.max(jnp.abs(jax.vmap(lambda at: self.said(self.setting.end_cost, "`end_cost`", task, params, at))(at)))
+            size = size + jnp.max(jnp.abs(jax.vmap(lambda at: self.costs(self.setting.end_cost, "`end_cost`", task, params, at))(at)))
         return jnp.where(jnp.isfinite(size) & (size > 0), size, 1)

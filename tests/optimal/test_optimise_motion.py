@@ -41,6 +41,27 @@ def test_derivatives_of_the_least_effort():
         np.testing.assert_allclose(derivative(J, argnums=(0, 1, 2))(2.0, 0.0, 1.5), 0.0, atol=1e-9)
 
 
+@pytest.mark.parametrize(("m", "s"), [(1.0, 1.0), (1e-9, 1e9), (1e9, 1e-9)])
+def test_derivatives_by_numbers_that_are_zero_in_any_units(m, s):
+    """Of ∫(m ẍ + b ẋ + c x)² dt, with b = c = 0: 12 m² d²/T³ by m, −2 m ∫ẋ² dt = −12 m d²/(5 T) by c, and nothing by b."""
+    system = jl.System(
+        lambda q, qdot, m, c: 0.5 * m * qdot**2 - 0.5 * c * q**2, force=lambda u: u, dissipation=lambda qdot, b: 0.5 * b * qdot**2
+    )
+    d, T = 0.7, 1.3
+
+    def J(mass, c, b):
+        params = {"m": mass, "c": c / s**2, "b": b / s}
+        bounds = (-30.0 * m / s**2, 30.0 * m / s**2)
+        best = jl.optimise_motion(
+            system, REST, (d * m, 0.0), params, duration=T * s, control={"u": bounds}, cost=effort, nodes=4, starts=1, refinements=0
+        )
+        return best.cost / (m**2 / s**3)
+
+    for derivative in (jax.grad, jax.jacfwd):
+        found = derivative(J, argnums=(0, 1, 2))(1.2, 0.0, 0.0)
+        np.testing.assert_allclose(found, [24 * 1.2 * d**2 / T**3, -12 * 1.2 * d**2 / (5 * T), 0.0], rtol=1e-7, atol=1e-9)
+
+
 def test_the_least_time_with_a_limited_force():
     """2 s, full force one way and the other; dT/dm = T/(2 m), dT/dF = −T/(2 F)."""
 
@@ -319,6 +340,8 @@ def test_a_system_that_calls_its_input_and_a_guess():
     for way in (guess, jl.optimise_motion(called, REST, (1.0, 0.0), {"m": 1.0}, **given)):
         best = jl.optimise_motion(called, REST, (1.0, 0.0), {"m": 1.0}, guess=way, **given)
         np.testing.assert_allclose(best.cost, 12.0, rtol=1e-9)
+    called_cost = jl.optimise_motion(called, REST, (1.0, 0.0), {"m": 1.0}, **(given | {"cost": lambda t, u: u(t) ** 2}))
+    np.testing.assert_allclose(called_cost.cost, 12.0, rtol=1e-9)
     motion = jl.simulate(called, *REST, np.linspace(0.0, 1.0, 5), {"m": 1.0, **best.signals})
     t = np.linspace(0.0, 1.0, 5)
     np.testing.assert_allclose(motion.q, 3 * t**2 - 2 * t**3, atol=1e-7)
@@ -349,12 +372,16 @@ def test_in_a_batch_and_under_jit():
         jl.optimise_motion(block, REST, (1.0, 0.0), {"m": m}, duration=1.0, control={"u": (-30, 30)}, cost=effort, nodes=4, starts=1).cost
     )
     np.testing.assert_allclose(jax.jit(jax.vmap(J))(jnp.array([1.0, 2.0])), [12.0, 48.0], rtol=1e-8)
+    weak = lambda F: jl.optimise_motion(block, REST, (1.0, 0.0), {"m": 1.0}, duration=1.0, control={"u": (-F, F)}, nodes=4, starts=1)
+    np.testing.assert_array_equal(jax.vmap(lambda F: weak(F).converged)(jnp.array([1.0, 6.0])), [False, True])
 
 
 def test_wrong_use():
     of = lambda **given: jl.optimise_motion(block, REST, (1.0, 0.0), {"m": 1.0}, **({"duration": 1.0, "control": {"u": (-20, 20)}} | given))
     with pytest.raises(ValueError, match=r"What stands against it: u \(lower\), u \(upper\). Widen it, or allow more time"):
         of(control={"u": (-1, 1)}, nodes=4)
+    with pytest.raises(ValueError, match=r"What stands against it: u \(lower\), u \(upper\)"):
+        jax.grad(lambda F: of(control={"u": (-F, F)}, nodes=4).cost)(1.0)
     with pytest.raises(ValueError, match=r"What stands against it: .*speed \(upper\)"):
         of(within={"speed": (lambda qdot: qdot, -0.5, 0.5)}, nodes=4)
     idle = jl.System(lambda qdot, m: 0.5 * m * qdot**2, force=lambda u, w: u + 0.0 * w)
@@ -377,8 +404,14 @@ def test_wrong_use():
         ({"over": "k"}, "`over` must name entries of `params`, but holds 'k'. There are m"),
         ({"waypoints": {1.5: (0.5, None)}}, "`waypoints` must be at shares of the duration"),
         ({"periodic": "phi"}, "`periodic` must name coordinates, but holds 'phi'. There are q"),
+        ({"tolerance": 0.0}, "`tolerance` must be positive"),
+        ({"cost": lambda u: jnp.stack([u, u])}, r"`cost` must return one number, but returns shape \(2,\)"),
+        ({"cost": lambda u: jnp.sqrt(u)}, "`cost` must be finite, but is NaN on the way"),
+        ({"waypoints": {0.5: (0.5, None), 0.51: (0.6, None)}}, "`nodes` must be enough for all `waypoints`"),
     ]:
         with pytest.raises(ValueError, match=words):
             of(**given)
+    with pytest.raises(TypeError, match="`guess` must be a motion, but is of class float"):
+        of(guess=3.0)
     with pytest.raises(TypeError, match=r"`start` must be \(q, qdot\)"):
         jl.optimise_motion(block, 0.0, (1.0, 0.0), {"m": 1.0}, duration=1.0, control={"u": None})
