@@ -19,6 +19,7 @@ from ._paper.equations import equations as equations
 from ._paper.to_sympy import to_sympy as to_sympy
 from ._mechanics.examine import examine as examine
 from ._mechanics.friction_treatment import Regularised as Regularised, StickSlip as StickSlip
+from ._curves.response_curve import response_curve as response_curve
 from ._fit.information import information as information
 from ._fit.validate import validate as validate
 from ._fit.comparison import compare as compare

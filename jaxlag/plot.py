@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from ._curves.response_curve import ResponseCurve
 from ._draw.animate import animate
 from ._draw.axes import COLOURS as COLOURS
 from ._draw.axes import pyplot
@@ -21,6 +22,7 @@ from ._draw.optimal_motion import optimal_motion
 from ._draw.posterior import posterior
 from ._draw.recovery import recovery
 from ._draw.report import report
+from ._draw.response_curve import response_curve
 from ._draw.stability_map import stability_map
 from ._fit.design import Design
 from ._fit.posterior import Posterior
@@ -53,6 +55,7 @@ __all__ = [
     "phase",
     "posterior",
     "recovery",
+    "response_curve",
     "root_locus",
     "stability_map",
 ]
@@ -107,6 +110,7 @@ SHORT_WAYS: tuple[tuple[type, str, Any], ...] = (  # what is computed knows noth
     (OptimalMotion, "plot", optimal_motion),
     (Modes, "plot", mode_shapes),
     (Modes, "animate", animate),
+    (ResponseCurve, "plot", response_curve),
     (RootLocus, "plot", root_locus),
     (StabilityMap, "plot", stability_map),
     (Equations, "plot", equations),

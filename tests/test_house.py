@@ -215,6 +215,15 @@ WINGS = {  # each imports only from those above it, and each file of a wing only
         "parameter_plane",
         "stability_map",
     ],
+    "_curves": [
+        "arclength",
+        "critical",
+        "measures",
+        "orbits",
+        "special_points",
+        "orbit_curve",
+        "response_curve",
+    ],
     "_optimal": [
         "radau",
         "block_system",
@@ -326,6 +335,7 @@ WINGS = {  # each imports only from those above it, and each file of a wing only
         "design",
         "posterior",
         "optimal_motion",
+        "response_curve",
         "report",
     ],
 }
@@ -350,7 +360,7 @@ HOMES = [
     ("optimistix", "_fit"),
     ("pandas", "_motion/export"),
     ("polars", "_motion/export"),
-    ("scipy", ("_program", "_fit", "_linear")),
+    ("scipy", ("_program", "_fit", "_linear", "_curves")),
     ("sympy", "_paper"),
 ]
 LONGEST_FILE = 500

@@ -27,13 +27,16 @@ BY_STEPS = 10  # last digits: the error of a motion if each of some hundred step
 
 
 class Setting(NamedTuple):
-    """Settings of the search: the section, the entries of the state that return, and the computation of motions."""
+    """Settings of the search: the section, the entries of the state that return, the computation of motions, and after how many passages
+    through the section, or periods of the force, the state returns.
+    """
 
     section: Event | Every
     returning: tuple[int, ...]
     friction: StickSlip | Regularised
     solver: Any  # of diffrax, or None
     max_steps: int
+    turns: int = 1
 
     def of_motions(self) -> dict[str, Any]:
         """The settings that are arguments of `simulate`."""
@@ -80,18 +83,18 @@ def orbit_near(system: System, setting: Setting, given: Given) -> Orbit:
     """The periodic motion that Newton's method finds from a guess, differentiable by the implicit function theorem."""
     guess, unravel = ravel_pytree(given.start)
     of, is_forced = np.array(setting.returning, int), isinstance(setting.section, Every)
-    usual = _forced(setting, given) if is_forced else jnp.zeros(())
-    passage = (guess, usual, usual) if is_forced else _first_passage(system, setting, given)
-    frame = Frame(given, *jax.lax.stop_gradient(passage))
+    usual = forced_period(setting, given) if is_forced else jnp.zeros(())
+    first = (guess, usual, usual) if is_forced else _first_passage(system, setting, given)
+    frame = Frame(given, *jax.lax.stop_gradient(first))
 
     def returned(frame, w, t):
         """The state at the next passage, and the time until then."""
-        return _passage(system, setting, frame, unravel(frame.first.at[of].set(w)), t)
+        return passage(system, setting, frame, unravel(frame.first.at[of].set(w)), t)
 
     def residual(frame, w):
         return returned(frame, w, frame.given.t)[0][of] - w
 
-    scales = jax.lax.stop_gradient(_scales(frame)[of])
+    scales = jax.lax.stop_gradient(scales_of(frame)[of])
     near = _newton(lambda w: residual(jax.lax.stop_gradient(frame), w), frame.first[of], given.tolerances[0], scales)
     w = differentiable_root(residual, frame, near, scales)
 
@@ -117,7 +120,7 @@ def orbit_near(system: System, setting: Setting, given: Given) -> Orbit:
     return Orbit(unravel(here), times[0], unravel(ends[0] - here), values, *jax.lax.stop_gradient((*checks, left[0])))
 
 
-def _scales(frame: Frame) -> Float[Array, " s"]:
+def scales_of(frame: Frame) -> Float[Array, " s"]:
     """The scale of each entry of the state over a period: if the entry is zero at the section, it follows from its rate or integral."""
     n, period = ravel_pytree(frame.given.start["q"])[0].size, frame.usual
     q, v, states = jnp.split(jnp.abs(frame.first), [n, 2 * n])
@@ -172,20 +175,21 @@ def _first_passage(system, setting, given):
     return known(_state(passages.q, passages.qdot, passages.states, i)), usual, 1.9 * usual
 
 
-def _forced(setting, given):
-    """The period of the force."""
+def forced_period(setting, given):
+    """The time after which the force has repeated itself so often as the state takes to return."""
     period = setting.section.period
-    return jnp.asarray(call(period, "`period` of `section`", given.params) if callable(period) else period, given.t.dtype)
+    once = jnp.asarray(call(period, "`period` of `section`", given.params) if callable(period) else period, given.t.dtype)
+    return setting.turns * once
 
 
-def _passage(system: System, setting: Setting, frame: Frame, start: dict[str, PyTree], t: Any) -> tuple[Array, Array]:
-    """The state after one period of the force, or at the first passage after the present one; and the time until then."""
+def passage(system: System, setting: Setting, frame: Frame, start: dict[str, PyTree], t: Any) -> tuple[Array, Array]:
+    """The state when it returns, after periods of the force or at a passage after the present one; and the time until then."""
     if isinstance(setting.section, Every):
-        period = _forced(setting, frame.given)
+        period = forced_period(setting, frame.given)
         motion = _motion(system, setting, frame.given, start, t, period)
         return _state(motion.q, motion.qdot, motion.states, -1), period
     passages = _motion(system, setting, frame.given, start, t, frame.longest).events[SECTION]
-    later = passages.ts - t > frame.usual / 2
+    later = passages.ts - t > (1 - 0.5 / setting.turns) * frame.usual
     i = jnp.argmax(later)
     known = lambda x: jnp.where(jnp.any(later), x, jnp.nan)
     return known(_state(passages.q, passages.qdot, passages.states, i)), known(passages.ts[i] - t)
