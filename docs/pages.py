@@ -40,16 +40,19 @@ REFERENCE = {  # names in `jaxlag`
     "stabilisation.Projection stabilisation.Baumgarte stabilisation.NoStabilisation StickSlip Regularised "
     "surfaces.Located surfaces.NotLocated keep_compiled",
     "Near a steady state": "equilibrium steady results.Equilibrium linearise results.LinearSystem results.Modes lowest_modes root_locus "
-    "results.RootLocus results.Crossing periodic results.PeriodicOrbit response_curve results.ResponseCurve results.SpecialPoint results.Measured stability_map results.StabilityMap",
+    "results.RootLocus results.Crossing periodic results.PeriodicOrbit "
+    "response_curve results.ResponseCurve results.SpecialPoint results.Measured stability_map results.StabilityMap",
     "Best motions": "optimise_motion results.OptimalMotion",
-    "Identification": "Experiment Measurement ModalTest FrequencyResponseTest fit fit_each results.Fit results.Channel results.Interval "
+    "Identification": "Experiment Measurement ModalTest FrequencyResponseTest ResponseCurveTest "
+    "fit fit_each results.Fit results.Channel results.Interval "
     "results.Prediction regress results.Regression Regress MultiStart validate results.Validation compare results.Comparison "
     "information results.Information design results.Design DOptimal AOptimal EOptimal Along Average Worst "
     "discover results.Discovery recover results.Recovery "
     "log_density results.LogDensity results.Posterior Huber learnt.ConvexDissipation learnt.PassiveDissipation learnt.Potential "
     "learnt.ConvexPotential",
     "On paper": "equations results.Equations results.LinearisedEquations to_sympy",
-    "Pictures": "plot.motion plot.phase plot.forces plot.energy plot.balance plot.friction plot.bode plot.nyquist plot.response_curve plot.root_locus "
+    "Pictures": "plot.motion plot.phase plot.forces plot.energy plot.balance plot.friction plot.bode plot.nyquist plot.response_curve "
+    "plot.root_locus "
     "plot.mode_shapes plot.stability_map plot.fit plot.parameters plot.recovery plot.design plot.posterior plot.optimal_motion "
     "plot.convergence plot.equations plot.animate",
 }

@@ -38,6 +38,7 @@ from ._fit.design import design as design
 from ._fit.design_criteria import AOptimal as AOptimal, Along as Along, Average as Average
 from ._fit.design_criteria import DOptimal as DOptimal, EOptimal as EOptimal, Worst as Worst
 from ._fit.regress import regress as regress
+from ._fit.response_curve_test import ResponseCurveTest as ResponseCurveTest
 from ._motion.simulate import simulate as simulate
 from ._motion.load import load as load
 from ._motion.simulate_many import simulate_many as simulate_many

@@ -250,6 +250,7 @@ WINGS = {  # each imports only from those above it, and each file of a wing only
         "measurement",
         "linear_test",
         "modal_test",
+        "response_curve_test",
         "frequency_response_test",
         "residuals",
         "problem",

@@ -37,11 +37,13 @@ class Measure(NamedTuple):
 
 
 class Measured(NamedTuple):
-    """The greatest and the least value in a period, and c_n of f = Re Σ c_n exp(2π i n t/T)."""
+    """The greatest and the least value in a period, `highest` and `lowest`, and `harmonics` (9), c₀ the mean: f = Re Σ cₙ exp(2π i n t/T).
+    Of many motions, each has them as its first axis.
+    """
 
-    highest: Float[Array, ""]
-    lowest: Float[Array, ""]
-    harmonics: Complex[Array, " h"]
+    highest: Float[Array, "..."]
+    lowest: Float[Array, "..."]
+    harmonics: Complex[Array, "... h"]
 
 
 def measures_of(of: Any, q: PyTree) -> tuple[Measure, ...]:
@@ -99,12 +101,12 @@ def harmonics_of(values: Float[Array, "f N"], ts: Float[Array, " N"], period: An
 
 
 def moved_by_impacts(motion: Trajectory, at: Array, period: Any, rates: Float[Array, "f T"]) -> Float[Array, "f a"]:
-    """What values at samples `at`, which happen at an impact, owe to its instant, which moves: zero, but not its derivative."""
-    moved = jnp.zeros((rates.shape[0], at.size), rates.dtype)
+    """What values at samples `at`, so near to an impact that they are meant to be those at it, change until then."""
+    moved, times = jnp.zeros((rates.shape[0], at.size), rates.dtype), jax.lax.stop_gradient(motion.ts[at])
     for contact in motion.contacts.values():
         changed = contact.changed.reshape(motion.ts.size, -1)
-        for i in (at, jnp.minimum(at + 1, motion.ts.size - 1)):
-            off = jnp.abs(changed[i] - motion.ts[at][:, None]) < TOUCHES * period
-            instant = jnp.where(off, changed[i], 0)
-            moved += rates[:, at] * jnp.sum(instant - jax.lax.stop_gradient(instant), axis=1)
+        before, behind = (changed[i] - times[:, None] for i in (at, jnp.minimum(at + 1, motion.ts.size - 1)))
+        is_near = lambda until: jnp.abs(until) < TOUCHES * period
+        until = jnp.where(is_near(before), before, jnp.where(is_near(behind), behind, 0))
+        moved += rates[:, at] * jnp.sum(until, axis=1)[None]
     return moved

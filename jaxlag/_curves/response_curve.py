@@ -14,6 +14,7 @@ from jaxtyping import Array, Bool, Complex, Float, PyTree
 from .._linear.not_differentiated import without_derivative
 from .._linear.periodic import FINER, PeriodicOrbit
 from .._linear.return_map import Given
+from .._model.event import Every
 from .._model.numbers import count
 from .._model.paths import leaf_names
 from .._model.system import System
@@ -111,7 +112,7 @@ class ResponseCurve(eqx.Module):
         return self.values.shape[0]
 
     def orbit(self, i: int) -> PeriodicOrbit:
-        """The periodic motion at point i."""
+        """The periodic motion at point `i`."""
         if not -len(self) <= i < len(self):
             raise IndexError(f"`orbit({i})` must be there, but there are {len(self)} points.")
         state = jax.tree.map(lambda x: x[i], (self.q, self.qdot, self.states, self.period, self.drift, self.multipliers))
@@ -120,7 +121,7 @@ class ResponseCurve(eqx.Module):
         return PeriodicOrbit(*state, first.t, params, first.tolerances, first.system, first.setting)
 
     def at(self, value: float) -> tuple[PeriodicOrbit, ...]:
-        """The periodic motions at a value of the parameter, in the order of the curve. Their derivatives are those at this value.
+        """The periodic motions at a `value` of the parameter, in the order of the curve. Their derivatives are those at this value.
 
         **Raises:** `ValueError` if one that the curve passes is not found.
         """
@@ -137,7 +138,8 @@ class ResponseCurve(eqx.Module):
         return tuple(found)
 
     def branch(self, i: int, *, values: Any = None, steps: int | None = None) -> "ResponseCurve":
-        """The other curve through special point i: of motions of twice the period from a flip, of what crosses at a branch point.
+        """The other curve through special point `i`: of motions of twice the period from a flip, of what crosses at a branch point.
+        `values`, `steps`: as for `response_curve`; those of this curve, if not given.
 
         **Raises:** `ValueError` at another special point, or where no other curve is found.
         """
@@ -198,7 +200,7 @@ def response_curve(
     **Arguments:**
 
     - `orbit`: of `periodic`, at a value of the parameter between `values`; with a force that depends on the parameter, the section is
-      `Every(period)` with the period as a function of it.
+      `Every(period)` with the period as a function of it, and states are those at the orbit's t in the first period.
     - `params`: those of the orbit, if not given: pass them to differentiate in them without differentiating the orbit.
     - `over`: the name of a number in params; `values`: (lower, upper), between which the curve is followed.
     - `of`: what is measured of each motion: functions by name, by the argument rule, of `t, q, qdot, qddot, multipliers, states` and
@@ -229,11 +231,14 @@ def response_curve(
     params = {"c": 1.0, "d": 0.1, "w": 0.5}
     orbit = jl.periodic(duffing, 0.4, 0.0, params, section=jl.Every(lambda w: 2 * jnp.pi / w))
     curve = jl.response_curve(orbit, over="w", values=(0.3, 2.5))
-    [float(point.value) for point in curve.special]  # folds at 1.7797, 1.3242
+    curve.special[0].value  # 1.7797, the first fold
     ```
     """
     given = orbit.params if params is None else parameters(params, orbit.q)
     asked = Asked(over, bounded(values), measures_of(of, orbit.q), *_counts(samples, steps))
+    if isinstance(orbit.setting.section, Every):  # the same motion, begun early: a phase ω t of a late t would turn often with ω
+        t, period = jax.lax.stop_gradient((orbit.t, orbit.period))
+        orbit = dataclasses.replace(orbit, t=t - period * jnp.floor(t / period))
     curve = _curve(orbit, given, asked)
     start = np.asarray(jax.tree.leaves(curve.known.given.params)[curve.family.place])
     sides = curve.through(np.append(_flat(orbit, curve.family)[:-1], start))

@@ -88,7 +88,7 @@ class Measurement(Test):
         self.values = jax.tree.map(lambda z: _column(z, "`values`"), values, is_leaf=_is_list)
         check_function(predict, "`predict`")
         self.predict = predict
-        of_each = lambda s, part: jax.tree.map(lambda z: _deviation(s, z), part)
+        of_each = lambda s, part: jax.tree.map(lambda z: deviation_of(s, z), part)
         try:
             self.sigma = jax.tree.map(of_each, sigma, self.values, is_leaf=_is_list)
         except ValueError as error:
@@ -111,7 +111,8 @@ def _column(z, label):
     return z
 
 
-def _deviation(s, z):
+def deviation_of(s: Any, z: np.ndarray) -> np.ndarray:
+    """The standard deviation of each value, given for all or for each."""
     s = np.asarray(numbers(s, "`sigma`"))
     if s.shape not in ((), z.shape) or not np.all((s > 0) & np.isfinite(s)):
         raise ValueError(f"{s} for {z.size} values")

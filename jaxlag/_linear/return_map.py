@@ -23,6 +23,7 @@ ITERATIONS = 30
 SECTION = "the section"  # its name among the events of the system
 LATER = 0.382  # of a period: a second start, from which the motion is checked to return, too
 MANY = 1000  # last digits of the clock: their effect is visible against the errors of the integration
+OF_SLOPES = 10  # errors of the integration in a derivative, below which an entry of the state returns whatever it is
 BY_STEPS = 10  # last digits: the error of a motion if each of some hundred steps errs by one
 
 
@@ -114,7 +115,8 @@ def orbit_near(system: System, setting: Setting, given: Given) -> Orbit:
     left = ends[:, of] - w[None]
     of_clock = BY_STEPS * jnp.abs(left[2] - left[1]) / MANY  # a late clock gives the phase of a force to few digits
     sizes = jnp.abs(slopes[0] - jnp.eye(w.size)) @ jnp.maximum(jnp.abs(w), scales)
-    finds = [is_nothing(jnp.maximum(jnp.abs(off) - of_clock, 0), sizes) for off in left[:2]]
+    of_motion = given.tolerances[0] * jnp.maximum(jnp.abs(w), SHARE * scales)  # all that is left where every motion returns
+    finds = [is_nothing(jnp.maximum(jnp.abs(off) - of_clock - of_motion, 0), sizes) for off in left[:2]]
     values, here = eigen(slopes[0]).values[::-1], frame.first.at[of].set(w)
     checks = jnp.all(jnp.isfinite(frame.first)), *finds
     return Orbit(unravel(here), times[0], unravel(ends[0] - here), values, *jax.lax.stop_gradient((*checks, left[0])))
@@ -135,7 +137,8 @@ def _newton(residual: Callable, w: Float[Array, " k"], rtol: Array, scale: Float
         w, _, i = carry
         both = lambda w: (found := residual(w), found)
         slope, left = jax.jacfwd(both, has_aux=True)(w)
-        step = -least_change(slope, left, scale)
+        shares = jnp.abs(slope) * scale[None, :] / scale[:, None]
+        step = -least_change(jnp.where(shares > OF_SLOPES * rtol, slope, 0), left, scale)
         return w + step, jnp.all(jnp.abs(step) <= rtol * jnp.maximum(jnp.abs(w), SHARE * scale)), i + 1
 
     def going_on(carry):

@@ -111,6 +111,8 @@ def test_motions_at_a_value(curve):
     np.testing.assert_allclose([at.q, at.period], [curve.q[i], 2 * np.pi / curve.values[i]])
     with pytest.raises(IndexError, match="`orbit"):
         curve.orbit(len(curve))
+    with pytest.raises(ValueError, match="`branch.* but that is a fold"):
+        curve.branch(0)
 
 
 @pytest.mark.slow
@@ -175,3 +177,295 @@ def test_den_hartog():
     np.testing.assert_allclose(hartog(1.3, 0.3), 1.315348196714902, rtol=1e-14)
     np.testing.assert_allclose(curve.amplitude["q"], hartog(np.asarray(curve.values), 0.3), rtol=1e-7)
     assert bool(jnp.all(curve.is_stable)) and curve.special == ()
+
+
+def rubbing(w, F, guess):
+    """(X, time of slipping) of a motion with one stop in each half period, from the equations of its sliding part."""
+
+    def left(x):
+        X, t1, t2 = x  # sticks at −X until cos ω t1 + X = F, slides up until t2, sticks at X; every half period
+        P = 1 / (1 - w**2)
+        steady = lambda t: P * np.cos(w * t) - F
+        rate = lambda t: -w * P * np.sin(w * t)
+        a, b = -X - steady(t1), -rate(t1)
+        q = steady(t2) + a * np.cos(t2 - t1) + b * np.sin(t2 - t1)
+        v = rate(t2) - a * np.sin(t2 - t1) + b * np.cos(t2 - t1)
+        return [np.cos(w * t1) + X - F, q - X, v]
+
+    x, _, found, _ = fsolve(left, guess, full_output=True, xtol=1e-13)
+    assert found == 1
+    return x
+
+
+@pytest.mark.slow
+def test_stops_of_dry_friction():
+    """F = 0.8 of the drive: below ω = 0.7688 there is a stop in each half period. The amplitude with stops, and where they end: where the
+    block slips on as soon as it has stopped.
+
+    Source: Den Hartog (1931), his motions with one stop, whose equations are solved here by SciPy.
+    """
+    F = 0.8
+    start = jl.periodic(dry, 0.9, 0.6, {"w": 0.55, "F": F}, section=once)
+    curve = jl.response_curve(start, over="w", values=(0.4, 0.85))
+    assert [point.kind for point in curve.special] == ["sticking"]
+    w, amplitude = np.asarray(curve.values), np.asarray(curve.amplitude["q"])
+    place = int(np.argmin(np.abs(w - 0.55)))
+    guess, known = np.array([amplitude[place], -2.0, 3.5]), {}
+    candidates = [[amplitude[place], t1, t2] for t1 in np.linspace(-6, 0, 13) for t2 in np.linspace(1, 8, 15)]
+    for guess in candidates:
+        try:
+            x = rubbing(w[place], F, guess)
+        except AssertionError:
+            continue
+        if abs(x[0] - amplitude[place]) < 1e-5 and 0 < x[2] - x[1] < np.pi / w[place]:
+            known[place] = x
+            break
+    limit = float(curve.special[0].value)
+    for i in [*range(place + 1, len(w)), *range(place - 1, -1, -1)]:
+        if w[i] < limit - 1e-6:
+            known[i] = rubbing(w[i], F, known[i - 1] if i > place else known[i + 1])
+            np.testing.assert_allclose(amplitude[i], known[i][0], rtol=1e-7)
+        elif w[i] > limit + 1e-6:
+            np.testing.assert_allclose(amplitude[i], hartog(w[i], F), rtol=1e-7)
+    assert len(known) > 10
+    last = known[max(known)]
+    together = lambda w: (lambda x: x[1] + np.pi / w - x[2])(rubbing(w, F, last))  # how long it sticks
+    np.testing.assert_allclose(limit, brentq(together, limit - 0.02, limit + 0.002, xtol=1e-13), rtol=1e-7)
+
+
+knocking = jl.System(
+    lambda q, qdot: 0.5 * qdot**2 - 0.5 * q**2,
+    dissipation=lambda qdot, d: 0.5 * d * qdot**2,
+    force=lambda t, w: jnp.cos(w * t),
+    unilateral={"stop": jl.Contact(lambda q, s: s - q, restitution=0.8)},
+)
+
+
+def bounce(w, guess, s=0.0, d=0.1, e=0.8, sign=-1.0):
+    """ω at which the motion that hits once in a period has a multiplier `sign`, and the instant and speed of its impact.
+
+    Source: Shaw & Holmes, Journal of Sound and Vibration 90 (1983) 129-155: the motion between impacts in closed form, and the derivative
+    of the map of impacts.
+    """
+    damped = np.sqrt(1 - d**2 / 4)
+
+    def flight(w, start, v, t):
+        A = 1 / (1 - w**2 + 1j * d * w)
+        steady = lambda t: np.array([(A * np.exp(1j * w * t)).real, (1j * w * A * np.exp(1j * w * t)).real])
+        a = np.array([s, v]) - steady(start)
+        h = t - start
+        c, n, fade = np.cos(damped * h), np.sin(damped * h) / damped, np.exp(-d * h / 2)
+        M = fade * np.array([[c + d / 2 * n, n], [-n, c - d / 2 * n]])
+        return steady(t) + M @ a, M
+
+    def hits(w, tau, v):
+        """The state just before the next impact, and the derivative of (instant, speed) there by those of this one."""
+        T = 2 * np.pi / w
+        after, M = flight(w, tau, -e * v, tau + T)
+        bend = lambda t, u: np.cos(w * t) - d * u - s
+        # δ(q, q̇) just after the impact by (δτ, δv), at fixed time; then flight; then the next instant
+        start = np.array([[e * v, 0.0], [-bend(tau, -e * v), -e]])
+        end = M @ start
+        u = after[1]
+        dt = -end[0] / u
+        return after, np.array([dt, end[1] + bend(tau + T, u) * dt])
+
+    def left(x):
+        w, tau, v = x
+        after, J = hits(w, tau, v)
+        return [after[0] - s, after[1] - v, np.linalg.det(J - sign * np.eye(2))]
+
+    x, _, found, message = fsolve(left, [w, *guess], full_output=True, xtol=1e-12)
+    assert found == 1, message
+    return x
+
+
+@pytest.fixture(scope="module")
+def hammer():
+    motion = jl.simulate(knocking, -0.5, 0.0, 2 * np.pi / 2.2 * np.arange(101), {"w": 2.2, "d": 0.1, "s": 0.0})
+    orbit = jl.periodic(knocking, motion.q[-1], motion.qdot[-1], {"w": 2.2, "d": 0.1, "s": 0.0}, section=once)
+    return jl.response_curve(orbit, over="w", values=(1.8, 3.2))
+
+
+@pytest.mark.slow
+def test_flip_of_the_impact_oscillator(hammer):
+    """Where the motion with one impact gives way to one of two periods, in closed form; and that motion, which branches off there."""
+    (flip,) = hammer.special
+    assert flip.kind == "flip"
+    np.testing.assert_allclose(flip.orbit.multipliers[0], -1, atol=1e-7)
+    motion = flip.orbit.motion(4001)
+    i = int(np.argmax(np.diff(np.asarray(motion.contacts["stop"].impacts))))
+    w, *_ = bounce(float(flip.value), [float(motion.ts[i]), float(motion.qdot[i])])
+    np.testing.assert_allclose(flip.value, w, rtol=1e-8)
+    twice = hammer.branch(0, steps=8)
+    at = twice.orbit(4)
+    motion = at.motion(3)
+    np.testing.assert_allclose(at.period, 4 * np.pi / twice.values[4], rtol=1e-12)
+    np.testing.assert_allclose([motion.q[2], motion.qdot[2]], [at.q, at.qdot], atol=1e-7)
+    assert abs(float(motion.q[1] - motion.q[0])) > 1e-3  # not after one period
+
+
+@pytest.mark.slow
+def test_a_stop_that_is_only_just_met():
+    """Without impact the amplitude is |1 − ω² + 0.1 iω|⁻¹; at grazing it is 1. The motion that hits is not stable there, turns back, and
+    becomes stable at a fold, in closed form; the derivative of the fold by the gap, against differences of the closed form.
+    """
+    orbit = jl.periodic(knocking, -0.2, 0.0, {"w": 2.2, "d": 0.1, "s": 1.0}, section=once)
+    of = {"q": lambda q: q, "speed": lambda qdot: qdot}
+    curve = jl.response_curve(orbit, over="w", values=(1.2, 3.0), of=of)
+    fold, grazing = curve.special
+    assert (fold.kind, grazing.kind) == ("fold", "grazing")
+    squared = brentq(lambda u: (1 - u) ** 2 + 0.01 * u - 1, 1.5, 2.5, xtol=1e-15)
+    np.testing.assert_allclose(grazing.value, np.sqrt(squared), rtol=1e-8)
+    free = np.asarray(curve.values[grazing.index + 1 :])
+    np.testing.assert_allclose(curve.amplitude["q"][grazing.index + 1 :], 1 / np.abs(1 - free**2 + 0.1j * free), rtol=1e-7)
+    np.testing.assert_allclose(curve.measured["q"].highest[: grazing.index], 1, rtol=1e-9)  # at the stop
+    assert not np.any(curve.is_stable[fold.index + 1 : grazing.index])
+    motion = fold.orbit.motion(4001)
+    i = int(np.argmax(np.diff(np.asarray(motion.contacts["stop"].impacts))))
+    hit = [float(motion.ts[i]), float(motion.qdot[i])]
+    at = lambda s: bounce(float(fold.value), hit, s=s, sign=1.0)[0]
+    np.testing.assert_allclose(fold.value, at(1.0), rtol=1e-8)
+    given = lambda s: {"w": 2.2, "d": 0.1, "s": s}
+    by_gap = jax.jacfwd(lambda s: jl.response_curve(orbit, given(s), over="w", values=(1.2, 3.0)).special[0].value)(1.0)
+    np.testing.assert_allclose(by_gap, (at(1.001) - at(0.999)) / 0.002, rtol=1e-5)
+
+
+swinging = jl.System(  # a pendulum whose support moves up and down
+    lambda q, qdot: 0.5 * qdot**2,
+    dissipation=lambda qdot, d: 0.5 * d * qdot**2,
+    force=lambda t, q, a, h: -(a - 2 * h * jnp.cos(2 * t)) * jnp.sin(q),
+)
+
+
+@pytest.mark.slow
+def test_pendulum_with_a_moving_support():
+    """It hangs at rest; flips are at Mathieu's characteristic values a₁ and b₁, branch points, where multipliers pass 1, at a₂ and b₂.
+    Motions of twice the period branch off.
+    """
+    h = 0.4
+    rest = jl.periodic(swinging, 0.0, 0.0, {"a": 0.3, "h": h, "d": 0.0}, section=jl.Every(jnp.pi))
+    curve = jl.response_curve(rest, over="a", values=(0.2, 2.0))
+    assert [point.kind for point in curve.special] == ["flip", "flip"]
+    np.testing.assert_allclose([point.value for point in curve.special], [mathieu_b(1, h), mathieu_a(1, h)], rtol=1e-9)
+    np.testing.assert_array_equal(curve.amplitude["q"], 0)
+    rest = jl.periodic(swinging, 0.0, 0.0, {"a": 4.02, "h": h, "d": 0.0}, section=jl.Every(jnp.pi))
+    fine = jl.response_curve(rest, over="a", values=(3.9, 4.1))
+    assert [point.kind for point in fine.special] == ["branch point", "branch point"]
+    np.testing.assert_allclose([point.value for point in fine.special], [mathieu_b(2, h), mathieu_a(2, h)], rtol=1e-8)
+    swings = curve.branch(0, values=(-1.0, 3.0), steps=30)
+    assert swings.ends[0] == "it branches off there" and float(swings.amplitude["q"][-1]) > 0.3
+    motion = swings.orbit(20).motion(3)
+    np.testing.assert_allclose(motion.q, [motion.q[0], -motion.q[0], motion.q[0]], atol=1e-8)
+    crossing = fine.branch(1, values=(3.5, 5.0), steps=25)
+    assert len(crossing) > 25 and float(crossing.amplitude["q"].max()) > 0.05
+    motion = crossing.orbit(0).motion(3)
+    np.testing.assert_allclose(motion.q[-1], motion.q[0], atol=1e-8)
+
+
+top = jl.Event(lambda qdot: qdot, direction=jl.direction.Falling())
+
+
+@pytest.mark.slow
+def test_backbone_of_duffing():
+    """Free vibrations are one for each amplitude; a damping that comes out as zero numbers them. The frequency by
+    elliptic integrals; at amplitude 1 it is 1.3177760649655266.
+    """
+    free = jl.System(lambda q, qdot: 0.5 * qdot**2 - 0.5 * q**2 - 0.25 * q**4, dissipation=lambda qdot, d: 0.5 * d * qdot**2)
+    orbit = jl.periodic(free, 1.0, 0.0, {"d": 0.0}, section=top, longest=20.0)
+    np.testing.assert_allclose(2 * np.pi / orbit.period, 1.3177760649655266, rtol=1e-9)
+    backbone = jl.response_curve(orbit, over="d", values=(-0.1, 0.1), steps=12)
+    A = np.asarray(backbone.amplitude["q"])
+    frequency = np.pi * np.sqrt(1 + A**2) / (2 * ellipk(A**2 / (2 * (1 + A**2))))
+    assert A.max() > 2 and A.size > 12
+    np.testing.assert_allclose(2 * np.pi / np.asarray(backbone.period), frequency, rtol=1e-8)
+    np.testing.assert_allclose(backbone.values, 0, atol=1e-9)
+
+
+@pytest.mark.slow
+def test_torus():
+    """A driven oscillator of van der Pol: the pair of multipliers has absolute value 1, det P = exp ∫tr, by SciPy's motion from there."""
+    driven = jl.System(
+        lambda q, qdot: 0.5 * qdot**2 - 0.5 * q**2,
+        force=lambda t, q, qdot, mu, w: mu * (1 - q**2) * qdot + 1.5 * jnp.cos(w * t),
+    )
+    params = {"mu": 0.3, "w": 1.0}
+    orbit = jl.periodic(driven, -0.7, 3.0, params, section=once)
+    find = lambda mu: jl.response_curve(orbit, params | {"mu": mu}, over="w", values=(0.9, 1.6)).special[0]
+    torus = find(0.3)
+    assert torus.kind == "torus"
+    w = float(torus.value)
+    rates = lambda t, y: [y[1], 0.3 * (1 - y[0] ** 2) * y[1] - y[0] + 1.5 * np.cos(w * t), 0.3 * (1 - y[0] ** 2)]
+    start = [float(torus.orbit.q), float(torus.orbit.qdot), 0.0]
+    found = solve_ivp(rates, (0, 2 * np.pi / w), start, "DOP853", rtol=1e-12, atol=1e-13).y[:, -1]
+    np.testing.assert_allclose(found, start, atol=1e-8)
+    by_mu = jax.jacfwd(lambda mu: find(mu).value)(0.3)
+    np.testing.assert_allclose(by_mu, (find(0.3003).value - find(0.2997).value) / 6e-4, rtol=1e-5)
+
+
+@pytest.mark.slow
+def test_limit_cycles_over_a_parameter():
+    """Van der Pol's, from a section that is an event: period against SciPy's at one value."""
+    cycles = jl.System(lambda q, qdot: 0.5 * qdot**2 - 0.5 * q**2, force=lambda q, qdot, mu: mu * (1 - q**2) * qdot)
+    orbit = jl.periodic(cycles, 1.0, 0.0, {"mu": 1.0}, section=top, longest=20.0)
+    curve = jl.response_curve(orbit, over="mu", values=(0.1, 4.0))
+    assert bool(jnp.all(curve.is_stable))
+    np.testing.assert_allclose([curve.at(1.0)[0].period, curve.at(1.0)[0].q], [6.6632868593231, 2.0086198608748], rtol=1e-9)
+    turning = lambda t, y: y[1]
+    turning.direction = -1
+    rates = lambda t, y: [y[1], 4.0 * (1 - y[0] ** 2) * y[1] - y[0]]
+    times = solve_ivp(rates, (0, 60), [2.0, 0.0], "DOP853", rtol=1e-12, atol=1e-12, events=turning).t_events[0]
+    np.testing.assert_allclose(curve.period[-1], times[-1] - times[-2], rtol=1e-8)
+
+
+def test_in_single_precision_and_late():
+    """float32; and a drive that began long ago."""
+    start = jl.periodic(duffing, 0.4, 0.0, PARAMS, section=once, t=1e6 * 4 * np.pi)
+    late = jl.response_curve(start, over="w", values=(0.3, 2.5))
+    np.testing.assert_allclose([point.value for point in late.special], [1.77971952, 1.32423620], rtol=1e-8)
+    np.testing.assert_allclose(late.orbit(5).motion(3).q[-1], late.q[5], atol=1e-8)
+    with jax.enable_x64(False):
+        start = jl.periodic(duffing, jnp.float32(0.4), jnp.float32(0.0), PARAMS, section=once)
+        curve = jl.response_curve(start, over="w", values=(0.3, 2.5))
+        assert curve.values.dtype == jnp.float32
+        np.testing.assert_allclose([float(point.value) for point in curve.special], [1.7797195, 1.3242362], rtol=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ({"over": "v"}, "`over` must name one number"),
+        ({"values": (2.0, 1.0)}, "`values` must be two numbers"),
+        ({"values": (1.0, 2.0)}, "`values` must lie around"),
+        ({"of": {}}, "`of` must be functions"),
+        ({"of": {"x": lambda q: jnp.stack([q, q])}}, "`of` 'x' must return one number"),
+        ({"samples": 3}, "`samples`"),
+        ({"steps": 0}, "`steps`"),
+    ],
+)
+def test_wrong_arguments(orbit, change, said):
+    with pytest.raises((ValueError, TypeError), match=said):
+        jl.response_curve(orbit, **({"over": "w", "values": (0.3, 2.5)} | change))
+
+
+def test_what_is_hidden_is_refused(orbit):
+    curve = lambda d: jl.response_curve(orbit, PARAMS | {"d": d}, over="w", values=(0.3, 2.5)).values
+    with pytest.raises(ValueError, match="`params` must be known"):
+        jax.jit(curve)(0.1)
+    with pytest.raises(ValueError, match="`params` must be known"):
+        jax.vmap(curve)(jnp.array([0.1, 0.2]))
+
+
+def test_shown(curve):
+    """What is printed, and the picture: stable parts solid, the unstable one dashed, two folds."""
+    import matplotlib as mpl
+
+    mpl.use("Agg")
+    text = repr(curve)
+    assert "fold at w = 1.7797" in text and "an end of `values` is reached" in text
+    ax = curve.plot()
+    styles = [line.get_linestyle() for line in ax.get_lines() if len(line.get_xdata()) > 2]
+    assert styles == ["-", "--", "-"]
+    assert {text.get_text() for text in ax.get_legend().get_texts()} == {"fold", "unstable"}
+    with pytest.raises(ValueError, match="`of` must name"):
+        curve.plot(of="x")
