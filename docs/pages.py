@@ -50,7 +50,7 @@ REFERENCE = {  # names in `jaxlag`
     "discover results.Discovery recover results.Recovery "
     "log_density results.LogDensity results.Posterior Huber learnt.ConvexDissipation learnt.PassiveDissipation learnt.Potential "
     "learnt.ConvexPotential",
-    "On paper": "equations results.Equations results.LinearisedEquations to_sympy",
+    "On paper": "equations results.Equations results.LinearisedEquations to_fmu to_sympy",
     "Pictures": "plot.motion plot.phase plot.forces plot.energy plot.balance plot.friction plot.bode plot.nyquist plot.response_curve "
     "plot.root_locus "
     "plot.mode_shapes plot.stability_map plot.fit plot.parameters plot.recovery plot.design plot.posterior plot.optimal_motion "

@@ -16,6 +16,7 @@ from . import (
 )
 from ._mechanics.acceleration import acceleration as acceleration, constraint_force as constraint_force
 from ._paper.equations import equations as equations
+from ._paper.fmu import to_fmu as to_fmu
 from ._paper.to_sympy import to_sympy as to_sympy
 from ._mechanics.examine import examine as examine
 from ._mechanics.friction_treatment import Regularised as Regularised, StickSlip as StickSlip

@@ -314,7 +314,13 @@ WINGS = {  # each imports only from those above it, and each file of a wing only
         "textbook_printer",
         "unicode_printer",
         "latex_printer",
+        "identifiers",
         "codegen",
+        "fmu_program",
+        "fmu_motion",
+        "fmu_description",
+        "fmu",
+        "fmu_of_equations",
         "result",
         "linearised_result",
         "linearised",
@@ -367,7 +373,7 @@ HOMES = [
 LONGEST_FILE = 500
 TABLES = {"tableaux"}  # coefficients
 LONGEST_BODY = 60
-OWN_TABLES = {"structured_jacobian", "sums_in_scans", "whole_kernel", "unicode_printer"}  # the last of SymPy's names
+OWN_TABLES = {"structured_jacobian", "sums_in_scans", "whole_kernel", "fmu_program", "unicode_printer"}  # the last of SymPy's names
 FILES = [(wing, name) for wing, names in WINGS.items() for name in names]
 
 

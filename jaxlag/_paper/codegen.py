@@ -1,8 +1,8 @@
 """Equations of motion as programs that do not need this package: NumPy, C."""
 
 import keyword
+import pathlib
 import re
-import unicodedata
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -15,6 +15,7 @@ from sympy.printing.numpy import NumPyPrinter
 
 from .._mechanics.massless import underdetermined
 from .derivative import derivative
+from .identifiers import identifier, in_ascii
 
 
 class Program(NamedTuple):
@@ -103,7 +104,7 @@ def to_python(program: Program) -> str:
 
 def to_c(program: Program) -> str:
     """The source of a function in C99."""
-    spelt = lambda name: identifier(_in_ascii(name))
+    spelt = lambda name: identifier(in_ascii(name))
     writer = _Writer(program, C99CodePrinter({"strict": True, "math_macros": {}}), RESERVED_IN_C, spelt)
     given = [("q", program.q), ("qdot", program.qdot), ("params", tuple(symbol for symbol, _ in program.params))]
     body = [f"const double {writer.names[symbol]} = {part}[{i}];" for part, symbols in given for i, symbol in enumerate(symbols)]
@@ -122,22 +123,6 @@ def to_c(program: Program) -> str:
     return "\n".join(
         ["#include <math.h>", "", *([] if writer.z else [SOLVE]), f"/* {comment} */", head, "{", *(f"    {line}" for line in body), "}", ""]
     )
-
-
-def identifier(name: str) -> str:
-    """A name as a Python identifier: k_2 for k^2, _1k for 1k."""
-    name = re.sub(r"\W", "_", unicodedata.normalize("NFKC", name))  # as Python does: two spellings may be one identifier
-    return name if name.isidentifier() else f"_{name}"
-
-
-def _in_ascii(name: str) -> str:
-    """A name in the letters of C99: phi for φ."""
-    return "".join(x if x.isascii() else _letter_in_words(x) for x in unicodedata.normalize("NFKD", name) if not unicodedata.combining(x))
-
-
-def _letter_in_words(letter: str) -> str:
-    *_, word = unicodedata.name(letter, "_").replace("-", "_").split()
-    return word.capitalize() if letter.isupper() else word.lower()
 
 
 class _Writer:
@@ -175,47 +160,4 @@ class _Writer:
 
 
 CONSTANTS = {constant: sympy.Float(constant, 17) for constant in (sympy.pi, sympy.E)}
-SOLVE = """/* z of A z = b, by elimination with complete pivoting, in units in which the inertia of each of the m coordinates and the
-   largest entry of each row behind them are 1; of least norm where rows are linearly dependent. */
-static void solve(int n, int m, double A[n][n], double *b, double *z)
-{
-    int place[n], rank = 0;
-    double unit[n], free[n][n];
-    for (int i = 0; i < n; i++) {
-        double size = i < m ? sqrt(fabs(A[i][i])) : 0;
-        for (int j = 0; i >= m && j < m; j++) size = fmax(size, fabs(A[i][j] * unit[j]));
-        unit[i] = size > 0 ? 1 / size : 1;
-        place[i] = i;
-    }
-    for (int i = 0; i < n; i++) {
-        for (int j = 0; j < n; j++) A[i][j] *= unit[i] * unit[j];
-        b[i] *= unit[i];
-    }
-    for (; rank < n; rank++) {
-        int row = rank, column = rank;
-        for (int i = rank; i < n; i++)
-            for (int j = rank; j < n; j++)
-                if (fabs(A[i][j]) > fabs(A[row][column])) row = i, column = j;
-        if (fabs(A[row][column]) < 1e-12) break;
-        for (int j = 0; j < n; j++) { double x = A[rank][j]; A[rank][j] = A[row][j]; A[row][j] = x; }
-        for (int i = 0; i < n; i++) { double x = A[i][rank]; A[i][rank] = A[i][column]; A[i][column] = x; }
-        double x = b[rank]; b[rank] = b[row]; b[row] = x;
-        int k = place[rank]; place[rank] = place[column]; place[column] = k;
-        for (int i = 0; i < n; i++) {
-            double factor = A[i][rank] / A[rank][rank];
-            if (i == rank) continue;
-            for (int j = rank; j < n; j++) A[i][j] -= factor * A[rank][j];
-            b[i] -= factor * b[rank];
-        }
-    }
-    for (int i = 0; i < n; i++) z[place[i]] = i < rank ? unit[place[i]] * b[i] / A[i][i] : 0;
-    for (int k = rank; k < n; k++) { /* remove the null space of A from what stands behind coordinates, by orthogonal null vectors */
-        for (int i = 0; i < n; i++) free[k][place[i]] = unit[place[i]] * (i < rank ? -A[i][k] / A[i][i] : i == k);
-        for (int l = rank; l <= k; l++) {
-            double *target = l < k ? free[k] : z, *along = l < k ? free[l] : free[k], dot = 0, square = 0;
-            for (int i = m; i < n; i++) dot += along[i] * target[i], square += along[i] * along[i];
-            for (int i = m; i < n; i++) target[i] -= square > 0 ? dot / square * along[i] : 0;
-        }
-    }
-}
-"""
+SOLVE = (pathlib.Path(__file__).parent / "c" / "solve.c").read_text()

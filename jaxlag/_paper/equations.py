@@ -138,6 +138,7 @@ def equations(
         paths=constants.paths,
         simplify=simplify,
         notation=Notation(full, parameters),
+        system=system,
         contacts=full.contacts,
     )
     holonomic = reduced.g[: len(reduced.g) - len(full.contacts), :]

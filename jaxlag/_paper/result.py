@@ -4,7 +4,9 @@ import dataclasses
 import functools
 import itertools
 import math
-from collections.abc import Iterable, Iterator
+import os
+import pathlib
+from collections.abc import Collection, Iterable, Iterator
 from typing import Any
 
 import jax
@@ -124,6 +126,41 @@ class Equations:
 
         return to_c(self._program())
 
+    def to_fmu(
+        self,
+        path: str | os.PathLike[str],
+        q0: PyTree,
+        qdot0: PyTree,
+        params: PyTree = None,
+        *,
+        inputs: str | Collection[str] = (),
+        outputs: str | Collection[str] | None = None,
+        name: str | None = None,
+    ) -> pathlib.Path:
+        """Writes a functional mock-up unit (FMI 3.0), as `jaxlag.to_fmu` does, of these equations in the remaining coordinates.
+
+        Eliminated coordinates, their velocities and their accelerations are variables that follow from the others.
+
+        **Arguments, returns, raises:** as for `to_fmu`, where `q0`, `qdot0` and `params` are structured as they were for `equations`;
+        further states are refused here.
+
+        **Source:** Modelica Association, Functional Mock-up Interface Specification 3.0 (2022).
+
+        ```python
+        import tempfile
+        import jaxlag as jl
+        from jaxlag.examples import pendulum
+        on_paper = jl.equations(pendulum.polar, {"r", "phi"}, {"m", "l", "g"})
+        with tempfile.TemporaryDirectory() as folder:
+            on_paper.to_fmu(f"{folder}/pendulum.fmu", *pendulum.polar_state(0.5, 0.0, 1.0), pendulum.params)
+        ```
+        """
+        from .fmu import export
+        from .fmu_of_equations import exported_equations
+
+        with jax.enable_x64(True):
+            return export(exported_equations(self, q0, qdot0, params), path, inputs, outputs, name)
+
     def _program(self) -> Any:
         from .codegen import Program
 
@@ -168,6 +205,7 @@ class Details:
     paths: list  # each parameter's symbol and its path in Python
     simplify: Any  # `simplify.Simplifier`
     notation: Any  # `notation.Notation`
+    system: Any  # `System` from which they were derived
     contacts: tuple = ()  # of `derivation.ContactLaw`
 
     @functools.cached_property
