@@ -41,7 +41,8 @@ REFERENCE = {  # names in `jaxlag`
     "surfaces.Located surfaces.NotLocated keep_compiled",
     "Near a steady state": "equilibrium steady results.Equilibrium linearise results.LinearSystem results.Modes lowest_modes root_locus "
     "results.RootLocus results.Crossing periodic results.PeriodicOrbit "
-    "response_curve results.ResponseCurve results.SpecialPoint results.Measured stability_map results.StabilityMap",
+    "equilibrium_curve results.EquilibriumCurve results.SpecialEquilibrium response_curve results.ResponseCurve "
+    "results.SpecialPoint results.Measured stability_map results.StabilityMap",
     "Best motions": "optimise_motion results.OptimalMotion",
     "Identification": "Experiment Measurement ModalTest FrequencyResponseTest ResponseCurveTest "
     "fit fit_each results.Fit results.Channel results.Interval "
@@ -52,7 +53,7 @@ REFERENCE = {  # names in `jaxlag`
     "learnt.ConvexPotential",
     "On paper": "equations results.Equations results.LinearisedEquations to_fmu to_sympy",
     "Pictures": "plot.motion plot.phase plot.forces plot.energy plot.balance plot.friction plot.bode plot.nyquist plot.response_curve "
-    "plot.root_locus "
+    "plot.equilibrium_curve plot.root_locus "
     "plot.mode_shapes plot.stability_map plot.fit plot.parameters plot.recovery plot.design plot.posterior plot.optimal_motion "
     "plot.convergence plot.equations plot.animate",
 }

@@ -20,6 +20,7 @@ from ._paper.fmu import to_fmu as to_fmu
 from ._paper.to_sympy import to_sympy as to_sympy
 from ._mechanics.examine import examine as examine
 from ._mechanics.friction_treatment import Regularised as Regularised, StickSlip as StickSlip
+from ._curves.equilibrium_curve import equilibrium_curve as equilibrium_curve
 from ._curves.response_curve import response_curve as response_curve
 from ._fit.information import information as information
 from ._fit.validate import validate as validate

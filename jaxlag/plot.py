@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from ._curves.equilibrium_curve import EquilibriumCurve
 from ._curves.response_curve import ResponseCurve
 from ._draw.animate import animate
 from ._draw.axes import COLOURS as COLOURS
@@ -22,7 +23,7 @@ from ._draw.optimal_motion import optimal_motion
 from ._draw.posterior import posterior
 from ._draw.recovery import recovery
 from ._draw.report import report
-from ._draw.response_curve import response_curve
+from ._draw.response_curve import equilibrium_curve, response_curve
 from ._draw.stability_map import stability_map
 from ._fit.design import Design
 from ._fit.posterior import Posterior
@@ -44,6 +45,7 @@ __all__ = [
     "design",
     "energy",
     "equations",
+    "equilibrium_curve",
     "fit",
     "forces",
     "friction",
@@ -110,6 +112,7 @@ SHORT_WAYS: tuple[tuple[type, str, Any], ...] = (  # what is computed knows noth
     (OptimalMotion, "plot", optimal_motion),
     (Modes, "plot", mode_shapes),
     (Modes, "animate", animate),
+    (EquilibriumCurve, "plot", equilibrium_curve),
     (ResponseCurve, "plot", response_curve),
     (RootLocus, "plot", root_locus),
     (StabilityMap, "plot", stability_map),

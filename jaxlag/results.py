@@ -1,5 +1,7 @@
 """The classes that functions of jaxlag return, for annotations and `isinstance`; you need not create any of them."""
 
+from ._curves.equilibrium_curve import EquilibriumCurve as EquilibriumCurve
+from ._curves.equilibrium_curve import SpecialEquilibrium as SpecialEquilibrium
 from ._curves.measures import Measured as Measured
 from ._curves.response_curve import ResponseCurve as ResponseCurve, SpecialPoint as SpecialPoint
 from ._fit.information import Information as Information

@@ -217,12 +217,16 @@ WINGS = {  # each imports only from those above it, and each file of a wing only
     ],
     "_curves": [
         "arclength",
+        "curve",
         "critical",
+        "in_plane",
         "measures",
         "orbits",
         "special_points",
         "orbit_curve",
         "response_curve",
+        "rests",
+        "equilibrium_curve",
     ],
     "_optimal": [
         "radau",

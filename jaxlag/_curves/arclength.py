@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-STEP, LONGEST, SHORTEST = 0.02, 0.06, 1e-5  # of a step: the first, bounds; in these units the values asked for are 1 wide
+STEP, LONGEST, SHORTEST = 0.02, 0.04, 1e-5  # of a step: the first, bounds; in these units the values asked for are 1 wide
 FEW, MANY = 3, 5  # turns of Newton's method after which the next step is longer or shorter
 STRAIGHT = np.cos(np.radians(20))  # between the tangents at the ends of a step
 ASIDE = 0.3  # of a step, by which its end may lie beside the tangent

@@ -29,6 +29,11 @@ def borders_of(A: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return u[:, -1], v[-1]
 
 
+def crossing(J: np.ndarray) -> np.ndarray:
+    """The direction of another curve where two cross: of the two in which the Jacobian is singular, the one with less of the parameter."""
+    return min(np.linalg.svd(J)[2][-2:], key=lambda free: abs(free[-1]))
+
+
 def critical(kind: str, change: Array | np.ndarray, b: Array | np.ndarray, c: Array | np.ndarray) -> Any:
     """A smooth function that is zero where the critical matrix is singular."""
     xp = np if isinstance(change, np.ndarray) else jnp

@@ -8,13 +8,14 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
-from .._linear.newton import differentiable_root, least_change
+from .._linear.newton import differentiable_root
 from .._linear.return_map import Frame, Given, Setting, forced_period, passage, scales_of
 from .._model.event import Every
 from .._model.system import System
 from .._motion.simulate import simulate
 from .._program.jit import compiled
 from .critical import critical
+from .in_plane import Plane, in_plane
 from .measures import Measure, Measured, extrema, harmonics_of, moved_by_impacts, values_of
 
 ORDINARY = "ordinary"  # a point of a curve that is not special
@@ -38,15 +39,6 @@ class Numbers(NamedTuple):
     given: Given
     usual: Float[Array, ""]
     width: Float[Array, ""]
-
-
-class Plane(NamedTuple):
-    """A plane through z across a curve, in units of `scale`; for a special point the two vectors that border its critical matrix."""
-
-    z: Float[Array, " u"]
-    tangent: Float[Array, " u"]
-    scale: Float[Array, " u"]
-    borders: tuple[Array, Array]
 
 
 class Near(NamedTuple):
@@ -104,29 +96,13 @@ def corrected(family: Family, numbers: Numbers, plane: Plane, turns: Any) -> Nea
 
     def evaluated(z):
         left, time, frame = returned(family, numbers, z)
-        return left, (left, time, scales_of(frame)[of])
+        return left, (jnp.append(WIDE * scales_of(frame)[of], numbers.width), time)
 
-    def turn(carry):
-        z, *_, i = carry
-        J, (left, time, x) = jax.jacfwd(evaluated, has_aux=True)(z)
-        across = (z - plane.z) / plane.scale @ plane.tangent
-        A, b = jnp.concatenate([J, (plane.tangent / plane.scale)[None]]), jnp.append(left, across)
-        step = jnp.where(i < turns, -least_change(A, b, plane.scale), 0)
-        length = jnp.max(jnp.abs(step / plane.scale))
-        scale = jnp.append(WIDE * x, numbers.width)
-        small = CLOSE * numbers.given.tolerances[0]
-        returns = jnp.max(jnp.abs(left) / scale[:-1], initial=0.0) <= small**0.5  # steps are short where an impact grazes, too
-        done = (length <= small) & returns
-        return z + step, J, scale, time, done & (turns > 0), i + 1
-
-    def going_on(carry):
-        z, J, *_, done, i = carry
-        return ~done & (i <= turns) & jnp.all(jnp.isfinite(z)) & ((i == 0) | jnp.all(jnp.isfinite(J)))
-
-    k, nothing = plane.z.size - 1, jnp.zeros((), plane.z.dtype)
-    start = plane.z, jnp.zeros((k, k + 1), plane.z.dtype), plane.scale, nothing, jnp.array(False), jnp.array(0)
-    z, J, scale, time, done, i = jax.lax.while_loop(going_on, turn, start)
-    return Near(z, J, scale, time, done & jnp.all(jnp.isfinite(J)), i)
+    small = CLOSE * numbers.given.tolerances[0]
+    near = in_plane(evaluated, plane, turns, small)
+    scale, time = near.aside
+    returns = jnp.max(jnp.abs(near.left) / scale[:-1], initial=0.0) <= small**0.5  # steps are short where an impact grazes, too
+    return Near(near.z, near.J, scale, time, near.done & returns, near.turns)
 
 
 @compiled

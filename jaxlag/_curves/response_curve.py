@@ -16,26 +16,18 @@ from .._linear.periodic import FINER, PeriodicOrbit
 from .._linear.return_map import Given
 from .._model.event import Every
 from .._model.numbers import count
-from .._model.paths import leaf_names
 from .._model.system import System
 from .._model.validation import parameters
 from .._motion.scales import tolerances_of
 from .._program.jit import is_concrete
 from .._program.jit import values as known_values
-from .arclength import Followed, Point, bounded
+from .arclength import Point, bounded
 from .critical import FLIP, FOLD, TORUS
+from .curve import ENDS, beside, joined, place_of, refuse_outside
 from .measures import Measured, measures_of
 from .orbit_curve import Asked, OrbitCurve
 from .orbits import ORDINARY, Family, Numbers, Told, with_value
-from .special_points import BRANCH, CORNER, Special, with_special_points
-
-ENDS = {
-    "bounds": "an end of `values` is reached",
-    "closed": "the curve closes",
-    "steps": "`steps` were not enough",
-    "lost": "no periodic motion was found beyond",
-    "start": "it branches off there",
-}
+from .special_points import BRANCH, CORNER, Special, changes_of_orbits, with_special_points
 
 
 class SpecialPoint(eqx.Module):
@@ -117,7 +109,7 @@ class ResponseCurve(eqx.Module):
             raise IndexError(f"`orbit({i})` must be there, but there are {len(self)} points.")
         state = jax.tree.map(lambda x: x[i], (self.q, self.qdot, self.states, self.period, self.drift, self.multipliers))
         first = self._first
-        params = with_value(first.params, _index(first.params, self.over), self.values[i])
+        params = with_value(first.params, place_of(first.params, self.over), self.values[i])
         return PeriodicOrbit(*state, first.t, params, first.tolerances, first.system, first.setting)
 
     def at(self, value: float) -> tuple[PeriodicOrbit, ...]:
@@ -156,12 +148,10 @@ class ResponseCurve(eqx.Module):
             twice = orbit.setting._replace(turns=2 * orbit.setting.turns)
             orbit = dataclasses.replace(orbit, setting=twice, period=2 * orbit.period)
         curve = _curve(orbit, orbit.params, asked)
-        sides = curve.across(_flat(orbit, curve.family), point.kind)
+        sides = curve.beside(_flat(orbit, curve.family), point.kind)
         if not sides:
             raise ValueError(f"`branch({i})` must find another curve, but Newton's method finds none. Widen `values`.")
-        points, ends = (sides[0][0], (sides[0][1],) * 2) if len(sides) == 1 else _joined(sides[1], sides[0])
-        ends = ("start", ends[1]) if len(sides) == 1 else ends
-        return _shown(curve, orbit, points, ends)
+        return _shown(curve, orbit, *beside(sides))
 
     def __repr__(self) -> str:
         head = f"ResponseCurve of {len(self)} periodic motions over {self.over}"
@@ -244,7 +234,7 @@ def response_curve(
     sides = curve.through(np.append(_flat(orbit, curve.family)[:-1], start))
     if sides is None:
         raise ValueError(f"`orbit` must be a periodic motion at its {over}, but none was found there with `params`. Compute it with them.")
-    return _shown(curve, orbit, *_joined(*sides))
+    return _shown(curve, orbit, *joined(*sides))
 
 
 def _counts(samples: Any, steps: Any) -> tuple[int, int]:
@@ -254,25 +244,16 @@ def _counts(samples: Any, steps: Any) -> tuple[int, int]:
 def _curve(orbit: PeriodicOrbit, params: PyTree, asked: Asked) -> OrbitCurve:
     """The curve through an orbit, to be followed."""
     fixed = jax.lax.stop_gradient
-    index = _index(params, asked.over)
-    start = known_values(jax.tree.leaves(params)[index])
-    if start is not None and not asked.bounds[0] <= start <= asked.bounds[1]:
-        raise ValueError(f"`values` must lie around that of the orbit, but are {asked.bounds}, and {asked.over} = {start:g}. Widen them.")
+    place = place_of(params, asked.over)
+    start = known_values(jax.tree.leaves(params)[place])
+    refuse_outside(start, asked.bounds, asked.over)
     asked_for, beside = orbit.tolerances
     rtol, atol = tolerances_of(asked_for, beside, orbit.q)
     tolerances = (rtol if asked_for is not None else FINER * rtol, atol)
     state = fixed({"q": orbit.q, "qdot": orbit.qdot, "states": orbit.states})
     t, width = fixed(orbit.t), jnp.asarray(asked.bounds[1] - asked.bounds[0], jnp.result_type(rtol))
     numbers = Numbers(Given(state, params, t, jnp.zeros_like(t), tolerances), fixed(orbit.period), width)
-    return OrbitCurve(Family(orbit.system, orbit.setting, index), asked, numbers)
-
-
-def _index(params: PyTree, over: str) -> int:
-    """The place of a parameter among the leaves of params."""
-    names = leaf_names(params, "params")
-    if over not in names or np.shape(jax.tree.leaves(params)[names.index(over)]):
-        raise ValueError(f"`over` must name one number of `params`, but is {over!r}. The entries are {', '.join(names)}.")
-    return names.index(over)
+    return OrbitCurve(Family(orbit.system, orbit.setting, place), asked, numbers)
 
 
 def _flat(orbit: PeriodicOrbit, family: Family) -> np.ndarray:
@@ -282,18 +263,9 @@ def _flat(orbit: PeriodicOrbit, family: Family) -> np.ndarray:
     return np.append(x, np.asarray(jax.lax.stop_gradient(jax.tree.leaves(orbit.params)[family.place])))
 
 
-def _joined(back: Followed, on: Followed) -> tuple[list[Point], tuple[str, str]]:
-    """The points of both sides in one order, and why they end."""
-    (before, first), (after, last) = back, on
-    if "closed" in (first, last):
-        return (after, (last, last)) if last == "closed" else (before, (first, first))
-    turned = [point._replace(tangent=-point.tangent) for point in before[:0:-1]]
-    return [*turned, *after], (first, last)
-
-
-def _shown(curve: OrbitCurve, orbit: PeriodicOrbit, points: list[Point], ends: tuple[str, str]) -> ResponseCurve:
+def _shown(curve: OrbitCurve, orbit: PeriodicOrbit, runs: list[list[Point]], ends: tuple[str, str]) -> ResponseCurve:
     """The curve as it is returned."""
-    points, found = with_special_points(curve, points)
+    points, found = with_special_points(curve, runs, changes_of_orbits)
     special = [_special(curve, orbit, i, at) for i, at in found.items()]
     told = [curve.shown(point) for point in points]
     whole = jax.tree.map(lambda *x: jnp.stack(x), *told)

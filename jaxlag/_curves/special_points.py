@@ -1,12 +1,12 @@
 """The special points of a curve: found between two of its points, and located."""
 
 import itertools
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from typing import NamedTuple
 
 import numpy as np
 
-from .arclength import Correct, Point, corner
+from .arclength import Correct, Corrected, Point, corner
 from .critical import FLIP, FOLD, TORUS, borders_of, critical_matrix
 
 BRANCH, CORNER = "branch point", "corner"
@@ -24,57 +24,50 @@ class Special(NamedTuple):
     corners: tuple[tuple, tuple]
 
 
-def with_special_points(correct: Correct, points: list[Point]) -> tuple[list[Point], dict[int, Special]]:
-    """The points of a curve with the special ones among them, and these by their number. Where corners change, nothing else is sought."""
-    all_of_them, special = points[:1], {}
-    for here, after in itertools.pairwise(points):
-        found = list(_between(correct, here, after))
-        chord = (after.z - here.z) / here.scale
-        for at in sorted(found, key=lambda at: (at.at.z - here.z) / here.scale @ chord):
-            special[len(all_of_them)] = at
-            all_of_them.append(at.at)
-        all_of_them.append(after)
-    return all_of_them, special
+Changes = Callable[[Correct, Point, Point], Iterable[Special]]
 
 
-def _between(correct: Correct, here: Point, after: Point) -> Iterator[Special]:
-    """The special points between two points of a curve."""
-    corners = here.corners, after.corners
+def with_special_points(correct: Correct, runs: list[list[Point]], changes: Changes) -> tuple[list[Point], dict[int, Special]]:
+    """The points of a curve with the special ones among them, and these by their number; `changes` finds those between two of a run."""
+    points, special = [], {}
+    for run in runs:
+        points.append(run[0])
+        for here, after in itertools.pairwise(run):
+            chord = (after.z - here.z) / here.scale
+            for at in sorted(changes(correct, here, after), key=lambda at: (at.at.z - here.z) / here.scale @ chord):
+                special[len(points)] = at
+                points.append(at.at)
+            points.append(after)
+    return points, special
+
+
+def changes_of_orbits(correct: Correct, here: Point, after: Point) -> Iterator[Special]:
+    """The special points between two orbits. Where corners change, nothing else is sought."""
     if here.corners != after.corners:
-        yield Special(CORNER, corner(correct, here, after), (NOTHING, NOTHING), corners)
+        yield Special(CORNER, corner(correct, here, after), (NOTHING, NOTHING), (here.corners, after.corners))
         return
-    for kind in _kinds(here, after):
-        found = _located(correct, here, after, kind)
-        if found is not None:
-            A = critical_matrix(FOLD if kind == BRANCH else kind, found.J[:, :-1])
-            yield Special(kind, found, borders_of(A), corners)
+    yield from folds_and_branches(correct, here, after)
+    multipliers = [np.linalg.eigvals(point.J[:, :-1] + np.eye(len(point.J))) for point in (here, after)]
+    i, j = np.triu_indices(len(here.J), 1)
+    for kind, off in ((FLIP, lambda m: m + 1), (TORUS, lambda m: m[i] * m[j] - 1)):
+        if min(np.min(np.abs(off(m)), initial=np.inf) for m in multipliers) > SURE:
+            found = _singular(correct, here, after, kind)
+            if found is not None and (kind == FLIP or _is_pair(found.J[:, :-1])):
+                yield Special(kind, found, borders_of(critical_matrix(kind, found.J[:, :-1])), (here.corners, after.corners))
 
 
-def _kinds(here: Point, after: Point) -> Iterator[str]:
-    """What changes its sign from one point to the next, beyond rounding."""
-    changes = [point.J[:, :-1] for point in (here, after)]
-    multipliers = [np.linalg.eigvals(change + np.eye(len(change))) for change in changes]
-    sign = lambda of: np.sign(of[0]) * np.sign(of[1]) < 0
+def folds_and_branches(correct: Correct, here: Point, after: Point) -> Iterator[Special]:
+    """Where the curve turns back between two points, and where another one crosses it."""
     tangents = here.tangent[-1], after.tangent[-1]
-    if sign(tangents) and min(map(abs, tangents)) > SURE:
-        yield FOLD
-    if sign([_orientation(point) for point in (here, after)]):
-        yield BRANCH
-    sure = lambda off: min(np.min(np.abs(off(m)), initial=np.inf) for m in multipliers) > SURE
-    if sure(lambda m: m + 1) and sign([np.linalg.slogdet(critical_matrix(FLIP, change))[0] for change in changes]):
-        yield FLIP
-    i, j = np.triu_indices(len(changes[0]), 1)
-    if sure(lambda m: m[i] * m[j] - 1) and sign([np.linalg.slogdet(critical_matrix(TORUS, change))[0] for change in changes]):
-        yield TORUS
+    turns = tangents[0] * tangents[1] < 0 and min(map(abs, tangents)) > SURE
+    for kind in (*([FOLD] if turns else []), BRANCH):
+        found = _singular(correct, here, after, kind)
+        if found is not None:
+            yield Special(kind, found, borders_of(found.J[:, :-1]), (here.corners, after.corners))
 
 
-def _orientation(point: Point) -> float:
-    """The sign of the determinant of the Jacobian and the tangent, which changes where branches cross."""
-    return float(np.linalg.slogdet(np.concatenate([point.J * point.scale, point.tangent[None]]))[0])
-
-
-def _located(correct: Correct, here: Point, after: Point, kind: str) -> Point | None:
-    """The point where it happens; None if it does not: a pair of real multipliers whose product passes 1 is no torus."""
+def located(correct: Correct, here: Point, after: Point, test: Callable[[Corrected | Point], float]) -> Point | None:
+    """The point between two others where a function of it changes its sign; None if it does not, or a point in between is not found."""
     from scipy.optimize import brentq  # imported here because that takes a while
 
     chord = (after.z - here.z) / here.scale
@@ -86,34 +79,35 @@ def _located(correct: Correct, here: Point, after: Point, kind: str) -> Point | 
             raise _NotFound
         return found
 
-    test = _tested(kind, here, after)
+    if not test(here) * test(after) < 0:
+        return None
     try:
-        part = float(brentq(lambda part: test(at(part).J), 0.0, 1.0, xtol=SHARP))
-        found = at(part)
+        found = at(float(brentq(lambda part: test(at(part)), 0.0, 1.0, xtol=SHARP)))
     except (_NotFound, ValueError):
         return None
-    if kind == TORUS and not _is_pair(found.J[:, :-1]):
+    along = here.tangent * here.scale / found.scale
+    return Point(found.z, found.J, along / np.linalg.norm(along), found.scale, here.corners)
+
+
+def _singular(correct: Correct, here: Point, after: Point, kind: str) -> Point | None:
+    """The point where the determinant of the critical matrix changes its sign; of a branch point, of the Jacobian with the tangent."""
+    tangents = (here.tangent[None], after.tangent[None])
+
+    def matrix(J, tangent):
+        return np.concatenate([J * here.scale, tangent]) if kind == BRANCH else critical_matrix(kind, J[:, :-1])
+
+    if here.J.shape[0] + 1 != here.J.shape[1]:
+        return None  # constraints that depend on each other
+    signs = [np.linalg.slogdet(matrix(point.J, tangent))[0] for point, tangent in zip((here, after), tangents, strict=True)]
+    if not signs[0] * signs[1] < 0:
         return None
-    along = here.tangent * here.scale
-    return Point(found.z, found.J, along / found.scale / np.linalg.norm(along / found.scale), found.scale, here.corners)
+    size = np.linalg.slogdet(matrix(here.J, tangents[0]))[1]
 
-
-def _tested(kind: str, here: Point, after: Point) -> Callable[[np.ndarray], float]:
-    """The determinant that changes its sign between two points, as a function of the Jacobian; 1 or −1 here."""
-    tangent = (here.tangent + after.tangent)[None]
-
-    def matrix(J):
-        if kind == BRANCH:
-            return np.concatenate([J * here.scale, tangent])
-        return critical_matrix(kind, J[:, :-1])
-
-    size = np.linalg.slogdet(matrix(here.J))[1]
-
-    def test(J):
-        sign, log = np.linalg.slogdet(matrix(J))
+    def test(found):
+        sign, log = np.linalg.slogdet(matrix(found.J, tangents[0] + tangents[1]))
         return float(sign * np.exp(log - size))
 
-    return test
+    return located(correct, here, after, test)
 
 
 def _is_pair(change: np.ndarray) -> bool:
