@@ -32,8 +32,10 @@ class InPlane(NamedTuple):
     turns: Int[Array, ""]
 
 
-def in_plane(evaluated: Callable, plane: Plane, turns: Any, small: Any) -> InPlane:
-    """The point in a plane where R = 0, by at most so many `turns`; none only evaluates. `evaluated(z)` is R and what is told aside."""
+def in_plane(evaluated: Callable, plane: Plane, turns: Any, small: Any, cleaned: Callable = lambda J, aside: J) -> InPlane:
+    """The point in a plane where R = 0, by at most so many `turns`; none only evaluates. `evaluated(z)` is R and what is told aside;
+    `cleaned(J, aside)` a Jacobian without what is rounding.
+    """
 
     def both(z):
         left, aside = evaluated(z)
@@ -42,6 +44,7 @@ def in_plane(evaluated: Callable, plane: Plane, turns: Any, small: Any) -> InPla
     def turn(carry):
         z, *_, i = carry
         J, (left, aside) = jax.jacfwd(both, has_aux=True)(z)
+        J = cleaned(J, aside)
         across = (z - plane.z) / plane.scale @ plane.tangent
         A, b = jnp.concatenate([J, (plane.tangent / plane.scale)[None]]), jnp.append(left, across)
         step = jnp.where(i < turns, -least_change(A, b, plane.scale), 0)

@@ -9,7 +9,7 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from .._linear.newton import differentiable_root
-from .._linear.return_map import Frame, Given, Setting, forced_period, passage, scales_of
+from .._linear.return_map import OF_SLOPES, Frame, Given, Setting, forced_period, passage, scales_of
 from .._model.event import Every
 from .._model.system import System
 from .._motion.simulate import simulate
@@ -98,8 +98,12 @@ def corrected(family: Family, numbers: Numbers, plane: Plane, turns: Any) -> Nea
         left, time, frame = returned(family, numbers, z)
         return left, (jnp.append(WIDE * scales_of(frame)[of], numbers.width), time)
 
+    def cleaned(J, aside):
+        scale, _ = aside
+        return jnp.where(jnp.abs(J) * scale[None] / scale[:-1, None] > OF_SLOPES * numbers.given.tolerances[0], J, 0)
+
     small = CLOSE * numbers.given.tolerances[0]
-    near = in_plane(evaluated, plane, turns, small)
+    near = in_plane(evaluated, plane, turns, small, cleaned)
     scale, time = near.aside
     returns = jnp.max(jnp.abs(near.left) / scale[:-1], initial=0.0) <= small**0.5  # steps are short where an impact grazes, too
     return Near(near.z, near.J, scale, time, near.done & returns, near.turns)
@@ -166,8 +170,9 @@ def _measured(family, setting, given, start, period):
 
 
 def counts_of(motion: Any) -> tuple[Array, ...]:
-    """How often things happened in a motion: changes of friction, elements that stuck, impacts of each contact."""
+    """How often things happened in a motion: changes of friction, elements that stuck, impacts of each contact, events of each name."""
     of_friction: tuple[Array, ...] = ()
     if "transitions" in motion.stats:
         of_friction = motion.stats["transitions"][-1], jnp.sum(motion.stats["time_stuck"][-1] > 0)
-    return (*of_friction, *(jnp.sum(contact.impacts[-1]) for contact in motion.contacts.values()))
+    impacts = (jnp.sum(contact.impacts[-1]) for contact in motion.contacts.values())
+    return (*of_friction, *impacts, *(event.count[-1] for event in motion.events.values()))

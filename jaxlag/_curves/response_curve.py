@@ -30,13 +30,16 @@ from .orbits import ORDINARY, Family, Numbers, Told, with_value
 from .special_points import BRANCH, CORNER, Special, changes_of_orbits, with_special_points
 
 
+NEUTRAL = 1e-6  # of a multiplier of 1: errors of motions
+
+
 class SpecialPoint(eqx.Module):
     """Where a periodic motion changes its character: `kind`, the `value` of the parameter, the `orbit` there, and what was `measured`.
 
     Kinds: "fold", where the curve turns back; "flip", where a motion of twice the period branches off; "torus" (Neimark–Sacker), where a
     second frequency appears; "branch point", where another curve crosses; "grazing", where a contact begins to knock; "sticking", where
-    friction begins to stick or lets go; "reversal", where a sliding velocity reverses more often. `index`: its number
-    among the points of the curve.
+    friction begins to stick or lets go; "reversal", where a sliding velocity reverses more often; "event", where an event of the system
+    happens more often. `index`: its number among the points of the curve; `what`: the name of the contact or the event.
     """
 
     kind: str = eqx.field(static=True)
@@ -44,6 +47,7 @@ class SpecialPoint(eqx.Module):
     orbit: PeriodicOrbit
     measured: dict[str, Measured]
     index: int = eqx.field(static=True)
+    what: str = eqx.field(static=True, default="")
 
     @property
     def amplitude(self) -> dict[str, Any]:
@@ -56,7 +60,8 @@ class ResponseCurve(eqx.Module):
 
     - `over`, `values` (n): the parameter, and its value at each point.
     - `q`, `qdot`, `states`: at the section, structured as in the orbit, with the points as first axis; `period` (n); `drift` as q.
-    - `multipliers` (n, k): the Floquet multipliers; `is_stable` (n): whether all are less than 1 in absolute value.
+    - `multipliers` (n, k): the Floquet multipliers; `is_stable` (n): whether none is greater than 1 in absolute value,
+      beyond the errors of motions.
     - `measured`: by name the `highest` and the `lowest` value in a period (n), and `harmonics` (n, 9), c₀ the mean: f = Re Σ cₘ
       exp(2π i m t/T). `amplitude` and `phase` are made of them.
     - `special`: where motions change, as `SpecialPoint`s, in the order of the points.
@@ -87,8 +92,8 @@ class ResponseCurve(eqx.Module):
 
     @property
     def is_stable(self) -> Bool[Array, " n"]:
-        """Whether small deviations from each motion die out."""
-        return jnp.all(jnp.abs(self.multipliers) < 1, axis=1)
+        """Whether no small deviation from each motion grows."""
+        return jnp.all(jnp.abs(self.multipliers) <= 1 + NEUTRAL, axis=1)
 
     @property
     def amplitude(self) -> dict[str, Float[Array, " n"]]:
@@ -165,7 +170,7 @@ class ResponseCurve(eqx.Module):
             i = int(np.argmax(amplitude))
             rows.append(f"largest amplitude of {name}: {float(amplitude[i]):.6g} at {self.over} = {float(self.values[i]):.6g}")
         for point in self.special:
-            rows.append(f"{point.kind} at {self.over} = {float(point.value):.8g}")
+            rows.append(f"{point.kind}{f' ({point.what})' if point.what else ''} at {self.over} = {float(point.value):.8g}")
         return "\n".join([head, *(f"  {row}" for row in rows)])
 
 
@@ -290,18 +295,20 @@ def _special(curve: OrbitCurve, orbit: PeriodicOrbit, i: int, at: Special) -> Sp
     if at.kind in (BRANCH, CORNER):
         told = jax.tree.map(lambda x: without_derivative(x, curve.numbers.given.params), told)
     measured = dict(zip((m.name for m in curve.asked.measures), told.measured, strict=True))
-    kind = _corner(curve, *at.corners) if at.kind == CORNER else at.kind
+    kind, what = _corner(curve, *at.corners) if at.kind == CORNER else (at.kind, "")
     multipliers = without_derivative(_multipliers(at.at), curve.numbers.given.params)
-    return SpecialPoint(kind, told.z[-1], _with(orbit, curve, told, multipliers), measured, i)
+    return SpecialPoint(kind, told.z[-1], _with(orbit, curve, told, multipliers), measured, i, what)
 
 
-def _corner(curve: OrbitCurve, before: tuple, after: tuple) -> str:
-    """What changes at a corner."""
-    contacts = len(curve.family.system.unilateral)
-    of_friction, of_contacts = before[: len(before) - contacts], before[len(before) - contacts :]
-    if of_contacts != after[len(before) - contacts :]:
-        return "grazing"
-    return "sticking" if of_friction[1:] != after[1:2] else "reversal"
+def _corner(curve: OrbitCurve, before: tuple, after: tuple) -> tuple[str, str]:
+    """What changes at a corner: its kind, and the name of the contact or the event."""
+    system = curve.family.system
+    named = [*(("grazing", name) for name, _ in system.unilateral), *(("event", name) for name in dict(system.events))]
+    of_friction = len(before) - len(named)
+    for i, (kind, name) in enumerate(named, of_friction):
+        if before[i] != after[i]:
+            return kind, name
+    return ("sticking" if before[1] != after[1] else "reversal"), ""
 
 
 def _with(orbit: PeriodicOrbit, curve: OrbitCurve, told: Told, multipliers: Any = None) -> PeriodicOrbit:

@@ -11,7 +11,17 @@ from .._curves.equilibrium_curve import EquilibriumCurve
 from .._curves.response_curve import ResponseCurve
 from .axes import GREY, Units, canvas, channels, colour, label, units_of
 
-MARKERS = {"fold": "o", "flip": "s", "torus": "D", "branch point": "^", "grazing": "X", "sticking": "P", "reversal": ".", "flutter": "D"}
+MARKERS = {
+    "fold": "o",
+    "flip": "s",
+    "torus": "D",
+    "branch point": "^",
+    "grazing": "X",
+    "sticking": "P",
+    "reversal": ".",
+    "event": "*",
+    "flutter": "D",
+}
 
 
 def response_curve(curve: ResponseCurve, *, of: str | None = None, units: Units = None, ax: Any = None) -> Any:

@@ -331,6 +331,23 @@ def test_a_stop_that_is_only_just_met():
     np.testing.assert_allclose(by_gap, (at(1.001) - at(0.999)) / 0.002, rtol=1e-5)
 
 
+def test_an_event_that_begins_to_happen():
+    """Two stiffnesses: where a linear motion first reaches the second one, in closed form, named by the system's own event."""
+    gears = jl.System(
+        lambda q, qdot, s: 0.5 * qdot**2 - 0.5 * q**2,
+        dissipation=lambda qdot: 0.05 * qdot**2,
+        force=lambda t, w: 0.3 * jnp.cos(w * t),
+        events={"far": jl.Event(lambda q, s: q - s, direction=jl.direction.Rising())},
+    )
+    orbit = jl.periodic(gears, 0.4, 0.0, {"s": 1.0, "w": 0.5}, section=once)
+    curve = jl.response_curve(orbit, over="w", values=(0.3, 2.0))
+    reach = lambda w: 0.3 / abs(1 - w**2 + 0.1j * w) - 1
+    assert [(point.kind, point.what) for point in curve.special] == [("event", "far")] * 2
+    expected = [brentq(reach, 0.5, 1.0, xtol=1e-14), brentq(reach, 1.0, 1.5, xtol=1e-14)]
+    np.testing.assert_allclose([point.value for point in curve.special], expected, rtol=1e-8)
+    assert "event (far) at w" in repr(curve)
+
+
 swinging = jl.System(  # a pendulum whose support moves up and down
     lambda q, qdot: 0.5 * qdot**2,
     dissipation=lambda qdot, d: 0.5 * d * qdot**2,
