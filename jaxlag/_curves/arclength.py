@@ -39,13 +39,13 @@ class Point(NamedTuple):
 
     z: np.ndarray
     J: np.ndarray
-    tangent: np.ndarray
+    direction: np.ndarray
     scale: np.ndarray
     corners: tuple
 
     def ahead(self, step: float) -> np.ndarray:
         """The point a step along the tangent."""
-        return self.z + step * self.scale * self.tangent
+        return self.z + step * self.scale * self.direction
 
 
 Correct = Callable[..., Corrected]  # of z, the tangent and the scales of a plane through z; `turns=0` evaluates there
@@ -69,8 +69,8 @@ def followed(correct: Correct, start: Point, bounds: tuple[float, float], steps:
     points, step = [start], STEP
     while len(points) <= steps:
         here = points[-1]
-        found = correct(here.ahead(step), here.tangent, here.scale)
-        after = _point(found, here.tangent * here.scale) if found.found else None
+        found = correct(here.ahead(step), here.direction, here.scale)
+        after = _point(found, here.direction * here.scale) if found.found else None
         if after is None or _turned(here, after) < STRAIGHT or _beside(here, after, step) > ASIDE * step:
             if step > SHORTEST:
                 step /= 2
@@ -107,17 +107,17 @@ def corner(correct: Correct, here: Point, after: Point) -> Point:
     """The last point of the curve before its corners change, between two points of it; from the side where less happens: the curve is
     smoother there.
     """
-    near, way = (here, 1) if sum(here.corners) <= sum(after.corners) else (after._replace(tangent=-after.tangent), -1)
+    near, way = (here, 1) if sum(here.corners) <= sum(after.corners) else (after._replace(direction=-after.direction), -1)
     low, high, last = 0.0, 2 * float(np.linalg.norm((after.z - here.z) / near.scale)), None
     for _ in range(HALVINGS):
         middle = (low + high) / 2
-        found = correct(near.ahead(middle), near.tangent, near.scale)
+        found = correct(near.ahead(middle), near.direction, near.scale)
         if found.found and found.corners == near.corners:
             low, last = middle, found
         else:
             high = middle
-    at = near if last is None else _point(last, near.tangent * near.scale)
-    return at._replace(tangent=way * at.tangent)
+    at = near if last is None else _point(last, near.direction * near.scale)
+    return at._replace(direction=way * at.direction)
 
 
 def _point(found: Corrected, along: np.ndarray) -> Point:
@@ -127,8 +127,8 @@ def _point(found: Corrected, along: np.ndarray) -> Point:
 
 def _turned(here: Point, after: Point) -> float:
     """The cosine of the angle between two tangents."""
-    before = here.tangent * here.scale / after.scale
-    return float(before @ after.tangent / np.linalg.norm(before))
+    before = here.direction * here.scale / after.scale
+    return float(before @ after.direction / np.linalg.norm(before))
 
 
 def _beside(here: Point, after: Point, step: float) -> float:
@@ -138,11 +138,11 @@ def _beside(here: Point, after: Point, step: float) -> float:
 
 def _behind_corner(correct: Correct, points: list[Point]) -> Point | None:
     """The next point where the curve has a corner, along the tangent or along that which lies behind the corner, which may turn back."""
-    here, ways = points[-1], [points[-1].tangent]
+    here, ways = points[-1], [points[-1].direction]
     for little in AHEAD:
-        beyond = correct(here.ahead(little), here.tangent, here.scale, turns=0)
+        beyond = correct(here.ahead(little), here.direction, here.scale, turns=0)
         if np.all(np.isfinite(beyond.J)):
-            ways.append(tangent_of(beyond.J, here.scale, here.tangent))
+            ways.append(tangent_of(beyond.J, here.scale, here.direction))
     for step in BEYOND:
         for way in (sign * way for way in ways for sign in (1, -1)):
             found = correct(here.z + step * here.scale * way, way, here.scale)
@@ -176,15 +176,15 @@ def _at(correct: Correct, here: Point, after: Point, bound: float) -> Point | No
     along = np.zeros_like(z)
     along[-1] = np.sign(after.z[-1] - here.z[-1])
     found = correct(z, along, here.scale)
-    return _point(found, here.tangent * here.scale) if found.found else None
+    return _point(found, here.direction * here.scale) if found.found else None
 
 
 def _passes(here: Point, after: Point, start: Point) -> bool:
     """Whether the start lies between two points, and the curve goes the same way there."""
     off, length = (start.z - here.z) / here.scale, np.linalg.norm((after.z - here.z) / here.scale)
-    along = off @ here.tangent
-    beside = np.linalg.norm(off - along * here.tangent)
-    return bool(0 < along <= length and beside < 0.2 * length and here.tangent @ (start.tangent * start.scale / here.scale) > 0)
+    along = off @ here.direction
+    beside = np.linalg.norm(off - along * here.direction)
+    return bool(0 < along <= length and beside < 0.2 * length and here.direction @ (start.direction * start.scale / here.scale) > 0)
 
 
 def bounded(values: Any, label: str = "`values`") -> tuple[float, float]:

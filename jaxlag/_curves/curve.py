@@ -89,7 +89,7 @@ def beside(sides: list[Followed]) -> Runs:
 
 def backward(points: list[Point]) -> list[Point]:
     """The same points in the other order."""
-    return [point._replace(tangent=-point.tangent) for point in points[::-1]]
+    return [point._replace(direction=-point.direction) for point in points[::-1]]
 
 
 def place_of(params: PyTree, over: str) -> int:

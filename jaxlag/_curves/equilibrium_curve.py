@@ -214,7 +214,7 @@ class RestCurve(Curve):
 
     def told(self, point: Point | Corrected, kind: str = ORDINARY, borders: Any = (NOTHING, NOTHING)) -> Rested:
         """What is told of a point, differentiable as one of this kind."""
-        tangent = point.tangent if isinstance(point, Point) else along_parameter(point.z)
+        tangent = point.direction if isinstance(point, Point) else along_parameter(point.z)
         if is_concrete(self.numbers):
             kind, borders = ORDINARY, (NOTHING, NOTHING)
         return rest_told(self.system, self.place, kind, self.numbers, self.plane(point.z, tangent, point.scale, borders))

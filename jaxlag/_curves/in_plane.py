@@ -14,7 +14,7 @@ class Plane(NamedTuple):
     """A plane through z across a curve, in units of `scale`; for a special point the two vectors that border its critical matrix."""
 
     z: Float[Array, " u"]
-    tangent: Float[Array, " u"]
+    direction: Float[Array, " u"]
     scale: Float[Array, " u"]
     borders: tuple[Array, Array]
 
@@ -45,8 +45,8 @@ def in_plane(evaluated: Callable, plane: Plane, turns: Any, small: Any, cleaned:
         z, *_, i = carry
         J, (left, aside) = jax.jacfwd(both, has_aux=True)(z)
         J = cleaned(J, aside)
-        across = (z - plane.z) / plane.scale @ plane.tangent
-        A, b = jnp.concatenate([J, (plane.tangent / plane.scale)[None]]), jnp.append(left, across)
+        across = (z - plane.z) / plane.scale @ plane.direction
+        A, b = jnp.concatenate([J, (plane.direction / plane.scale)[None]]), jnp.append(left, across)
         step = jnp.where(i < turns, -least_change(A, b, plane.scale), 0)
         done = jnp.max(jnp.abs(step / plane.scale)) <= small
         return z + step, J, left, aside, done & (turns > 0) & jnp.all(jnp.isfinite(J)), i + 1

@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from .._model.event import Every
 from .._program.jit import is_concrete
 from .._program.jit import values as known_values
 from .arclength import Corrected, Followed, Point, started
@@ -15,6 +16,8 @@ from .in_plane import Plane
 from .measures import Measure
 from .orbits import ORDINARY, Family, Numbers, Telling, Told, corrected, told
 from .special_points import NOTHING
+
+BEYOND = 1e-3  # a step beyond the end of a curve
 
 
 class Asked(NamedTuple):
@@ -48,12 +51,20 @@ class OrbitCurve(Curve):
         near = jax.tree.map(np.asarray, corrected(self.family, numbers, plane, jnp.asarray(turns)))
         found, corners = bool(near.found), ()
         if found and counted:
-            counts = np.array(self.told(near.z, tangent, near.scale).counts, float)
-            found = bool(np.all(np.isfinite(counts)))
+            told = self.told(near.z, tangent, near.scale)
+            counts = np.array(told.counts, float)
+            found = bool(np.all(np.isfinite(counts)) and np.isfinite(told.period))
             corners = tuple(counts.astype(int).tolist()) if found else ()
         if found:
             self.usual = float(near.time)
         return Corrected(near.z, near.J, found, int(near.turns), near.scale, corners)
+
+    def why(self, point: Point, way: int) -> str:
+        """Why nothing is found beyond a point, along its direction or against it."""
+        if not isinstance(self.family.map.section, Every):
+            return "no periodic motion that passes through the section is near the last one"
+        ahead = self.near(point.ahead(way * BEYOND), point.direction, point.scale, 0, False)
+        return "no periodic motion is near the last one" if np.all(np.isfinite(ahead.J)) else "motions fail there"
 
     def told(self, z: np.ndarray, tangent: np.ndarray, scale: np.ndarray) -> Told:
         """What is told of the orbit at z, of known numbers."""
@@ -65,12 +76,12 @@ class OrbitCurve(Curve):
     def shown(self, point: Point, kind: str = ORDINARY, borders: tuple[np.ndarray, np.ndarray] = (NOTHING, NOTHING)) -> Told:
         """What is told of the orbit at a point, differentiable as one of this kind."""
         if is_concrete(self.numbers):
-            return self.told(point.z, point.tangent, point.scale)
+            return self.told(point.z, point.direction, point.scale)
         return self._told(self.numbers, point, kind, borders)
 
     def _told(self, numbers: Numbers, point: Point, kind: str, borders: Any) -> Told:
         telling = Telling(self.asked.measures, self.asked.samples, kind)
-        plane = self.plane(point.z, point.tangent, point.scale, borders)
+        plane = self.plane(point.z, point.direction, point.scale, borders)
         return told(self.family, telling, numbers._replace(usual=jnp.asarray(self.usual, self.dtype)), plane)
 
     def plane(self, z: Any, tangent: Any, scale: Any, borders: Any = (NOTHING, NOTHING)) -> Plane:

@@ -118,7 +118,7 @@ def told(family: Family, setting: Telling, numbers: Numbers, plane: Plane) -> To
         left = lambda z: returned(family, numbers, z)[0]
         z = plane.z + plane.scale * w
         if setting.kind == ORDINARY:
-            return jnp.append(left(z), plane.tangent @ w)
+            return jnp.append(left(z), plane.direction @ w)
         return jnp.append(left(z), critical(setting.kind, jax.jacfwd(left)(z)[:, :-1], *plane.borders))
 
     plane, usual = jax.lax.stop_gradient((plane, numbers.usual))

@@ -29,7 +29,6 @@ from .orbit_curve import Asked, OrbitCurve
 from .orbits import ORDINARY, Family, Numbers, Told, with_value
 from .special_points import BRANCH, CORNER, Special, changes_of_orbits, with_special_points
 
-
 NEUTRAL = 1e-6  # of a multiplier of 1: errors of motions
 
 
@@ -60,8 +59,8 @@ class ResponseCurve(eqx.Module):
 
     - `over`, `values` (n): the parameter, and its value at each point.
     - `q`, `qdot`, `states`: at the section, structured as in the orbit, with the points as first axis; `period` (n); `drift` as q.
-    - `multipliers` (n, k): the Floquet multipliers; `is_stable` (n): whether none is greater than 1 in absolute value,
-      beyond the errors of motions.
+    - `multipliers` (n, k): the Floquet multipliers; `is_stable` (n): whether none is greater than 1 in absolute value, beyond
+      the errors of motions.
     - `measured`: by name the `highest` and the `lowest` value in a period (n), and `harmonics` (n, 9), c₀ the mean: f = Re Σ cₘ
       exp(2π i m t/T). `amplitude` and `phase` are made of them.
     - `special`: where motions change, as `SpecialPoint`s, in the order of the points.
@@ -278,9 +277,9 @@ def _shown(curve: OrbitCurve, orbit: PeriodicOrbit, runs: list[list[Point]], end
     multipliers = without_derivative(jnp.stack([_multipliers(point) for point in points]), curve.numbers.given.params)
     state = whole.state
     shown = whole.z[:, -1], state["q"], state["qdot"], state["states"], whole.period, whole.drift, multipliers, measured
-    return ResponseCurve(
-        curve.asked.over, *shown, tuple(special), (ENDS[ends[0]], ENDS[ends[1]]), _with(orbit, curve, told[0]), curve.asked
-    )
+    said = lambda end, at, way: ENDS[end] + (f": {curve.why(at, way)}" if end == "lost" else "")
+    why = said(ends[0], points[0], -1), said(ends[1], points[-1], 1)
+    return ResponseCurve(curve.asked.over, *shown, tuple(special), why, _with(orbit, curve, told[0]), curve.asked)
 
 
 def _multipliers(point: Point) -> Array:

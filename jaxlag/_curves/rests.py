@@ -91,7 +91,7 @@ def rest_told(system: System, place: int, kind: str, numbers: RestNumbers, plane
         numbers, plane = args
         left = lambda z: _residual(system, place, numbers, z)
         z = plane.z + plane.scale * w
-        last = critical(FOLD, jax.jacfwd(left)(z)[:, :-1], *plane.borders) if kind == FOLD else plane.tangent @ w
+        last = critical(FOLD, jax.jacfwd(left)(z)[:, :-1], *plane.borders) if kind == FOLD else plane.direction @ w
         return jnp.append(left(z), last)
 
     plane = jax.lax.stop_gradient(plane)

@@ -58,7 +58,7 @@ def changes_of_orbits(correct: Correct, here: Point, after: Point) -> Iterator[S
 
 def folds_and_branches(correct: Correct, here: Point, after: Point) -> Iterator[Special]:
     """Where the curve turns back between two points, and where another one crosses it."""
-    tangents = here.tangent[-1], after.tangent[-1]
+    tangents = here.direction[-1], after.direction[-1]
     turns = tangents[0] * tangents[1] < 0 and min(map(abs, tangents)) > SURE
     for kind in (*([FOLD] if turns else []), BRANCH):
         found = _singular(correct, here, after, kind)
@@ -85,13 +85,13 @@ def located(correct: Correct, here: Point, after: Point, test: Callable[[Correct
         found = at(float(brentq(lambda part: test(at(part)), 0.0, 1.0, xtol=SHARP)))
     except (_NotFound, ValueError):
         return None
-    along = here.tangent * here.scale / found.scale
+    along = here.direction * here.scale / found.scale
     return Point(found.z, found.J, along / np.linalg.norm(along), found.scale, here.corners)
 
 
 def _singular(correct: Correct, here: Point, after: Point, kind: str) -> Point | None:
     """The point where the determinant of the critical matrix changes its sign; of a branch point, of the Jacobian with the tangent."""
-    tangents = (here.tangent[None], after.tangent[None])
+    tangents = (here.direction[None], after.direction[None])
 
     def matrix(J, tangent):
         return np.concatenate([J * here.scale, tangent]) if kind == BRANCH else critical_matrix(kind, J[:, :-1])

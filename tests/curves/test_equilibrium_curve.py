@@ -68,6 +68,11 @@ def test_a_branch_that_crosses():
         arched.branch(0)
 
 
+def test_a_branch_point_has_no_derivative_rather_than_a_wrong_one():
+    value = lambda g: jl.equilibrium_curve(bead, 0.0, {"W": 1.0, "g": g}, over="W", values=(0.5, 6.0)).special[0].value
+    assert np.isnan(jax.grad(value)(9.81))
+
+
 def test_pull_in():
     """A plate on a spring above another at voltage V: it is pulled in at a third of the gap, V² = 8 c d³/(27 ε A); in micrometres."""
     plate = jl.System(lambda q, qdot, m, c, eps, d, V: 0.5 * m * qdot**2 - 0.5 * c * q**2 + 0.5 * eps * V**2 / (d - q))
@@ -117,6 +122,7 @@ def test_flutter():
 
 def test_shown():
     import matplotlib as mpl
+    import matplotlib.pyplot
 
     mpl.use("Agg")
     bottom = jl.equilibrium_curve(bead, 0.0, {"W": 1.0, "g": 9.81}, over="W", values=(0.5, 6.0))
@@ -127,6 +133,7 @@ def test_shown():
     assert {text.get_text() for text in ax.get_legend().get_texts()} == {"branch point", "unstable"}
     with pytest.raises(ValueError, match="`of` must name"):
         bottom.plot(of="x")
+    mpl.pyplot.close(ax.figure)
 
 
 @pytest.mark.parametrize(

@@ -435,6 +435,18 @@ def test_limit_cycles_over_a_parameter():
     np.testing.assert_allclose(curve.period[-1], times[-1] - times[-2], rtol=1e-8)
 
 
+def test_a_section_that_is_no_longer_met():
+    """A limit cycle of amplitude 2√a, near a small one, meets q = 1 down to a = ¼ only; the curve says so and ends."""
+    cycles = jl.System(lambda q, qdot: 0.5 * qdot**2 - 0.5 * q**2, force=lambda q, qdot, a: 0.1 * (a - q**2) * qdot)
+    crosses = jl.Event(lambda q: q - 1.0, direction=jl.direction.Rising())
+    orbit = jl.periodic(cycles, 1.0, 1.0, {"a": 1.0}, section=crosses, longest=20.0)
+    curve = jl.response_curve(orbit, over="a", values=(0.05, 1.2))
+    said = "no periodic motion that passes through the section is near the last one"
+    assert curve.ends == (f"nothing was found beyond: {said}", "an end of `values` is reached")
+    assert abs(float(curve.values[0]) - 0.25) < 2e-3 and bool(jnp.all(jnp.isfinite(curve.amplitude["q"])))
+    np.testing.assert_allclose(curve.amplitude["q"], 2 * np.sqrt(curve.values), rtol=1e-3)
+
+
 def test_in_single_precision_and_late():
     """float32; and a drive that began long ago."""
     start = jl.periodic(duffing, 0.4, 0.0, PARAMS, section=once, t=1e6 * 4 * np.pi)
@@ -476,6 +488,7 @@ def test_what_is_hidden_is_refused(orbit):
 def test_shown(curve):
     """What is printed, and the picture: stable parts solid, the unstable one dashed, two folds."""
     import matplotlib as mpl
+    import matplotlib.pyplot
 
     mpl.use("Agg")
     text = repr(curve)
@@ -486,3 +499,4 @@ def test_shown(curve):
     assert {text.get_text() for text in ax.get_legend().get_texts()} == {"fold", "unstable"}
     with pytest.raises(ValueError, match="`of` must name"):
         curve.plot(of="x")
+    mpl.pyplot.close(ax.figure)
