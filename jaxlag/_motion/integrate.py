@@ -149,7 +149,9 @@ def _nearest(equations: EquationsOfMotion, flat: Flat, at: StatesAt, params, sea
 def with_status(ys, result, conditions, inputs) -> tuple[Array, RESULTS]:
     """States that were not reached as NaN; and the reason that the motion ended, the start or the input included."""
     finite = jnp.all(jnp.array([jnp.all(jnp.isfinite(x)) for x in jax.tree.leaves(inputs) if eqx.is_inexact_array(x)]))
-    ordered = jnp.all(jnp.diff(inputs[-1]) >= 0)  # the times; traced ones may repeat the first or the last, as padding does
+    between = jnp.diff(inputs[-1])  # of times; traced ones may repeat the first or the last, as padding does, others where served
+    served = jnp.all(jnp.isfinite(ys[: between.size + 1])) | (result != RESULTS.successful) | jnp.all(between != 0)
+    ordered = jnp.all(between >= 0) & served
     conditions = (*conditions, (ordered, RESULTS.unordered), (finite, RESULTS.not_finite))
     for passed, reason in conditions:
         result = RESULTS.where(passed, result, reason)

@@ -16,7 +16,7 @@ class RESULTS(dfx.RESULTS):  # pyright: ignore
     """Why a motion ended: the reasons of diffrax, and those of mechanics."""
 
     not_finite = "`q0`, `qdot0`, `ts` and `params` must be finite, but there is a NaN or an infinity among them. Look for missing values."
-    unordered = "`ts` must increase, but a time is smaller than the one before it. Sort the times, and what was measured along with them."
+    unordered = "`ts` must increase, but a time is smaller than the one before it, or the same. Sort the times and what was measured."
     no_period = "`every` must be positive, but the period of a sampled state is not. Look at what it is computed from."
     no_inertia = Failure.no_inertia.value
     impossible_start = Failure.impossible_start.value

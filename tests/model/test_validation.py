@@ -358,3 +358,13 @@ def test_bad_fits(case):
     record = jl.Experiment(TS, experiment["values"], 1.0, 0.0, observe=experiment["observe"])
     with pytest.raises((ValueError, TypeError), match=sentence):
         jl.fit(jl.System(energy), record, {"c": 4.0}, **how)
+
+
+def test_traced_times_that_repeat_are_served_or_a_result():
+    """The same time twice, in the middle: the same state twice, or a reason; never NaN that counts as success."""
+    bouncing = jl.System(energy, unilateral={"stop": jl.Contact(lambda q: 1.5 - q)})
+    for system in (jl.System(energy), bouncing):
+        motion = jax.jit(lambda ts, system=system: jl.simulate(system, 1.0, 0.0, ts, {"c": 4.0}))(jnp.array([0.0, 0.5, 0.5, 1.0]))
+        assert motion.succeeded == np.all(np.isfinite(motion.q)) and motion.succeeded | (motion.result == jl.results.RESULTS.unordered)
+        if motion.succeeded:
+            np.testing.assert_allclose(motion.q, np.cos([0, 1, 1, 2]), atol=1e-8)
