@@ -42,12 +42,13 @@ class OrbitCurve(Curve):
                 "`params` must be known to follow a curve, but are hidden by `jit` or one set of many under `vmap`. "
                 "Call `response_curve` from Python, for one set after the other."
             )
-        self.known, self.usual, self.dtype = known, float(known.usual), known.given.t.dtype
+        self.known, self.dtype = known, known.given.t.dtype
+        self.times: list[tuple[np.ndarray, float]] = []  # points that were found, and the times of their orbits
         self.kept: dict[bytes, Told] = {}
 
     def near(self, z: np.ndarray, tangent: np.ndarray, scale: np.ndarray, turns: int, counted: bool) -> Corrected:
         """What Newton's method finds in a plane through z, with what is counted along the orbit."""
-        numbers, plane = self.known._replace(usual=jnp.asarray(self.usual, self.dtype)), self.plane(z, tangent, scale)
+        numbers, plane = self.timed(self.known, z, scale), self.plane(z, tangent, scale)
         near = jax.tree.map(np.asarray, corrected(self.family, numbers, plane, jnp.asarray(turns)))
         found, corners = bool(near.found), ()
         if found and counted:
@@ -56,7 +57,7 @@ class OrbitCurve(Curve):
             found = bool(np.all(np.isfinite(counts)) and np.isfinite(told.period))
             corners = tuple(counts.astype(int).tolist()) if found else ()
         if found:
-            self.usual = float(near.time)
+            self.times.append((near.z, float(near.time)))
         return Corrected(near.z, near.J, found, int(near.turns), near.scale, corners)
 
     def why(self, point: Point, way: int) -> str:
@@ -82,7 +83,14 @@ class OrbitCurve(Curve):
     def _told(self, numbers: Numbers, point: Point, kind: str, borders: Any) -> Told:
         telling = Telling(self.asked.measures, self.asked.samples, kind)
         plane = self.plane(point.z, point.direction, point.scale, borders)
-        return told(self.family, telling, numbers._replace(usual=jnp.asarray(self.usual, self.dtype)), plane)
+        return told(self.family, telling, self.timed(numbers, point.z, point.scale), plane)
+
+    def timed(self, numbers: Numbers, z: np.ndarray, scale: np.ndarray) -> Numbers:
+        """The numbers of a curve, with the time of the orbit that is nearest to z of those found."""
+        if not self.times:
+            return numbers
+        _, time = min(self.times, key=lambda known: float(np.max(np.abs(known[0] - z) / scale)))
+        return numbers._replace(usual=jnp.asarray(time, self.dtype))
 
     def plane(self, z: Any, tangent: Any, scale: Any, borders: Any = (NOTHING, NOTHING)) -> Plane:
         """A plane of numbers of the kind that motions are computed in."""

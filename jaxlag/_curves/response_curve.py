@@ -122,12 +122,13 @@ class ResponseCurve(eqx.Module):
         **Raises:** `ValueError` if one that the curve passes is not found.
         """
         curve, values = _curve(self.orbit(0), self._first.params, self._asked), np.asarray(jax.lax.stop_gradient(self.values))
-        passes = np.flatnonzero((values[:-1] <= value) & (value < values[1:]) | (values[:-1] >= value) & (value > values[1:]))
+        ends = values[1:].copy()
+        ends[-1] += (values[-1] == value) * (values[-1] - values[-2])  # the last point is part of the curve, too
+        passes = np.flatnonzero((values[:-1] <= value) & (value < ends) | (values[:-1] >= value) & (value > ends))
         found = []
         for i in passes:
             here, after = (_flat(self.orbit(k), curve.family) for k in (int(i), int(i) + 1))
-            z = here + (value - values[i]) / (values[i + 1] - values[i]) * (after - here)
-            point = curve.at_parameter(z)
+            point = curve.at_parameter(here + (value - values[i]) / (values[i + 1] - values[i]) * (after - here))
             if point is None:
                 raise ValueError(f"`value` must be one at which the curve has a motion, but at {value:g} none was found near point {i}.")
             found.append(_with(self._first, curve, curve.shown(point), _multipliers(point)))

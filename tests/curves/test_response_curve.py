@@ -105,7 +105,7 @@ def test_motions_at_a_value(curve):
     for one in found:
         np.testing.assert_allclose(one.motion(3).q[-1], one.q, atol=1e-8)
         assert float(one.params["w"]) == 1.6
-    assert len(curve.at(0.5)) == 1 and curve.at(3.0) == ()
+    assert [len(curve.at(w)) for w in (0.3, 0.5, 2.5, 3.0)] == [1, 1, 1, 0]
     i = 100
     at = curve.orbit(i)
     np.testing.assert_allclose([at.q, at.period], [curve.q[i], 2 * np.pi / curve.values[i]])
@@ -500,3 +500,31 @@ def test_shown(curve):
     with pytest.raises(ValueError, match="`of` must name"):
         curve.plot(of="x")
     mpl.pyplot.close(ax.figure)
+
+
+@pytest.mark.slow
+def test_a_motor_that_cannot_pass_its_resonance():
+    """Sommerfeld's effect: an unbalanced rotor on a spring over the torque of its motor, its angle running on. In each turn the torque does
+    the work that is dissipated; near the resonance the speed hardly rises, up to a fold.
+    """
+
+    def lagrangian(q, qdot, M, m, e, J, k):
+        moving = 0.5 * M * qdot["x"] ** 2 + 0.5 * J * qdot["phi"] ** 2
+        return moving + m * (0.5 * qdot["x"] ** 2 - e * jnp.sin(q["phi"]) * qdot["x"] * qdot["phi"]) - 0.5 * k * q["x"] ** 2
+
+    rotor = jl.System(
+        lagrangian,
+        dissipation=lambda qdot, b, c: 0.5 * b * qdot["x"] ** 2 + 0.5 * c * qdot["phi"] ** 2,
+        force=lambda T: {"phi": T, "x": 0.0},
+    )
+    params = {"M": 10.0, "m": 1.0, "e": 0.02, "J": 0.01, "k": 4000.0, "b": 20.0, "c": 0.01, "T": 0.1}
+    once_around = jl.Event(lambda q: jnp.sin(q["phi"]), direction=jl.direction.Rising())
+    start = {"x": 0.0, "phi": 0.0}, {"x": 0.0, "phi": 10.0}
+    orbit = jl.periodic(rotor, *start, params, section=once_around, longest=3.0, cyclic="phi")
+    of = {"x": lambda q: q["x"], "loss": lambda qdot, b, c: b * qdot["x"] ** 2 + c * qdot["phi"] ** 2}
+    curve = jl.response_curve(orbit, over="T", values=(0.05, 0.5), of=of)
+    assert [point.kind for point in curve.special] == ["fold", "fold"]
+    np.testing.assert_allclose(curve.drift["phi"], 2 * np.pi, rtol=1e-8)
+    lost = np.asarray(curve.measured["loss"].harmonics[:, 0].real * curve.period)
+    np.testing.assert_allclose(lost, 2 * np.pi * np.asarray(curve.values), rtol=1e-7)
+    assert bool(jnp.all(jnp.diff(curve.period) < 0))  # the speed rises along the curve, though the torque does not
