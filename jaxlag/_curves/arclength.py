@@ -14,6 +14,7 @@ STEP, LONGEST, SHORTEST = 0.02, 0.04, 1e-5  # of a step: the first, bounds; in t
 FEW, MANY = 3, 5  # turns of Newton's method after which the next step is longer or shorter
 STRAIGHT = np.cos(np.radians(20))  # between the tangents at the ends of a step
 ASIDE = 0.3  # of a step, by which its end may lie beside the tangent
+ACROSS = 1e-6  # of its length: what is left of a vector across all tangents
 LAST = 40  # points, on whose way a curve must not come back
 UNIQUE = 1e-8  # of the largest singular value of a Jacobian, below which another is zero
 BEYOND = tuple(SHORTEST * 4.0**i for i in range(7))  # steps that are tried across a corner
@@ -100,7 +101,9 @@ def tangent_of(J: np.ndarray, scale: np.ndarray, along: np.ndarray) -> np.ndarra
     _, sizes, v = np.linalg.svd(J / np.where(rows > 0, rows, 1))
     free = v[np.concatenate([sizes, np.zeros(len(v) - len(sizes))]) <= UNIQUE * max(sizes[0], 1e-300)] if sizes.size else v
     t = free.T @ (free @ along)
-    return t / max(np.linalg.norm(t), 1e-300)
+    if np.linalg.norm(t) <= ACROSS * np.linalg.norm(along):  # the curve begins where it turns: either way is one
+        t = free[-1] * (np.sign(along[-1]) or 1.0)
+    return t / np.linalg.norm(t)
 
 
 def corner(correct: Correct, here: Point, after: Point) -> Point:

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from .._fit.experiment import Experiment
+from .._fit.response_curve_test import ResponseCurveTest
 from .._fit.result import Fit
 from .._fit.rounding import plus_minus
 from .axes import GREY, Units, canvas, channels, chosen, colour, label, legend_above, legend_beside, panels, units_of
@@ -23,9 +24,9 @@ def fit(fit: Fit, *, number: int = 0, level: float = 0.95, units: Units = None, 
        \qquad |r_i| < 2\sigma $$
 
     The band of the fit shows the uncertainty of the motion that follows from its parameters and initial states; it is often thinner than
-    the line. Times of events are drawn over those that are fitted. The band of the residuals is ±2σ, with the sigma of the experiment if
-    one was given, otherwise the estimated one. If the residuals are noise, 95 % of them lie in it, without any pattern; a pattern points
-    to something that the model lacks.
+    the line. Times of events are drawn over those that are fitted, a `ResponseCurveTest` over its parameter. The band of the residuals is
+    ±2σ, with the sigma of the experiment if one was given, otherwise the estimated one. If the residuals are noise, 95 % of them lie in it,
+    without any pattern; a pattern points to something that the model lacks.
 
     **Arguments:**
 
@@ -38,8 +39,8 @@ def fit(fit: Fit, *, number: int = 0, level: float = 0.95, units: Units = None, 
 
     **Returns:** the axes, an array of shape (2, channels).
 
-    **Raises:** `ValueError` if `axes` do not match the channels or the experiment is no recording in time, `IndexError` if there is no such
-    experiment; `ImportError` without matplotlib.
+    **Raises:** `ValueError` if `axes` do not match the channels or the experiment is no recording and no sweep, `IndexError` if there is
+    no such experiment; `ImportError` without matplotlib.
 
     **Source:** Ljung, System Identification, 2nd ed., section 16.6 (residual analysis); Seber & Wild, Nonlinear Regression (1989),
     section 5.1 (the band).
@@ -55,11 +56,13 @@ def fit(fit: Fit, *, number: int = 0, level: float = 0.95, units: Units = None, 
     ```
     """
     experiment, units = fit.experiments[number], units_of(fit.units, units)
-    if not isinstance(experiment, Experiment):
+    if not isinstance(experiment, (Experiment, ResponseCurveTest)):
         what = type(experiment).__name__
         raise ValueError(
-            f"`number` must be that of a recording in time, but number {number} is a {what}. Draw its `fit.residuals[{number}]`."
+            f"`number` must be that of a recording or of a sweep, but number {number} is a {what}. Draw its `fit.residuals[{number}]`."
         )
+    is_sweep = isinstance(experiment, ResponseCurveTest)
+    along, events = ("t", experiment.events) if not is_sweep else (experiment.over, ())
     sigma = experiment.sigma
     if sigma is None:
         sigma = jax.tree.map(lambda own, value: np.broadcast_to(own, value.shape), fit.sigmas[number], experiment.values)
@@ -72,7 +75,7 @@ def fit(fit: Fit, *, number: int = 0, level: float = 0.95, units: Units = None, 
         several = len(entries) > 1
         for i, (entry, z) in enumerate(entries.items()):
             model, noise = fitted[name][entry], 2 * sigma[name][entry]
-            ts = model if name in experiment.events else np.asarray(experiment.ts)
+            ts = model if name in events else np.asarray(experiment.at if is_sweep else experiment.ts)
             upper.plot(ts, z, ".", color=GREY, markersize=3, label=None if i else "measured")
             upper.plot(ts, model, color=colour(i), label=f"{entry} fitted" if several else "fitted")
             reach = upmost[name][entry] - model
@@ -87,7 +90,7 @@ def fit(fit: Fit, *, number: int = 0, level: float = 0.95, units: Units = None, 
         elif upper is drawn[0, 0]:
             legend_above(upper)
         lower.set_ylabel("residual, ±2σ" + label(name, units).removeprefix(name))
-        lower.set_xlabel(label("t", units))
+        lower.set_xlabel(label(along, units))
     return drawn
 
 

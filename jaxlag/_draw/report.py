@@ -12,10 +12,12 @@ from typing import Any
 
 import jax
 import numpy as np
+from jaxtyping import PyTree
 
 from .._fit.autocorrelation import spectrum
 from .._fit.experiment import Experiment
 from .._fit.fit_card import channel_rows
+from .._fit.response_curve_test import ResponseCurveTest
 from .._fit.result import Fit
 from .._fit.rounding import plus_minus, rounded
 from .._motion.export import jsonable
@@ -125,9 +127,11 @@ def _table(columns: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
 def _model(fit: Fit) -> str:
     """The terms of the system, and its equations of motion."""
     system, params = fit.problem.model.system, fit.params
-    q = next((e.q0 if isinstance(e, Experiment) else e.q for e in fit.experiments), None)
+    q = next((q for q in map(_coordinates, fit.experiments) if q is not None), None)
     named = ", ".join(html.escape(name) for name in system.terms if name != "time")
     terms = f"<p>Dissipation, forces and constraints: {named}.</p>" if named else ""
+    if q is None:
+        return terms
     if sum(np.size(leaf) for leaf in jax.tree.leaves(q)) > MOST_COORDINATES:
         return f"{terms}<p>The equations of so many coordinates are not printed.</p>"
     try:
@@ -136,12 +140,19 @@ def _model(fit: Fit) -> str:
         return f"{terms}<p>The equations are not printed: {html.escape(str(reason))}</p>"
 
 
+def _coordinates(experiment: Any) -> PyTree:
+    """Coordinates as an experiment or a test has them; None of a measurement."""
+    if isinstance(experiment, Experiment):
+        return experiment.q0
+    return experiment.start["q"] if isinstance(experiment, ResponseCurveTest) else getattr(experiment, "q", None)
+
+
 def _recordings(fit: Fit, level: float) -> Iterator[tuple[int, str]]:
-    """Pictures of each recording in time: measured, fitted, residuals and their spectrum."""
-    recorded = [(k, e) for k, e in enumerate(fit.experiments) if isinstance(e, Experiment)]
+    """Pictures of each recording in time and of each sweep: measured, fitted, residuals, of recordings their spectrum."""
+    recorded = [(k, e) for k, e in enumerate(fit.experiments) if isinstance(e, (Experiment, ResponseCurveTest))]
     for k, e in recorded[:MOST_DRAWN]:
         motion = _picture(fitted(fit, number=k, level=level), f"Recording {k}: measured and fitted, and the residuals")
-        has_samples = len(channels(fit.residuals[k], "z")) > len(e.events)
+        has_samples = isinstance(e, Experiment) and len(channels(fit.residuals[k], "z")) > len(e.events)
         yield k, motion + (_picture(_spectra(fit, k), f"Recording {k}: spectrum of the residuals") if has_samples else "")
     if len(recorded) > MOST_DRAWN:
         yield len(recorded), f"<p>{len(recorded) - MOST_DRAWN} more recordings are not drawn.</p>"

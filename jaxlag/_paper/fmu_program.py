@@ -137,10 +137,7 @@ FORMULAS: dict[str, Callable[..., str]] = {
     **{name: _between(sign) for name, sign in dict(add="+", add_any="+", sub="-", mul="*", div="/").items()},
     **{name: _between(sign) for name, sign in dict(eq="==", ne="!=", lt="<", le="<=", gt=">", ge=">=").items()},
     **{name: _between(sign) for name, sign in {"and": "&&", "or": "||", "xor": "!="}.items()},
-    **{
-        name: _call(name)
-        for name in re.findall(r"\w+", "sqrt cbrt exp exp2 expm1 log log1p sin cos tan asin acos atan atan2 sinh cosh tanh")
-    },
+    **{name: _call(name) for name in re.findall(r"\w+", "sqrt cbrt exp exp2 expm1 log log1p sin cos tan asin acos atan atan2")},
     **{name: _call(name) for name in re.findall(r"\w+", "sinh cosh tanh asinh acosh atanh pow erf erfc lgamma floor ceil")},
     **dict(abs=_call("fabs"), max=_call("fmax"), min=_call("fmin"), rem=_call("fmod"), round=_call("rint"), is_finite=_call("isfinite")),
     "not": lambda x: f"!{x}",

@@ -370,12 +370,12 @@ def test_pendulum_with_a_moving_support():
     fine = jl.response_curve(rest, over="a", values=(3.9, 4.1))
     assert [point.kind for point in fine.special] == ["branch point", "branch point"]
     np.testing.assert_allclose([point.value for point in fine.special], [mathieu_b(2, h), mathieu_a(2, h)], rtol=1e-8)
-    swings = curve.branch(0, values=(-1.0, 3.0), steps=30)
+    swings = curve.branch(0, values=(-1.0, 3.0), steps=60)
     assert swings.ends[0] == "it branches off there" and float(swings.amplitude["q"][-1]) > 0.3
     motion = swings.orbit(20).motion(3)
     np.testing.assert_allclose(motion.q, [motion.q[0], -motion.q[0], motion.q[0]], atol=1e-8)
-    crossing = fine.branch(1, values=(3.5, 5.0), steps=25)
-    assert len(crossing) > 25 and float(crossing.amplitude["q"].max()) > 0.05
+    crossing = fine.branch(1, values=(3.5, 5.0), steps=40)
+    assert len(crossing) > 40 and float(crossing.amplitude["q"].max()) > 0.05
     motion = crossing.orbit(0).motion(3)
     np.testing.assert_allclose(motion.q[-1], motion.q[0], atol=1e-8)
 

@@ -457,7 +457,7 @@ def test_what_cannot_be_fitted_is_refused(call, said):
 @pytest.mark.slow
 def test_a_picture_is_of_recordings_alone():
     fit = jl.fit(SPRING, ONE, HARDENING, free=("c",))
-    with pytest.raises(ValueError, match="`number` must be that of a recording in time, but number 0 is a ModalTest"):
+    with pytest.raises(ValueError, match="`number` must be that of a recording or of a sweep, but number 0 is a ModalTest"):
         jl.plot.fit(fit)
     assert "residual sigma" in str(fit) and "nan %" not in str(fit)
     assert fit.to_dict()["channels"][0]["name"] == "frequency"

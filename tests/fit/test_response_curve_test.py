@@ -115,3 +115,25 @@ def test_a_parameter_that_is_not_there():
     with pytest.raises(ValueError, match="`over` must name one number"):
         jl.fit(oscillator, test, {"m": 1.0, "c": 3.0, "b": 0.5, "w": 1.0, "P": 1.0}, free=("c",))
     assert jax.tree.leaves(test.values)
+
+
+def test_pictures_and_report(tmp_path):
+    """Measured and fitted over the parameter of the sweep, and the page for a colleague; of a measurement alone, too."""
+    import matplotlib as mpl
+    import matplotlib.pyplot as plt
+
+    mpl.use("Agg")
+    w = np.array([0.5, 1.0, 1.8, 2.2, 3.0])
+    amplitude = np.abs(1 / (4.0 - w**2 + 0.3j * w))
+    test = jl.ResponseCurveTest(w, amplitude, 0.0, 0.0, over="w", period=period, sigma=1e-3)
+    start = {"m": 1.0, "c": 3.0, "b": 0.5, "w": 1.0, "P": 1.0}
+    found = jl.fit(oscillator, test, start, free=("c", "b"))
+    axes = found.plot()
+    assert axes.shape == (2, 1) and axes[1, 0].get_xlabel() == "w" and axes[0, 0].get_ylabel() == "amplitude"
+    np.testing.assert_allclose(axes[0, 0].get_lines()[1].get_data(), [w, amplitude], rtol=1e-5)
+    plt.close(axes[0, 0].figure)
+    found.report(tmp_path / "sweep.html")
+    assert "measured and fitted" in (tmp_path / "sweep.html").read_text()
+    weighed = jl.fit(oscillator, jl.Measurement([2.0], lambda m: m, sigma=0.1), start, free=("m",))
+    weighed.report(tmp_path / "weight.html")
+    assert (tmp_path / "weight.html").stat().st_size > 1000
