@@ -323,6 +323,7 @@ NOTEBOOK_SYSTEMS = {  # by notebook and name: its coordinates
     "17_gyroscope.wheel": {"x", "y", "z", "psi", "theta", "phi"},
     "23_bearing.rotor": None,
     "23_bearing.pendulum": None,
+    "25_hammering_gap.gears": None,
 }
 RECORDED = {  # driven by a signal without a formula, or by an input that is searched for
     "11_driven_pendulum.pendulum",
