@@ -528,3 +528,45 @@ def test_a_motor_that_cannot_pass_its_resonance():
     lost = np.asarray(curve.measured["loss"].harmonics[:, 0].real * curve.period)
     np.testing.assert_allclose(lost, 2 * np.pi * np.asarray(curve.values), rtol=1e-7)
     assert bool(jnp.all(jnp.diff(curve.period) < 0))  # the speed rises along the curve, though the torque does not
+
+
+@pytest.mark.slow
+def test_random_pairs_of_oscillators():
+    """Ten pairs with random masses, springs, cubic springs and dampers, in random units: at random points of each curve SciPy's motion
+    returns, and its variation over a period has these multipliers.
+    """
+    pair = jl.System(
+        lambda q, qdot, m, k, c: 0.5 * m @ qdot**2 - 0.5 * (k[0] * q[0] ** 2 + k[1] * (q[1] - q[0]) ** 2) - 0.25 * c * q[0] ** 4,
+        dissipation=lambda qdot, b: 0.5 * (b[0] * qdot[0] ** 2 + b[1] * (qdot[1] - qdot[0]) ** 2),
+        force=lambda t, F, w: jnp.array([0.0, 1.0]) * F * jnp.cos(w * t),
+    )
+    random = np.random.default_rng(11)
+    for _ in range(10):
+        length, time, mass = 10.0 ** random.uniform(-4, 4, 3)
+        force = mass * length / time**2
+        m, k = random.uniform(0.5, 2.0, 2), random.uniform(0.5, 3.0, 2)
+        b, c, F = random.uniform(0.05, 0.2, 2), random.uniform(0.1, 1.0), random.uniform(0.1, 0.4)
+        params = {"m": mass * m, "k": force / length * k, "c": force / length**3 * c, "b": force * time / length * b, "F": force * F}
+        low, high = 0.3 / time, 2.5 / time
+        start = jl.periodic(pair, jnp.zeros(2), jnp.zeros(2), params | {"w": low}, section=once)
+        curve = jl.response_curve(start, over="w", values=(low, high), steps=1500)
+        assert curve.values[0] == low and curve.values[-1] == high, curve.ends
+        for i in random.choice(len(curve), 3, replace=False):
+            w = float(curve.values[i]) * time
+            K = np.array([[k[0] + k[1], -k[1]], [-k[1], k[1]]])
+            B = np.array([[b[0] + b[1], -b[1]], [-b[1], b[1]]])
+
+            def rates(t, y, m=m, c=c, F=F, w=w, K=K, B=B):
+                Y = y.reshape(4, 5)
+                bend = np.diag([3 * c * Y[0, 0] ** 2, 0.0])
+                own = np.array([0.0, F * np.cos(w * t)]) - K @ Y[:2, 0] - B @ Y[2:, 0] - np.array([c * Y[0, 0] ** 3, 0.0])
+                moved = -(K + bend) @ Y[:2, 1:] - B @ Y[2:, 1:]
+                return np.concatenate([Y[2:], np.concatenate([own[:, None], moved], 1) / m[:, None]]).ravel()
+
+            x = np.concatenate([np.asarray(curve.q[i]) / length, np.asarray(curve.qdot[i]) * time / length])
+            whole = np.concatenate([x[:, None], np.eye(4)], 1).ravel()
+            found = solve_ivp(rates, (0, 2 * np.pi / w), whole, "DOP853", rtol=1e-11, atol=1e-12).y[:, -1].reshape(4, 5)
+            np.testing.assert_allclose(found[:, 0], x, atol=1e-7 * np.abs(x).max())
+            expected = np.linalg.eigvals(found[:, 1:])
+            got = np.asarray(curve.multipliers[i])
+            np.testing.assert_allclose(np.sort(np.abs(got)), np.sort(np.abs(expected)), rtol=1e-5, atol=1e-7)
