@@ -217,9 +217,9 @@ WINGS = {  # each imports only from those above it, and each file of a wing only
     ],
     "_curves": [
         "arclength",
-        "curve",
         "critical",
         "in_plane",
+        "curve",
         "measures",
         "orbits",
         "special_points",

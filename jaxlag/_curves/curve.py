@@ -4,12 +4,16 @@ import abc
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import PyTree
 
 from .._model.paths import leaf_names
+from .._program.jit import values as known_values
 from .arclength import Corrected, Followed, Point, followed, started
+from .in_plane import Plane
 
+NOTHING = np.zeros(0)
 TURNS = 8  # of Newton's method, after which a step is shortened
 LEAVES = (1e-3, 1e-2, 5e-2)  # steps from a special point onto the curve that crosses there
 LEAST = 0.1  # of the largest scale of an entry along a curve: its least
@@ -26,8 +30,8 @@ Runs = tuple[list[list[Point]], tuple[str, str]]  # points, one after the other 
 class Curve(abc.ABC):
     """A curve that `arclength` can follow."""
 
-    def __init__(self, bounds: tuple[float, float], steps: int):
-        self.bounds, self.steps = bounds, steps
+    def __init__(self, bounds: tuple[float, float], steps: int, dtype: Any):
+        self.bounds, self.steps, self.dtype = bounds, steps, dtype
         self.largest: Any = 0.0
 
     @abc.abstractmethod
@@ -41,6 +45,10 @@ class Curve(abc.ABC):
             return near
         self.largest = np.maximum(self.largest, near.scale)
         return near._replace(scale=np.maximum(near.scale, LEAST * self.largest))
+
+    def plane(self, z: Any, direction: Any, scale: Any, borders: Any = (NOTHING, NOTHING)) -> Plane:
+        """A plane of numbers of the kind that is computed with."""
+        return jax.tree.map(lambda x: jnp.asarray(x, self.dtype), Plane(z, direction, scale, borders))
 
     def scale_at(self, z: np.ndarray) -> np.ndarray:
         """The scales at z."""
@@ -90,6 +98,17 @@ def beside(sides: list[Followed]) -> Runs:
 def backward(points: list[Point]) -> list[Point]:
     """The same points in the other order."""
     return [point._replace(direction=-point.direction) for point in points[::-1]]
+
+
+def known_of(numbers: Any, function: str) -> Any:
+    """The numbers as Python may look at them, of what is differentiated the values."""
+    known = known_values(numbers)
+    if known is None:
+        raise ValueError(
+            "`params` must be known to follow a curve, but are hidden by `jit` or one set of many under `vmap`. "
+            f"Call `{function}` from Python, for one set after the other."
+        )
+    return known
 
 
 def place_of(params: PyTree, over: str) -> int:

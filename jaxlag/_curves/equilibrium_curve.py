@@ -21,11 +21,10 @@ from .._program.jit import is_concrete
 from .._program.jit import values as known_values
 from .arclength import Correct, Corrected, Point, bounded
 from .critical import FOLD, crossing
-from .curve import ENDS, Curve, along_parameter, beside, joined, place_of, refuse_outside
-from .in_plane import Plane
+from .curve import ENDS, NOTHING, Curve, along_parameter, beside, joined, known_of, place_of, refuse_outside
 from .orbits import ORDINARY, with_value
 from .rests import Rested, RestNumbers, rest_near, rest_start, rest_told
-from .special_points import BRANCH, NOTHING, Special, folds_and_branches, located, with_special_points
+from .special_points import BRANCH, Special, folds_and_branches, located, with_special_points
 
 FLUTTER = "flutter"
 GROWS = 1e-9  # of the largest eigenvalue: a real part beyond rounding
@@ -189,16 +188,10 @@ class RestCurve(Curve):
     """Points of a curve of equilibria."""
 
     def __init__(self, system: System, asked: Asked, numbers: RestNumbers):
-        super().__init__(asked.bounds, asked.steps)
+        super().__init__(asked.bounds, asked.steps, jax.tree.leaves(numbers.q)[0].dtype)
         self.system, self.asked, self.numbers = system, asked, numbers
-        known = known_values(numbers)
-        if known is None:
-            raise ValueError(
-                "`params` must be known to follow a curve, but are hidden by `jit` or one set of many under `vmap`. "
-                "Call `equilibrium_curve` from Python, for one set after the other."
-            )
+        known = known_of(numbers, "equilibrium_curve")
         self.place, self.known = place_of(numbers.params, asked.over), known
-        self.dtype = jax.tree.leaves(numbers.q)[0].dtype
         near = linearise(system, self.known.q, params=self.known.params, t=self.known.t, states=self.known.states)
         self.choice = Choice((), None, near.coordinates.partition, 0)
 
@@ -207,10 +200,6 @@ class RestCurve(Curve):
         found = rest_near(self.system, self.place, self.known, self.plane(z, tangent, scale), jnp.asarray(turns))
         near = jax.tree.map(np.asarray, found)
         return Corrected(near.z, near.J, bool(near.done), int(near.turns), near.aside, ())
-
-    def plane(self, z: Any, tangent: Any, scale: Any, borders: Any = (NOTHING, NOTHING)) -> Plane:
-        """A plane of numbers of the kind of the coordinates."""
-        return jax.tree.map(lambda x: jnp.asarray(x, self.dtype), Plane(z, tangent, scale, borders))
 
     def told(self, point: Point | Corrected, kind: str = ORDINARY, borders: Any = (NOTHING, NOTHING)) -> Rested:
         """What is told of a point, differentiable as one of this kind."""

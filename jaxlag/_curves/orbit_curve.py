@@ -8,14 +8,11 @@ import numpy as np
 
 from .._model.event import Every
 from .._program.jit import is_concrete
-from .._program.jit import values as known_values
 from .arclength import Corrected, Followed, Point, started
 from .critical import FLIP, FOLD, borders_of, critical_matrix, crossing
-from .curve import Curve, along_parameter
-from .in_plane import Plane
+from .curve import NOTHING, Curve, along_parameter, known_of
 from .measures import Measure
 from .orbits import ORDINARY, Family, Numbers, Telling, Told, corrected, told
-from .special_points import NOTHING
 
 BEYOND = 1e-3  # a step beyond the end of a curve
 
@@ -34,15 +31,9 @@ class OrbitCurve(Curve):
     """Points of a curve of orbits."""
 
     def __init__(self, family: Family, asked: Asked, numbers: Numbers):
-        super().__init__(asked.bounds, asked.steps)
-        self.family, self.asked, self.numbers = family, asked, numbers
-        known = known_values(numbers)
-        if known is None:
-            raise ValueError(
-                "`params` must be known to follow a curve, but are hidden by `jit` or one set of many under `vmap`. "
-                "Call `response_curve` from Python, for one set after the other."
-            )
-        self.known, self.dtype = known, known.given.t.dtype
+        known = known_of(numbers, "response_curve")
+        super().__init__(asked.bounds, asked.steps, known.given.t.dtype)
+        self.family, self.asked, self.numbers, self.known = family, asked, numbers, known
         self.times: list[tuple[np.ndarray, float]] = []  # points that were found, and the times of their orbits
         self.kept: dict[bytes, Told] = {}
 
@@ -91,10 +82,6 @@ class OrbitCurve(Curve):
             return numbers
         _, time = min(self.times, key=lambda known: float(np.max(np.abs(known[0] - z) / scale)))
         return numbers._replace(usual=jnp.asarray(time, self.dtype))
-
-    def plane(self, z: Any, tangent: Any, scale: Any, borders: Any = (NOTHING, NOTHING)) -> Plane:
-        """A plane of numbers of the kind that motions are computed in."""
-        return jax.tree.map(lambda x: jnp.asarray(x, self.dtype), Plane(z, tangent, scale, borders))
 
     def at_parameter(self, z: np.ndarray) -> Point | None:
         """The point near z at the parameter of z."""

@@ -8,11 +8,11 @@ import numpy as np
 
 from .arclength import Correct, Corrected, Point, corner
 from .critical import FLIP, FOLD, TORUS, borders_of, critical_matrix
+from .curve import NOTHING
 
 BRANCH, CORNER = "branch point", "corner"
 SURE = 1e-6  # by which a multiplier must be off its critical value at both ends
 SHARP = 1e-13  # of the way between two points, to which a special point is located
-NOTHING = np.zeros(0)
 
 
 class Special(NamedTuple):

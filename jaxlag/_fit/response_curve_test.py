@@ -10,10 +10,10 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, PyTree
 
+from .._curves.curve import NOTHING
 from .._curves.in_plane import Plane
 from .._curves.measures import Measure, measures_of
 from .._curves.orbits import HARMONICS, ORDINARY, WIDE, Family, Numbers, Telling, corrected, returned, told
-from .._curves.special_points import NOTHING
 from .._linear.periodic import FINER
 from .._linear.return_map import Given, Setting, scales_of
 from .._mechanics.friction_treatment import StickSlip

@@ -36,6 +36,7 @@ def test_snap_through(unit):
     assert curve.ends == ("an end of `values` is reached",) * 2
 
 
+@pytest.mark.slow
 def test_derivatives_of_a_fold():
     """By the height, forward and reverse, of the load and of where it is; twice."""
     given = {"k": 2.0, "l": 1.0, "P": 0.0}

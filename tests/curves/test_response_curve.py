@@ -331,6 +331,7 @@ def test_a_stop_that_is_only_just_met():
     np.testing.assert_allclose(by_gap, (at(1.001) - at(0.999)) / 0.002, rtol=1e-5)
 
 
+@pytest.mark.slow
 def test_an_event_that_begins_to_happen():
     """Two stiffnesses: where a linear motion first reaches the second one, in closed form, named by the system's own event."""
     gears = jl.System(
@@ -435,6 +436,7 @@ def test_limit_cycles_over_a_parameter():
     np.testing.assert_allclose(curve.period[-1], times[-1] - times[-2], rtol=1e-8)
 
 
+@pytest.mark.slow
 def test_a_section_that_is_no_longer_met():
     """A limit cycle of amplitude 2√a, near a small one, meets q = 1 down to a = ¼ only; the curve says so and ends."""
     cycles = jl.System(lambda q, qdot: 0.5 * qdot**2 - 0.5 * q**2, force=lambda q, qdot, a: 0.1 * (a - q**2) * qdot)
