@@ -11,7 +11,7 @@ from jaxtyping import PyTree
 from .._model.paths import leaf_names
 from .._program.jit import values as known_values
 from .arclength import Corrected, Followed, Point, followed, started
-from .in_plane import Plane
+from .in_plane import UNKNOWN, Plane
 
 NOTHING = np.zeros(0)
 TURNS = 8  # of Newton's method, after which a step is shortened
@@ -51,8 +51,14 @@ class Curve(abc.ABC):
         return jax.tree.map(lambda x: jnp.asarray(x, self.dtype), Plane(z, direction, scale, borders))
 
     def scale_at(self, z: np.ndarray) -> np.ndarray:
-        """The scales at z."""
-        return np.maximum(self(z, along_parameter(z), np.ones(len(z)), 0).scale, LEAST * self.largest)
+        """The scales at z; of an entry that is zero there, by what the parameter does to it over all values asked for, or else 1."""
+        at = self(z, along_parameter(z), np.append(np.full(len(z) - 1, UNKNOWN), 1.0), 0)
+        try:
+            moved = np.abs(np.linalg.solve(at.J[:, :-1], at.J[:, -1] * at.scale[-1]))
+        except np.linalg.LinAlgError:  # what friction holds, rests anywhere
+            moved = np.zeros(len(z) - 1)
+        unit = np.append(np.where((moved > 0) & np.isfinite(moved), moved, 1.0), 1.0)
+        return np.maximum(np.where(at.scale > UNKNOWN, at.scale, unit), LEAST * self.largest)
 
     def through(self, z: np.ndarray) -> tuple[Followed, Followed] | None:
         """The curve through z, backward and forward; None if z is not near it."""

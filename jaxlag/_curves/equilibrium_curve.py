@@ -95,12 +95,12 @@ class EquilibriumCurve(eqx.Module):
         """
         point = self.special[i]
         if point.kind != BRANCH:
-            raise ValueError(f"`branch({i})` must be of a branch point, but that is a {point.kind}. Only one curve passes there.")
+            raise ValueError(f"`branch({i})` must be of a branch point, but that is a {point.kind}. Choose one of those.")
         bounds = self._asked.bounds if values is None else bounded(values)
         steps = self._asked.steps if steps is None else count(steps, "`steps`", cure="Give e.g. 400.")
         curve = RestCurve(self.system, Asked(self.over, bounds, steps), self._numbers)
         z = np.asarray(jax.lax.stop_gradient(point._z))
-        sides = curve.across(z, crossing(curve(z, along_parameter(z), np.ones(len(z)), 0).J * curve.scale_at(z)), sides=2)
+        sides = curve.across(z, crossing(curve(z, along_parameter(z), curve.scale_at(z), 0).J * curve.scale_at(z)), sides=2)
         if not sides:
             raise ValueError(f"`branch({i})` must find another curve, but Newton's method finds none. Widen `values`.")
         return _shown(curve, *beside(sides))

@@ -9,6 +9,8 @@ from jaxtyping import Array, Bool, Float, Int
 
 from .._linear.newton import least_change
 
+UNKNOWN = 1e-30  # a scale that stands for none
+
 
 class Plane(NamedTuple):
     """A plane through z across a curve, in units of `scale`; for a special point the two vectors that border its critical matrix."""

@@ -89,7 +89,8 @@ class OrbitCurve(Curve):
 
     def beside(self, z: np.ndarray, kind: str) -> list[Followed]:
         """The other curve through a special point z, to each side that it leaves it to; of twice the turns, from a flip."""
-        J = self(z, along_parameter(z), np.ones(len(z)), 0).J * self.scale_at(z)
+        scale = self.scale_at(z)
+        J = self(z, along_parameter(z), scale, 0).J * scale
         if kind == FLIP:
             return self.across(z, np.append(borders_of(critical_matrix(FOLD, J[:, :-1]))[1], 0.0), sides=1)
         return self.across(z, crossing(J), sides=2)

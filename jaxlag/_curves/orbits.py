@@ -9,13 +9,13 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from .._linear.newton import differentiable_root
-from .._linear.return_map import OF_SLOPES, Frame, Given, Setting, forced_period, passage, scales_of
+from .._linear.return_map import OF_SLOPES, Frame, Given, Setting, forced_period, passage, sizes_of
 from .._model.event import Every
 from .._model.system import System
 from .._motion.simulate import simulate
 from .._program.jit import compiled
 from .critical import critical
-from .in_plane import Plane, in_plane
+from .in_plane import UNKNOWN, Plane, in_plane
 from .measures import Measure, Measured, extrema, harmonics_of, moved_by_impacts, values_of
 
 ORDINARY = "ordinary"  # a point of a curve that is not special
@@ -96,11 +96,13 @@ def corrected(family: Family, numbers: Numbers, plane: Plane, turns: Any) -> Nea
 
     def evaluated(z):
         left, time, frame = returned(family, numbers, z)
-        return left, (jnp.append(WIDE * scales_of(frame)[of], numbers.width), time)
+        sizes = WIDE * sizes_of(frame)[of]
+        return left, (jnp.append(jnp.where(sizes > 0, sizes, plane.scale[:-1]), numbers.width), time)
 
     def cleaned(J, aside):
         scale, _ = aside
-        return jnp.where(jnp.abs(J) * scale[None] / scale[:-1, None] > OF_SLOPES * numbers.given.tolerances[0], J, 0)
+        is_felt = jnp.abs(J) * scale[None] / scale[:-1, None] > OF_SLOPES * numbers.given.tolerances[0]
+        return jnp.where(is_felt | jnp.any(scale <= UNKNOWN), J, 0)
 
     small = CLOSE * numbers.given.tolerances[0]
     near = in_plane(evaluated, plane, turns, small, cleaned)

@@ -142,9 +142,7 @@ class ResponseCurve(eqx.Module):
         """
         point = self.special[i]
         if point.kind not in (FLIP, BRANCH):
-            raise ValueError(
-                f"`branch({i})` must be asked of a flip or a branch point, but that is a {point.kind}: one curve passes there."
-            )
+            raise ValueError(f"`branch({i})` must be of a flip or a branch point, but that is a {point.kind}. Choose one of those.")
         asked = self._asked
         bounds = asked.bounds if values is None else bounded(values)
         asked = asked._replace(bounds=bounds, steps=asked.steps if steps is None else _counts(asked.samples, steps)[1])
@@ -252,8 +250,8 @@ def _curve(orbit: PeriodicOrbit, params: PyTree, asked: Asked) -> OrbitCurve:
     place = place_of(params, asked.over)
     start = known_values(jax.tree.leaves(params)[place])
     refuse_outside(start, asked.bounds, asked.over)
-    asked_for, beside = orbit.tolerances
-    rtol, atol = tolerances_of(asked_for, beside, orbit.q)
+    asked_for, absolute = orbit.tolerances
+    rtol, atol = tolerances_of(asked_for, absolute, orbit.q)
     tolerances = (rtol if asked_for is not None else FINER * rtol, atol)
     state = fixed({"q": orbit.q, "qdot": orbit.qdot, "states": orbit.states})
     t, width = fixed(orbit.t), jnp.asarray(asked.bounds[1] - asked.bounds[0], jnp.result_type(rtol))

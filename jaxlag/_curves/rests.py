@@ -77,7 +77,7 @@ def rest_near(system: System, place: int, numbers: RestNumbers, plane: Plane, tu
         sizes = jnp.abs(z[:-1])
         largest = jnp.max(sizes[:n], initial=0.0)
         sizes = sizes.at[:n].set(jnp.maximum(sizes[:n], 0.1 * largest))
-        scale = WIDE * jnp.where(sizes > 0, sizes, 1)
+        scale = jnp.where(sizes > 0, WIDE * sizes, plane.scale[:-1])
         return _residual(system, place, numbers, z), jnp.append(scale, numbers.width)
 
     return in_plane(evaluated, plane, turns, jnp.finfo(plane.z.dtype).eps ** 0.7)

@@ -123,11 +123,16 @@ def orbit_near(system: System, setting: Setting, given: Given) -> Orbit:
 
 
 def scales_of(frame: Frame) -> Float[Array, " s"]:
-    """The scale of each entry of the state over a period: if the entry is zero at the section, it follows from its rate or integral."""
+    """`sizes_of`, and 1 where these are zero."""
+    sizes = sizes_of(frame)
+    return jnp.where(sizes > 0, sizes, 1)
+
+
+def sizes_of(frame: Frame) -> Float[Array, " s"]:
+    """The size of each entry of the state over a period: if the entry is zero at the section, it follows from its rate or integral."""
     n, period = ravel_pytree(frame.given.start["q"])[0].size, frame.usual
     q, v, states = jnp.split(jnp.abs(frame.first), [n, 2 * n])
-    scales = jnp.concatenate([q + period * v, v + q / period, states])
-    return jnp.where(scales > 0, scales, 1)
+    return jnp.concatenate([q + period * v, v + q / period, states])
 
 
 def _newton(residual: Callable, w: Float[Array, " k"], rtol: Array, scale: Float[Array, " k"]) -> Float[Array, " k"]:

@@ -157,3 +157,11 @@ def test_what_is_not_known_or_not_for_it_is_refused():
     touching = jl.System(lambda q, qdot, g: 0.5 * qdot**2 - g * q, unilateral={"floor": jl.Contact(lambda q: q)})
     with pytest.raises(ValueError, match="no contacts"):
         jl.equilibrium_curve(touching, 0.0, {"g": 9.81}, over="g", values=(1.0, 10.0))
+
+
+@pytest.mark.parametrize("unit", [1.0, 1e-9, 1e9])
+def test_from_zero_in_any_units(unit):
+    """From the unstable top between the bars, where the coordinate and the load are zero: the same points."""
+    given = {"k": 2.0, "l": unit, "h": 0.3 * unit, "P": 0.0}
+    curve = jl.equilibrium_curve(arch, 0.0, given, over="P", values=(-0.01 * unit, 0.1 * unit))
+    np.testing.assert_allclose([point.value for point in curve.special], [snaps(2.0, unit, 0.3 * unit)[0]], rtol=1e-9)

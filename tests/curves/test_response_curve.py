@@ -572,3 +572,18 @@ def test_random_pairs_of_oscillators():
             expected = np.linalg.eigvals(found[:, 1:])
             got = np.asarray(curve.multipliers[i])
             np.testing.assert_allclose(np.sort(np.abs(got)), np.sort(np.abs(expected)), rtol=1e-5, atol=1e-7)
+
+
+@pytest.mark.parametrize(("length", "time"), [(1.0, 1.0), (1e-9, 1e9), (1e9, 1e-9)])
+def test_from_rest_in_any_units(length, time):
+    """Over the amplitude of a drive that is zero at first, at rest: q = F/|ω₀² − ω² + 2iδω|."""
+    system = jl.System(
+        lambda q, qdot, k: 0.5 * qdot**2 - 0.5 * k * q**2,
+        dissipation=lambda qdot, d: 0.5 * d * qdot**2,
+        force=lambda t, w, F: F * jnp.cos(w * t),
+    )
+    force = length / time**2
+    orbit = jl.periodic(system, 0.0, 0.0, {"k": time**-2, "d": 0.1 / time, "w": 2.2 / time, "F": 0.0}, section=once)
+    curve = jl.response_curve(orbit, over="F", values=(0.0, 0.5 * force), steps=60)
+    assert curve.ends == ("an end of `values` is reached",) * 2
+    np.testing.assert_allclose(curve.amplitude["q"], curve.values * time**2 / abs(1 - 2.2**2 + 0.22j), rtol=1e-7, atol=1e-12 * length)
