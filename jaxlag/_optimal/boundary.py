@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PyTree
 
-from .._model.numbers import in_dtype, numbers
+from .._model.numbers import in_dtype, library, numbers
 from .._model.paths import entry_names, is_within, listed
 
 CURE = "Give (q, qdot), with None for what is free."
@@ -20,10 +20,10 @@ class Boundary(NamedTuple):
     """
 
     like: PyTree
-    shares: np.ndarray
-    states: Float[Array, "k x"]
-    known: np.ndarray
-    returns: np.ndarray
+    shares: tuple[float, ...]
+    states: Float[Array | np.ndarray, "k x"]
+    known: tuple[tuple[bool, ...], ...]
+    returns: tuple[bool, ...]
 
     @property
     def n(self) -> int:
@@ -32,14 +32,14 @@ class Boundary(NamedTuple):
 
     def guess(self, shares: np.ndarray) -> tuple[Array, Array]:
         """q and its slopes by the share of the time, straight between what is known of each coordinate."""
-        q, slopes = [], []
+        q, slopes, known, given = [], [], np.array(self.known), np.array(self.shares)
         for j in range(self.n):
-            at = np.flatnonzero(self.known[:, j])
+            at = np.flatnonzero(known[:, j])
             if not at.size:
                 q.append(jnp.zeros(shares.size, self.states.dtype))
                 slopes.append(q[-1])
                 continue
-            knots, values = self.shares[at], self.states[at, j]
+            knots, values = given[at], self.states[at, j]
             q.append(jnp.interp(jnp.asarray(shares, values.dtype), jnp.asarray(knots, values.dtype), values))
             if at.size == 1:
                 slopes.append(jnp.zeros_like(q[-1]))
@@ -76,10 +76,10 @@ def boundary_of(start: Any, end: Any, waypoints: Mapping[float, Any] | None, per
     for share in shares:
         parts = [[None] * len(names) if part is None else part[1] for part in flat[share]]
         row, mask = zip(*(_filled(leaf, shape, dtype) for part in parts for leaf, shape in zip(part, shapes, strict=True)), strict=True)
-        rows.append(jnp.concatenate(row))
-        masks.append(np.concatenate(mask))
-    like = jax.tree.unflatten(structure, [jnp.zeros(shape, dtype) for shape in shapes])
-    return Boundary(like, np.array(shares), jnp.stack(rows), np.stack(masks), _returns(periodic, like))
+        rows.append(library(*row).concatenate(row))
+        masks.append(tuple(np.concatenate(mask).tolist()))
+    like = jax.tree.unflatten(structure, [np.zeros(shape, dtype) for shape in shapes])
+    return Boundary(like, tuple(shares), library(*rows).stack(rows), tuple(masks), _returns(periodic, like))
 
 
 def _pair(given: Any, label: str) -> tuple[Any, Any]:
@@ -110,19 +110,19 @@ def _shape(leaves: Sequence[Any], name: str) -> tuple[int, ...]:
     return shapes.pop()
 
 
-def _filled(leaf: Any, shape: tuple[int, ...], dtype: Any) -> tuple[Array, np.ndarray]:
+def _filled(leaf: Any, shape: tuple[int, ...], dtype: Any) -> tuple[Array | np.ndarray, np.ndarray]:
     size = int(np.prod(shape))
     if leaf is None:
-        return jnp.full(size, jnp.nan, dtype), np.zeros(size, bool)
-    return jnp.ravel(jnp.asarray(in_dtype(leaf, dtype))), np.ones(size, bool)
+        return np.full(size, np.nan, dtype), np.zeros(size, bool)
+    return in_dtype(leaf, dtype).ravel(), np.ones(size, bool)
 
 
-def _returns(periodic: Any, like: PyTree) -> np.ndarray:
+def _returns(periodic: Any, like: PyTree) -> tuple[bool, ...]:
     """Which entries of (q, q̇) are at the end what they were at the start."""
     names = entry_names(like, "q")
     if isinstance(periodic, bool):
-        return np.full(2 * len(names), periodic)
+        return (periodic,) * (2 * len(names))
     for name in (wanted := listed(periodic)):
         if not any(is_within(entry, name) for entry in names):
             raise ValueError(f"`periodic` must name coordinates, but holds {name!r}. There are {', '.join(names)}.")
-    return np.tile([any(is_within(entry, name) for name in wanted) for entry in names], 2)
+    return (*(any(is_within(entry, name) for name in wanted) for entry in names),) * 2

@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Array, Float, PyTree
 
 from .._mechanics.lagrange import position_residual
+from .._program.jit import compiled
 from .boundary import Boundary
 from .radau import points
 from .solution import OptimalMotion
@@ -17,6 +18,7 @@ WAYS, BEND = 8, 0.5  # of how many, bent by this part of their size, the smoothe
 PROJECTIONS = 20  # of Newton's steps onto the constraints
 
 
+@compiled
 def guessed(setting: Setting, task: Task, boundary: Boundary, guess: Any) -> Path:
     """Unknowns along a straight way, or along a given motion."""
     N, m, h, dtype = setting.intervals, setting.multipliers, setting.positions, task.start.dtype

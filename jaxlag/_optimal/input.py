@@ -16,11 +16,11 @@ def is_called(error: TypeError) -> bool:
 class Held(eqx.Module):
     """An input at one instant, as a signal."""
 
-    value: Float[Array, "..."]
+    value: Float[Array | np.ndarray, "..."]
 
     def __call__(self, t: ArrayLike) -> Float[Array, "..."]:
         """The value, at any time."""
-        return self.value
+        return jnp.asarray(self.value)
 
 
 class Piecewise(eqx.Module):

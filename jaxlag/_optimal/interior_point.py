@@ -16,6 +16,7 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from .block_system import Shape, factors, solved
@@ -38,43 +39,135 @@ CONVERGED, STEP_LIMIT, INFEASIBLE, STUCK = 0, 1, 2, 3
 
 
 class Chain(NamedTuple):
-    """A problem: of each interval its cost and its equations, `interval(ζ, data, args)` → (f, c), and bounds of all numbers."""
+    """A problem, of intervals k that have points i, at which states have the changes D x: x is the state before, and those at the points.
+
+    `point(w, k, i, *args)` is a cost and equations, of numbers of the point, which end with its state, of the changes there, and of the
+    border after the start; L ζ = r are equations that are linear in what an interval depends on; `end(w, *args)` is a cost of the last
+    point of all. All numbers have bounds.
+    """
 
     shape: Shape
-    interval: Callable[[Array, Any, Any], tuple[Array, Array]]
-    data: Any  # of each interval
-    args: Any
+    D: np.ndarray
+    point: Callable[..., tuple[Array, Array]]
+    L: Float[Array, "N e l"]
+    r: Float[Array, "N e"]
+    end: Callable[..., Array]
+    args: tuple[Any, ...]
     lower: Float[Array, " n"]
     upper: Float[Array, " n"]
 
+    @property
+    def own(self) -> int:
+        """How many numbers a point has."""
+        return self.shape.block // len(self.D)
+
+    def places(self, x: Array) -> Float[Array, "N s d"]:
+        """w of all points, linear in x."""
+        N, state = self.shape.intervals, self.shape.state
+        before, own, border = jnp.split(self.shape.gathered(x), [state, state + self.shape.block], axis=1)
+        own = own.reshape(N, len(self.D), self.own)
+        changes = self.D @ jnp.concatenate([before[:, None], own[..., self.own - state :]], axis=1)
+        border = jnp.broadcast_to(border[:, None, state:], (N, len(self.D), self.shape.border - state))
+        return jnp.concatenate([own, changes, border], axis=2)
+
+    def gathered(self, of_points: Float[Array, "N s d"]) -> Float[Array, " n"]:
+        """The transpose of `places`."""
+        return jax.linear_transpose(self.places, self.lower)(of_points)[0]
+
+    def at_points(self, function: Callable, *of_points: Array) -> Any:
+        """function(..., k, i) at all points, of arrays (N, s, ...)."""
+        k, i = jnp.arange(self.shape.intervals), jnp.arange(len(self.D))
+        inner = jax.vmap(lambda k, i, *of: function(*of, k, i), (None, 0, *(0 for _ in of_points)))
+        return jax.vmap(inner, (0, None, *(0 for _ in of_points)))(k, i, *of_points)
+
+    def rows(self, of_points: Array, x: Array) -> Float[Array, "N m"]:
+        """All equations of each interval."""
+        linear = jnp.einsum("kel,kl->ke", self.L, self.shape.gathered(x)) - self.r
+        return jnp.concatenate([of_points.reshape(len(linear), -1), linear], axis=1)
+
+    def split(self, y: Array) -> tuple[Array, Array]:
+        """What belongs to equations of points, (N, s, m), and to linear ones."""
+        N, s = self.shape.intervals, len(self.D)
+        count = y.shape[1] - self.L.shape[1]
+        return y[:, :count].reshape(N, s, count // s), y[:, count:]
+
     def values(self, x: Array) -> tuple[Array, Array]:
         """f and c (N, m)."""
-        f, c = jax.vmap(lambda z, data: self.interval(z, data, self.args))(self.shape.gathered(x), self.data)
-        return jnp.sum(f), c
+        w = self.places(x)
+        f, c = self.at_points(lambda w, k, i: self.point(w, k, i, *self.args), w)
+        return jnp.sum(f) + self.end(w[-1, -1], *self.args), self.rows(c, x)
 
     def stationary(self, x: Array, y: Array) -> tuple[Array, Array]:
         """∇f + Jᵀy (n,), and c."""
+        (f, c), pull = jax.vjp(self.values, x)
+        return pull((jnp.ones_like(f), y))[0], c
 
-        def one(z, data, y):
-            (_, c), pull = jax.vjp(lambda z: self.interval(z, data, self.args), z)
-            return pull((jnp.ones((), z.dtype), y))[0], c
+    def linearised(self, x: Array, y: Array) -> "Linearised":
+        """At x, with the Hessian of f + y·c."""
 
-        gradient, c = jax.vmap(one)(self.shape.gathered(x), self.data, y)
-        return self.shape.scattered(gradient), c
-
-    def linearised(self, x: Array, y: Array) -> tuple[Array, Array, Array, Array, Array]:
-        """f, c, the gradient of f (N, l), the Jacobian J (N, m, l), and the Hessian of f + y·c (N, l, l)."""
-
-        def one(z, data, y):
-            def both(z):
-                (f, c), pull = jax.vjp(lambda z: self.interval(z, data, self.args), z)
+        def one(w, y, k, i):
+            def both(w):
+                (f, c), pull = jax.vjp(lambda w: self.point(w, k, i, *self.args), w)
                 return (f, c, pull((jnp.ones_like(f), y))[0]), (f, c)
 
-            (df, J, H), (f, c) = jax.jacfwd(both, has_aux=True)(z)
+            (df, J, H), (f, c) = jax.jacfwd(both, has_aux=True)(w)
             return f, c, df, J, (H + H.T) / 2
 
-        f, c, df, J, H = jax.vmap(one)(self.shape.gathered(x), self.data, y)
-        return jnp.sum(f), c, df, J, H
+        w, end = self.places(x), lambda w: self.end(w, *self.args)
+        f, c, df, J, H = self.at_points(one, w, self.split(y)[0])
+        df, H = df.at[-1, -1].add(jax.grad(end)(w[-1, -1])), H.at[-1, -1].add(jax.hessian(end)(w[-1, -1]))
+        return Linearised(self, jnp.sum(f) + end(w[-1, -1]), self.rows(c, x), self.gathered(df), J, H)
+
+    def assembled(self, inner: Float[Array, "N s d d"]) -> Float[Array, "N l l"]:
+        """The matrix of each interval, of those of its points."""
+        (N, s), own, state, border = inner.shape[:2], self.own, self.shape.state, self.shape.border - self.shape.state
+        rows = [inner[..., :own, :], jnp.pad(inner[..., own : own + state, :], ((0, 0), (0, 0), (own - state, 0), (0, 0)))]
+        place = np.stack([np.eye(s, s + 1, 1), self.D])  # of a point among (before, points), and of its changes
+        parts, sides = [], []
+        for row in rows:
+            parts += [row[..., :own], jnp.pad(row[..., own : own + state], ((0, 0), (0, 0), (0, 0), (own - state, 0)))]
+            sides += [row[..., own + state :]]
+        of_both = np.einsum("asi,bsj->absij", place, place).reshape(4, s, s + 1, s + 1)
+        whole = jnp.einsum("asij,aksxy->kixjy", of_both, jnp.stack(parts)).reshape(N, (s + 1) * own, (s + 1) * own)
+        side = jnp.einsum("asi,aksxy->kixy", place, jnp.stack(sides)).reshape(N, (s + 1) * own, border)
+        corner = jnp.sum(inner[..., own + state :, own + state :], axis=1)
+        whole, side = whole[:, own - state :, own - state :], jnp.pad(side[:, own - state :], ((0, 0), (0, 0), (state, 0)))
+        corner = jnp.pad(corner, ((0, 0), (state, 0), (state, 0)))
+        return jnp.block([[whole, side], [jnp.swapaxes(side, 1, 2), corner]])
+
+
+class Linearised(NamedTuple):
+    """A chain at a point: f, c, ∇f, and what the points have of the Jacobian J and the Hessian H."""
+
+    chain: Chain
+    f: Float[Array, ""]
+    c: Float[Array, "N m"]
+    gradient: Float[Array, " n"]
+    J: Float[Array, "N s m d"]
+    H: Float[Array, "N s d d"]
+
+    def forwards(self, dx: Array) -> Array:
+        """J dx."""
+        own = jnp.einsum("ksmd,ksd->ksm", self.J, self.chain.places(dx))
+        return self.chain._replace(r=jnp.zeros_like(self.chain.r)).rows(own, dx)
+
+    def backwards(self, dy: Array) -> Array:
+        """Jᵀ dy."""
+        own, linear = self.chain.split(dy)
+        of_linear = self.chain.shape.scattered(jnp.einsum("kel,ke->kl", self.chain.L, linear))
+        return self.chain.gathered(jnp.einsum("ksmd,ksm->ksd", self.J, own)) + of_linear
+
+    def curved(self, dx: Array) -> Array:
+        """H dx."""
+        return self.chain.gathered(jnp.einsum("ksde,kse->ksd", self.H, self.chain.places(dx)))
+
+    def squares(self) -> Float[Array, "N s d d"]:
+        """JᵀJ of each point."""
+        return jnp.swapaxes(self.J, 2, 3) @ self.J
+
+    def matrix(self, of_points: Float[Array, "N s d d"], weight: Any) -> Float[Array, "N l l"]:
+        """Of each interval: what its points have, and of the linear equations weight LᵀL."""
+        return self.chain.assembled(of_points) + weight * jnp.swapaxes(self.chain.L, 1, 2) @ self.chain.L
 
 
 class Point(NamedTuple):
@@ -174,17 +267,22 @@ def _error(chain, point, c, gradient, mu):
 
 
 def _step(chain: Chain, s: _State, tolerance: float) -> _State:
-    shape, (x, y, zl, zu) = chain.shape, s.point
-    f, c, df, J, H = chain.linearised(x, y)
-    gradient = shape.scattered(df + jnp.einsum("kml,km->kl", J, y))
-    error = _error(chain, s.point, c, gradient, 0.0)
+    of = chain.linearised(s.point.x, s.point.y)
+    gradient = of.gradient + of.backwards(s.point.y)
+    s = s._replace(error=_error(chain, s.point, of.c, gradient, 0.0))
+    found = s._replace(status=jnp.full_like(s.status, CONVERGED))
+    return jax.lax.cond(s.error <= tolerance, lambda: found, lambda: _moved(chain, s, of, gradient, tolerance))
+
+
+def _moved(chain: Chain, s: _State, of: Linearised, gradient: Array, tolerance: float) -> _State:
+    (x, y, _, _), f, c = s.point, of.f, of.c
     mu = _barrier_now(chain, s, c, gradient, tolerance)
     kept = jnp.where(mu < s.mu, _empty(x.dtype), s.filter)
     below, above = _distances(chain, x)
     of_barrier = mu * (1 / above - 1 / below)  # where there is no bound, 1/∞
-    dx, dy, raised = _direction(chain, s, (c, J, H), gradient + of_barrier)
+    dx, dy, raised = _direction(chain, s, of, gradient + of_barrier)
     phi, theta = _barrier(chain, x, f, mu), jnp.sum(jnp.abs(c))
-    slope = jnp.sum((shape.scattered(df) + of_barrier) * dx)
+    slope = jnp.sum((of.gradient + of_barrier) * dx)
     most = jnp.maximum(TO_BOUND, 1 - mu)
     trials = _Trials(chain, x, mu, theta, phi, slope, kept, s.limits)
     alpha_max = jnp.minimum(_way(below, dx, most), _way(above, -dx, most))
@@ -196,11 +294,11 @@ def _step(chain: Chain, s: _State, tolerance: float) -> _State:
     entry = jnp.stack([(1 - MARGIN) * theta, phi - MARGIN * theta])
     enters = (accepted & ~of_cost & ~s.restoring) | begins
     kept = jnp.where(enters, kept.at[jnp.argmax(kept[:, 0])].set(entry), kept)  # in an empty place
-    done, stuck = error <= tolerance, begins & (theta <= tolerance * y.size)
-    status = jnp.where(done, CONVERGED, jnp.where(stuck, STUCK, jnp.where(~accepted & s.restoring, INFEASIBLE, -1)))
+    stuck = begins & (theta <= tolerance * y.size)
+    status = jnp.where(stuck, STUCK, jnp.where(~accepted & s.restoring, INFEASIBLE, -1))
     damping = jnp.where(alpha < SHORT, MORE * s.damping, jnp.where(alpha > 1 - SHORT, s.damping / MORE, s.damping))
     return _State(
-        jax.tree.map(lambda new, old: jnp.where(done | ~accepted, old, new), point, s.point),
+        jax.tree.map(lambda new, old: jnp.where(accepted, new, old), point, s.point),
         mu,
         kept,
         raised=jnp.where(raised > 0, raised, s.raised),
@@ -208,9 +306,9 @@ def _step(chain: Chain, s: _State, tolerance: float) -> _State:
         restoring=begins | (s.restoring & ~left),
         before=jnp.where(begins, theta, s.before),
         limits=s.limits,
-        steps=s.steps + jnp.where(done, 0, 1),
+        steps=s.steps + 1,
         status=status,
-        error=error,
+        error=s.error,
     )
 
 
@@ -228,16 +326,15 @@ def _direction(chain, s, of, slope):
     """A step of x and y, and by how much W was raised: Newton's; or Levenberg and Marquardt's to satisfy the equations alone, short where
     a bound is near.
     """
-    shape, (c, J, H) = chain.shape, of
     below, above = _distances(chain, s.point.x)
 
     def newton():
-        kkt, raised = factorised(shape, H, J, s.point.below / below + s.point.above / above, s.raised)
-        return *kkt(-slope, -c), raised
+        kkt, raised = factorised(of, s.point.below / below + s.point.above / above, s.raised)
+        return *kkt(-slope, -of.c), raised
 
     def to_equations():
-        damped = factors(shape, jnp.einsum("kml,kmj->klj", J, J), s.damping * (1 + 1 / below**2 + 1 / above**2))
-        return solved(shape, damped, -shape.scattered(jnp.einsum("kml,km->kl", J, c))), jnp.zeros_like(c), s.raised
+        damped = factors(of.chain.shape, of.matrix(of.squares(), 1.0), s.damping * (1 + 1 / below**2 + 1 / above**2))
+        return solved(of.chain.shape, damped, -of.backwards(of.c)), jnp.zeros_like(of.c), s.raised
 
     return jax.lax.cond(s.restoring, to_equations, newton)
 
@@ -262,40 +359,44 @@ def _way(gap, change, most):
     return jnp.min(jnp.where(shrinks, -most * gap / jnp.where(shrinks, change, -1), 1.0), initial=1.0)
 
 
-def factorised(shape, H, J, sigma, raised):
+def factorised(of: Linearised, sigma: Array, raised: Array) -> tuple[Callable, Array]:
     """The solution of the symmetric system as a function of its right-hand sides, and by how much W was raised."""
-    eps = jnp.finfo(J.dtype).eps
+    eps = jnp.finfo(sigma.dtype).eps
     small = eps**0.4
-    squares = jnp.einsum("kml,kmj->klj", J, J) / small
+    K = of.matrix(of.H + of.squares() / small, 1 / small)
 
     def attempt(state):
         count, now, _ = state
         second = jnp.where(raised > 0, jnp.maximum(LESS * raised, eps), RAISED)
         now = jnp.where(count == 0, 0.0, jnp.where(count == 1, second, MORE * now))
-        return count + 1, now, factors(shape, H + squares, sigma + now + small)
+        return count + 1, now, factors(of.chain.shape, K, sigma + now + small)
 
-    fails = lambda of: ~jnp.all(jnp.isfinite(of.corner)) | ~jnp.all(jnp.isfinite(of.chain))
-    unknown = jax.tree.map(lambda x: jnp.full(x.shape, jnp.nan, x.dtype), jax.eval_shape(lambda *of: factors(shape, *of), H, sigma))
+    unknown = jax.tree.map(
+        lambda x: jnp.full(x.shape, jnp.nan, x.dtype), jax.eval_shape(lambda K, sigma: factors(of.chain.shape, K, sigma), K, sigma)
+    )
     start = jnp.zeros((), int), jnp.zeros_like(raised), unknown
-    _, raised, of = jax.lax.while_loop(lambda s: fails(s[2]) & (s[1] < MOST), attempt, start)
+    _, raised, found = jax.lax.while_loop(lambda s: ~s[2].is_positive & (s[1] < MOST), attempt, start)
 
-    def kkt(r1, r2):
-        product = lambda dx: shape.scattered(jnp.einsum("klj,kj->kl", H, shape.gathered(dx))) + (sigma + raised) * dx
-        rows = lambda dx: jnp.einsum("kml,kl->km", J, shape.gathered(dx))
-        columns = lambda dy: shape.scattered(jnp.einsum("kml,km->kl", J, dy))
+    def product(step):
+        dx, dy = step
+        return of.curved(dx) + (sigma + raised) * dx + of.backwards(dy), of.forwards(dx)
 
-        def once(r1, r2):
-            dx = solved(shape, of, r1 + columns(r2) / small)
-            return dx, (rows(dx) - r2) / small
+    def once(r1, r2):
+        dx = solved(of.chain.shape, found, r1 + of.backwards(r2) / small)
+        return dx, (of.forwards(dx) - r2) / small
 
-        def refine(_, found):
-            dx, dy = found
-            more = once(r1 - product(dx) - columns(dy), r2 - rows(dx))
-            return dx + more[0], dy + more[1]
+    def refined(state):
+        count, step, right, _ = state
+        more = once(*jax.tree.map(jnp.subtract, right, product(step)))
+        largest = lambda x: jnp.max(jnp.abs(x), initial=0.0)
+        off = [largest(x) > jnp.sqrt(eps) * largest(y) for x, y in zip(more, step, strict=True)]
+        return count + 1, jax.tree.map(jnp.add, step, more), right, off[0] | off[1]
 
-        return jax.lax.fori_loop(0, REFINED, refine, once(r1, r2))
+    def solve(_, right):
+        start = jnp.zeros((), int), once(*right), right, jnp.array(True)
+        return jax.lax.while_loop(lambda s: s[3] & (s[0] < REFINED), refined, start)[1]
 
-    return kkt, raised
+    return lambda *right: jax.lax.custom_linear_solve(product, right, solve, symmetric=True), raised
 
 
 class _Trials(NamedTuple):

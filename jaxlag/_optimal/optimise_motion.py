@@ -42,7 +42,7 @@ def optimise_motion(
     t: Any = 0.0,
     guess: Any = None,
     tolerance: float = 1e-6,
-    refinements: int = 2,
+    refinements: int = 3,
     starts: int = 3,
     steps: int = 500,
     throw: bool = True,
@@ -149,7 +149,7 @@ def _found(setting: Setting, task: Task, path: Path) -> OptimalMotion:
     found = jax.tree.map(lambda x: x[best_of(every)], every)
     args, others = eqx.partition((sizes, task), eqx.is_array)
     point = differentiable(lambda args: of.chain(*eqx.combine(args, others)), args, fixed(found.point), LAST * tolerance)
-    whole = of.whole(point.x, sizes, task)
+    whole = of.taken_apart(point.x, sizes, task)
     cost = of.chain(sizes, task).values(point.x)[0] * sizes.cost
     return _motion(of, whole, task, cost, found, sizes)
 

@@ -24,11 +24,10 @@ def differentiable(chain_of: Callable[[Any], Chain], args: Any, point: Point, mu
 
     def change(args, w, R):
         chain, (x, y, zl, zu), r = chain_of(args), unravel(w), unravel(R)
-        _, _, _, J, H = chain.linearised(x, y)
         below, above = jnp.isfinite(chain.lower), jnp.isfinite(chain.upper)
         to_lower = jnp.where(below, x - jnp.where(below, chain.lower, 0), 1)
         to_upper = jnp.where(above, jnp.where(above, chain.upper, 0) - x, 1)
-        kkt, _ = factorised(chain.shape, H, J, zl / to_lower + zu / to_upper, jnp.zeros((), x.dtype))
+        kkt, _ = factorised(chain.linearised(x, y), zl / to_lower + zu / to_upper, jnp.zeros((), x.dtype))
         dx, dy = kkt(-r.x - r.below / to_lower + r.above / to_upper, -r.y)
         return ravel_pytree(Point(dx, dy, (-r.below - zl * dx) / to_lower, (-r.above + zu * dx) / to_upper))[0]
 

@@ -16,7 +16,7 @@ from .._model.injection import declared_parameters
 from .._model.system import System
 from .._motion.simulate import simulate
 from .._motion.trajectory import Trajectory
-from .._program.jit import is_concrete
+from .._program.jit import compiled, is_concrete
 from .input import Piecewise
 from .interior_point import CONVERGED, INFEASIBLE, STEP_LIMIT
 
@@ -157,22 +157,23 @@ class OptimalMotion(eqx.Module):
         return "\n".join(["OptimalMotion", *(f"  {row}" for row in rows)])
 
 
-def _deviation(best: OptimalMotion) -> Any:
+@compiled
+def _deviation(best: OptimalMotion) -> Array:
     """Interval by interval, each from where the simulated motion is."""
     system = best.system if best.is_signal else with_signals(best.system, tuple(best.signals))
-    best = jax.tree.map(np.asarray, best)
     stages = next(iter(best.signals.values())).values.shape[1]
-    nodes, sizes, worst = best.ts[::stages], np.concatenate(best.sizes), 0.0
-    flat = lambda *state: np.concatenate([np.ravel(x) for x in jax.tree.leaves(state)])
-    state = jax.tree.map(lambda x: x[0], (best.q, best.qdot))
-    for k in range(len(nodes) - 1):
-        duration = np.asarray(nodes[k + 1] - nodes[k])
-        here = {name: Piecewise(np.asarray(nodes[k]), duration, signal.values[k : k + 1]) for name, signal in best.signals.items()}
-        motion = simulate(system, state[0], state[1], nodes[k : k + 2], {**best.params, **here}, rtol=EXACT, throw=False)
-        state = jax.tree.map(lambda x: np.asarray(x)[-1], (motion.q, motion.qdot))
-        planned = jax.tree.map(lambda x, k=k: x[(k + 1) * stages], (best.q, best.qdot))
-        off = np.max(np.abs(flat(*state) - flat(*planned)) / sizes)
-        if not np.isfinite(off):
-            return np.nan
-        worst = max(worst, float(off))
-    return worst
+    planned = jax.tree.map(lambda x: x[::stages], (best.ts, best.q, best.qdot))
+    flat = lambda *state: ravel_pytree(state)[0]
+
+    def off_after(state, of):
+        t, duration, pieces, (_, q, v) = of
+        here = {name: Piecewise(t, duration, values[None]) for name, values in pieces.items()}
+        ts = jnp.stack([t, t + duration])
+        motion = simulate(system, *state, ts, {**best.params, **here}, rtol=EXACT, throw=False)
+        state = jax.tree.map(lambda x: x[-1], (motion.q, motion.qdot))
+        return state, jnp.max(jnp.abs(flat(*state) - flat(q, v)) / jnp.concatenate(best.sizes))
+
+    start, ends = jax.tree.map(lambda x: x[0], planned[1:]), jax.tree.map(lambda x: x[1:], planned)
+    pieces = {name: signal.values for name, signal in best.signals.items()}
+    _, off = jax.lax.scan(off_after, start, (planned[0][:-1], jnp.diff(planned[0]), pieces, ends))
+    return jnp.max(off)  # NaN where one is

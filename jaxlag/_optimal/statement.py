@@ -1,7 +1,6 @@
 """What is asked, as a `Setting` and a `Task`: checked once."""
 
 from collections.abc import Iterable, Mapping, Sequence
-from functools import partial
 from typing import Any
 
 import jax
@@ -14,7 +13,7 @@ from .._mechanics.friction_elements import find_elements
 from .._mechanics.lagrange import imbalance
 from .._model.flat import bind
 from .._model.injection import check_function
-from .._model.numbers import count, number, numbers, refuse_nan
+from .._model.numbers import count, library, number, numbers, refuse_nan
 from .._model.paths import is_within, leaf_names, listed
 from .._model.system import System
 from .._model.validation import parameters, without_contacts, without_events
@@ -23,6 +22,7 @@ from .boundary import Boundary
 from .input import Held, is_called
 from .transcription import Limit, Setting, Task
 
+Ends = tuple[Array | np.ndarray, Array | np.ndarray]  # lower and upper bounds
 STATES = 3  # at random, at which it is asked whether a control does anything
 
 
@@ -33,15 +33,14 @@ def stated(system: System, boundary: Boundary, params: PyTree, given: Mapping[st
     params = _parameters(params, like, given["control"])
     bounds = {name: _pair(pair, f"`control[{name!r}]`", dtype) for name, pair in given["control"].items()}
     shapes = tuple((name, np.shape(low)) for name, (low, _) in bounds.items())
-    is_signal = _is_signal(system, like, params, shapes)
-    held = {**params, **_held(shapes, is_signal, dtype)}
-    flat = bind(system, like, held)
+    moves, is_signal = _moves(system, like, params, shapes)
+    flat = bind(system, like, {**params, **_held(shapes, is_signal, dtype)})
     if find_elements(flat) is not None:
         raise ValueError(
             "`system` must have a smooth dissipation in `optimise_motion`, but has dry friction, whose phases are not searched. Replace "
             "it by a force where it slips, and by a holonomic constraint where it sticks, or smooth it."
         )
-    _refuse_idle(_influence(system, like, held, shapes), shapes)
+    _refuse_idle(moves, shapes)
     T, durations = _duration(given["duration"], dtype)
     leaves, chosen = _chosen(given["over"], params, dtype)
     of_limits, sizes = _limits(given["within"] or {}, dtype)
@@ -68,10 +67,10 @@ def stated(system: System, boundary: Boundary, params: PyTree, given: Mapping[st
         params,
         number(given["t"], "`t`", dtype, cure="Give the time at the start."),
         T,
-        jnp.stack(durations if durations is not None else (T, T)),
+        library(*(durations or (T,))).stack(durations or (T, T)),
         boundary.states[0],
         nodes_of(boundary, setting.intervals),
-        jnp.asarray(boundary.returns, dtype),
+        np.array(boundary.returns, dtype),
         inputs=_joined(bounds.values(), dtype),
         limits=of_limits,
         chosen=chosen,
@@ -123,7 +122,7 @@ def _refuse(system: System, given: Mapping[str, Any]) -> tuple[Limit, ...]:
     return tuple(limits)
 
 
-def _pair(given: Any, label: str, dtype: Any) -> tuple[Array, Array]:
+def _pair(given: Any, label: str, dtype: Any) -> Ends:
     """(lower, upper) as arrays of one shape, infinite where there is no bound."""
     if given is None:
         given = None, None
@@ -131,26 +130,26 @@ def _pair(given: Any, label: str, dtype: Any) -> tuple[Array, Array]:
         raise ValueError(f"{label} must be (lower, upper), but is {given!r}. None is no bound.")
     lower, upper = (numbers(end, label, dtype) if end is not None else sign * np.inf for end, sign in zip(given, (-1, 1), strict=True))
     shape = np.broadcast_shapes(np.shape(lower), np.shape(upper))
-    lower, upper = (jnp.broadcast_to(jnp.asarray(end, dtype), shape) for end in (lower, upper))
-    if is_concrete((lower, upper)) and not bool(jnp.all(lower < upper)):
+    lower, upper = (library(end).broadcast_to(library(end).asarray(end, dtype), shape) for end in (lower, upper))
+    if is_concrete((lower, upper)) and not np.all(np.asarray(lower) < np.asarray(upper)):
         raise ValueError(f"{label} must be in order, but is {given!r}. Put the lower one first.")
     return lower, upper
 
 
-def _joined(pairs: Iterable[tuple[Array, Array]], dtype: Any) -> tuple[Array, Array]:
+def _joined(pairs: Iterable[Ends], dtype: Any) -> Ends:
     """All lower bounds, one after the other, and all upper ones."""
     lower, upper = zip(*pairs, strict=True) if (pairs := list(pairs)) else ((), ())
-    together = lambda ends: jnp.concatenate([jnp.zeros(0, dtype), *map(jnp.ravel, ends)])
+    together = lambda ends: library(*ends).concatenate([np.zeros(0, dtype), *(end.ravel() for end in ends)])
     return together(lower), together(upper)
 
 
-def _limits(within: Mapping[str, Any], dtype: Any) -> tuple[tuple[Array, Array], tuple[int, ...]]:
+def _limits(within: Mapping[str, Any], dtype: Any) -> tuple[Ends, tuple[int, ...]]:
     """Lower and upper limits, one after the other, and how many numbers each has."""
     pairs = [_pair(given[1:], f"`within[{name!r}]`", dtype) for name, given in within.items()]
     return _joined(pairs, dtype), tuple(pair[0].size for pair in pairs)
 
 
-def _chosen(over: Any, params: PyTree, dtype: Any) -> tuple[tuple[int, ...], tuple[Array, Array]]:
+def _chosen(over: Any, params: PyTree, dtype: Any) -> tuple[tuple[int, ...], Ends]:
     """Which leaves of params are to be chosen, and their bounds."""
     given = over if isinstance(over, Mapping) else dict.fromkeys(listed(over))
     names, every, found, pairs = leaf_names(params), jax.tree.leaves(params), [], []
@@ -160,61 +159,48 @@ def _chosen(over: Any, params: PyTree, dtype: Any) -> tuple[tuple[int, ...], tup
             raise ValueError(f"`over` must name entries of `params`, but holds {name!r}. There are {', '.join(names) or 'none'}.")
         lower, upper = _pair(bounds, f"`over[{name!r}]`", dtype)
         found += within
-        pairs += [(jnp.broadcast_to(lower, np.shape(every[i])), jnp.broadcast_to(upper, np.shape(every[i]))) for i in within]
+        pairs += [tuple(library(end).broadcast_to(end, np.shape(every[i])) for end in (lower, upper)) for i in within]
     return tuple(found), _joined(pairs, dtype)
 
 
-def _duration(given: Any, dtype: Any) -> tuple[Array, tuple[Array, Array] | None]:
+def _duration(given: Any, dtype: Any) -> tuple[Array | np.ndarray, Ends | None]:
     """T, as a guess where it is to be found between two."""
     cure = "Give a time, or (shortest, longest)."
     if not isinstance(given, (tuple, list)):
-        return jnp.asarray(number(given, "`duration`", dtype, positive=True, cure=cure)), None
+        return number(given, "`duration`", dtype, positive=True, cure=cure), None
     if len(given) != 2:
         raise ValueError(f"`duration` must be a time or two, but is {given!r}. {cure}")
-    shortest, longest = (jnp.asarray(number(end, "`duration`", dtype, positive=True, cure=cure)) for end in given)
+    shortest, longest = (number(end, "`duration`", dtype, positive=True, cure=cure) for end in given)
     if is_concrete((shortest, longest)) and not shortest < longest:
         raise ValueError(f"`duration` must be in order, but is {given!r}. {cure}")
     return jnp.sqrt(shortest * longest), (shortest, longest)
 
 
 def _held(shapes: Sequence[tuple[str, tuple[int, ...]]], is_signal: bool, dtype: Any) -> dict[str, Any]:
-    values = {name: jnp.zeros(shape, dtype) for name, shape in shapes}
+    values = {name: np.zeros(shape, dtype) for name, shape in shapes}
     return {name: Held(value) for name, value in values.items()} if is_signal else values
 
 
-def _is_signal(system: System, like: PyTree, params: PyTree, shapes: Any) -> bool:
-    """Whether functions of the system call their inputs."""
-    dtype = jax.tree.leaves(like)[0].dtype
-    q = ravel_pytree(like)[0]
-
-    def forces(is_signal):
-        flat = bind(system, like, {**params, **_held(shapes, is_signal, dtype)})
-        state, multipliers = (jnp.zeros((), dtype), q, q), jnp.zeros(flat.rows, dtype)
-        terms = [*flat.lagrangians.values(), flat.nonholonomic, lambda t, q, v: flat.holonomic(t, q)]
-        terms += [partial(term, multipliers=multipliers) for term in (*flat.dissipations.values(), *flat.forces.values())]
-        return jax.eval_shape(lambda *state: [term(*state) for term in terms], *state)
-
+def _moves(system: System, like: PyTree, params: PyTree, shapes: Any) -> tuple[Array, bool]:
+    """Whether each control changes the equations of motion, at some states; and whether functions of the system call them."""
     try:
-        forces(False)
+        return _influence(system, like, params, shapes, False), False
     except TypeError as error:
         if not is_called(error):
             raise
-        forces(True)
-        return True
-    return False
+        return _influence(system, like, params, shapes, True), True
 
 
 @compiled
-def _influence(system: System, like: PyTree, params: PyTree, shapes: Any) -> Array:
-    """Whether each control changes the equations of motion, at some states."""
-    q, held = ravel_pytree(like)[0], {name: params[name] for name, _ in shapes}
-    values, unravel = ravel_pytree(held)
+def _influence(system: System, like: PyTree, params: PyTree, shapes: Any, is_signal: bool) -> Array:
+    q = ravel_pytree(like)[0]
+    values, unravel = ravel_pytree(_held(shapes, is_signal, q.dtype))
 
     def rows(u, q, v, multipliers):
         flat = bind(system, like, {**params, **unravel(u)})
         return ravel_pytree(imbalance(flat, jnp.zeros((), q.dtype), q, v, v, multipliers))[0]
 
-    m = bind(system, like, params).rows
+    m = bind(system, like, {**params, **unravel(values)}).rows
     states = jnp.asarray(np.random.default_rng(0).uniform(0.5, 1.5, (STATES, 2 * q.size + m + values.size)), q.dtype)
     slopes = jax.vmap(lambda s: jax.jacfwd(rows)(s[: values.size], *jnp.split(s[values.size :], [q.size, 2 * q.size])))(states)
     moves = jnp.any(slopes != 0, axis=(0, 1))  # where it is NaN, too
@@ -230,12 +216,11 @@ def _refuse_idle(moves: Array, shapes: Sequence[tuple[str, tuple[int, ...]]]) ->
                 )
 
 
-def nodes_of(boundary: Boundary, intervals: int) -> Array:
+def nodes_of(boundary: Boundary, intervals: int) -> Array | np.ndarray:
     """What is given at the end of each interval."""
-    rows = jnp.full((intervals, boundary.states.shape[1]), jnp.nan, boundary.states.dtype)
     ends = [max(round(share * intervals), 1) - 1 for share in boundary.shares[1:]]
     if len(set(ends)) < len(ends):
         raise ValueError(f"`nodes` must be enough for all `waypoints` and the end, but {intervals} are not: two fall on one. Give more.")
-    for k, row in zip(ends, boundary.states[1:], strict=True):
-        rows = rows.at[k].set(row)
-    return rows
+    free = np.full(boundary.states.shape[1], np.nan, boundary.states.dtype)
+    states = dict(zip(ends, boundary.states[1:], strict=True))
+    return library(boundary.states).stack([states.get(k, free) for k in range(intervals)])

@@ -72,15 +72,15 @@ class Task(NamedTuple):
 
     like: PyTree  # coordinates
     params: PyTree
-    t: Float[Array, ""]
-    duration: Float[Array, ""]  # as guessed, where it is free
-    durations: Float[Array, "2"]
-    start: Float[Array, " x"]
-    nodes: Float[Array, "N x"]  # at the end of each interval
-    returns: Float[Array, " x"]  # one, where the end is the start
-    inputs: tuple[Float[Array, " u"], Float[Array, " u"]]
-    limits: tuple[Float[Array, " l"], Float[Array, " l"]]
-    chosen: tuple[Float[Array, " p"], Float[Array, " p"]]  # bounds of the parameters
+    t: Float[Array | np.ndarray, ""]
+    duration: Float[Array | np.ndarray, ""]  # as guessed, where it is free
+    durations: Float[Array | np.ndarray, "2"]
+    start: Float[Array | np.ndarray, " x"]
+    nodes: Float[Array | np.ndarray, "N x"]  # at the end of each interval
+    returns: Float[Array | np.ndarray, " x"]  # one, where the end is the start
+    inputs: tuple[Float[Array | np.ndarray, " u"], Float[Array | np.ndarray, " u"]]
+    limits: tuple[Float[Array | np.ndarray, " l"], Float[Array | np.ndarray, " l"]]
+    chosen: tuple[Float[Array | np.ndarray, " p"], Float[Array | np.ndarray, " p"]]  # bounds of the parameters
 
 
 class Sizes(NamedTuple):
@@ -124,6 +124,17 @@ class Moment(NamedTuple):
     u: Any
 
 
+class Local(NamedTuple):
+    """What is known of a motion at a point of collocation: the slope of q, what is left of rounding, slacks, h and the parameters."""
+
+    at: Moment
+    slopes: Array
+    drift: Array
+    slack: Array
+    h: Any
+    params: Any
+
+
 def wide(size: Array, like: Array) -> Array:
     """With axes of one before its own, as many as another array has."""
     return jnp.reshape(size, (1,) * (jnp.ndim(like) - jnp.ndim(size)) + jnp.shape(size))
@@ -142,37 +153,32 @@ class Transcription:
         self.c = points(STAGES)
         self.D, self.b = derivatives(self.c), weights(self.c)
         s, self.x = setting, 2 * n
-        self.widths = tuple(STAGES * k for k in (s.inputs, s.multipliers, s.positions, sum(s.limited), self.x))
-        self.shape = Shape(s.intervals, sum(self.widths), self.x, self.x + s.is_free + s.chosen)
+        self.widths = s.inputs, s.multipliers, s.positions, sum(s.limited), n, n  # of what a point has
+        self.shape = Shape(s.intervals, STAGES * sum(self.widths), self.x, self.x + s.is_free + s.chosen)
 
     # between unknowns and motions
 
-    def taken_apart(self, block: Array, border: Array, sizes: Sizes, task: Task) -> Path:
-        """The unknowns of one block or of all of them, by kind and in their units."""
-        parts = jnp.split(block, np.cumsum(self.widths)[:-1], axis=-1)
-        u, multipliers, drift, slack, x = (part.reshape(*block.shape[:-1], STAGES, -1) for part in parts)
-        state = jnp.concatenate([sizes.q, sizes.v])
-        start, rest = border[: self.x] * state, border[self.x :]
+    def own(self, sizes: Sizes) -> Array:
+        """What a number of one is of all that a point has."""
+        return jnp.concatenate([sizes.u, sizes.multipliers, sizes.drift, sizes.limits, sizes.q, sizes.v])
+
+    def taken_apart(self, x: Array, sizes: Sizes, task: Task) -> Path:
+        """Unknowns by kind and in their units."""
+        block, border = self.shape.split(x)
+        block = block.reshape(self.shape.intervals, STAGES, -1)
+        block = block * wide(self.own(sizes), block)
+        start, rest = border[: self.x] * jnp.concatenate([sizes.q, sizes.v]), border[self.x :]
         duration = rest[0] * task.duration if self.setting.is_free else task.duration
-        x, chosen = x * wide(state, x), rest[self.setting.is_free :] * sizes.chosen
-        of = (u, sizes.u), (multipliers, sizes.multipliers), (drift, sizes.drift), (slack, sizes.limits)
-        u, multipliers, drift, slack = (part * wide(size, part) for part, size in of)
-        return Path(u, multipliers, drift, slack, x[..., : self.n], x[..., self.n :], start, duration, chosen)
+        chosen = rest[self.setting.is_free :] * sizes.chosen
+        u, multipliers, drift, slack, q, v = jnp.split(block, np.cumsum(self.widths)[:-1], axis=-1)
+        return Path(u, multipliers, drift, slack, q, v, start, duration, chosen)
 
     def put_together(self, path: Path, sizes: Sizes, task: Task) -> Array:
         """The inverse."""
-        state = jnp.concatenate([sizes.q, sizes.v])
-        x = jnp.concatenate([path.q, path.v], axis=-1)
-        of = (path.u, sizes.u), (path.multipliers, sizes.multipliers), (path.drift, sizes.drift), (path.slack, sizes.limits)
-        parts = [part / wide(size, part) for part, size in (*of, (x, state))]
-        block = jnp.concatenate([part.reshape(len(x), -1) for part in parts], axis=-1)
+        block = jnp.concatenate(path[:6], axis=-1)
+        block = block / wide(self.own(sizes), block)
         duration = [path.duration[None] / task.duration] if self.setting.is_free else []
-        return jnp.concatenate([block.ravel(), path.start / state, *duration, path.chosen / sizes.chosen])
-
-    def whole(self, x: Array, sizes: Sizes, task: Task) -> Path:
-        """All unknowns in their units."""
-        block, border = self.shape.split(x)
-        return self.taken_apart(block, border, sizes, task)
+        return jnp.concatenate([block.ravel(), path.start / jnp.concatenate([sizes.q, sizes.v]), *duration, path.chosen / sizes.chosen])
 
     # the mechanics at one point
 
@@ -239,50 +245,57 @@ class Transcription:
 
     # the chain
 
-    def interval(self, z: Array, k: Any, sizes: Sizes, task: Task) -> tuple[Array, Array]:
-        """The cost and the equations of interval k, over their sizes."""
-        s, N = self.setting, self.setting.intervals
-        state = jnp.concatenate([sizes.q, sizes.v])
-        before, block, border = jnp.split(z, [self.x, self.x + self.shape.block])
-        of = self.taken_apart(block, border, sizes, task)
-        params, h = self.params(task, of.chosen), of.duration / N
-        values = jnp.concatenate([(before * state)[None], jnp.concatenate([of.q, of.v], axis=1)])
-        slopes = self.D @ values / h
-        at = Moment(task.t + h * (k + self.c), of.q, of.v, slopes[:, self.n :], of.multipliers, of.u)
-        balance, position, velocity = jax.vmap(lambda at: self.rows(task, params, at))(at)
-        carried = jax.vmap(lambda at, drift: self.carried(task, params, at, drift))(at, of.drift)
-        cost = h * self.b @ jax.vmap(lambda at: self.costs(s.cost, "`cost`", task, params, at))(at)
-        last = jax.tree.map(lambda x: x[-1], at)
-        if s.end_cost is not None:
-            cost = cost + jnp.where(k == N - 1, self.costs(s.end_cost, "`end_cost`", task, params, last), 0)
-        limited = jax.vmap(lambda at: self.limited(task, params, at))(at)
-        target = task.nodes[k]
-        at_node = jnp.where(jnp.isfinite(target), values[-1] - jnp.where(jnp.isfinite(target), target, 0), 0)
-        at_start = jnp.where(jnp.isfinite(task.start) & (k == 0), of.start - jnp.where(jnp.isfinite(task.start), task.start, 0), 0)
-        again = jnp.where(k == N - 1, task.returns * (values[-1] - of.start), 0)
+    def local(self, w: Array, k: Any, i: Any, sizes: Sizes, task: Task) -> Local:
+        """What point i of interval k depends on, by kind and in its units."""
+        s, state = self.setting, jnp.concatenate([sizes.q, sizes.v])
+        own, changes, whole = jnp.split(w, [sum(self.widths), sum(self.widths) + self.x])
+        u, multipliers, drift, slack, q, v = jnp.split(own * self.own(sizes), np.cumsum(self.widths)[:-1])
+        h = (whole[0] if s.is_free else 1) * task.duration / s.intervals
+        slopes, params = changes * state / h, self.params(task, whole[s.is_free :] * sizes.chosen)
+        at = Moment(task.t + h * (k + jnp.asarray(self.c)[i]), q, v, slopes[self.n :], multipliers, u)
+        return Local(at, slopes[: self.n], drift, slack, h, params)
+
+    def equations(self, w: Array, k: Any, i: Any, sizes: Sizes, task: Task) -> tuple[Array, Array]:
+        """The share of a point in the cost, and its equations, over their sizes."""
+        at, slopes, drift, slack, h, params = self.local(w, k, i, sizes, task)
+        balance, position, velocity = self.rows(task, params, at)
+        cost = h * jnp.asarray(self.b)[i] * self.costs(self.setting.cost, "`cost`", task, params, at)
         equations = [
-            balance / wide(sizes.balance, balance) / N,
-            (slopes[:, : self.n] - of.v - carried) / wide(sizes.v, of.v) / N,
-            position / wide(sizes.position, position),
-            velocity / wide(sizes.velocity, velocity),
-            (limited - of.slack) / wide(sizes.limits, limited),
-            at_node / state,
-            at_start / state,
-            again / state,
+            balance / sizes.balance / self.setting.intervals,
+            (slopes - at.v - self.carried(task, params, at, drift)) / sizes.v / self.setting.intervals,
+            position / sizes.position,
+            velocity / sizes.velocity,
+            (self.limited(task, params, at) - slack) / sizes.limits,
         ]
-        return cost / sizes.cost, jnp.concatenate([jnp.ravel(x) for x in equations])
+        return cost / sizes.cost, jnp.concatenate(equations)
+
+    def end(self, w: Array, sizes: Sizes, task: Task) -> Array:
+        """What is to be paid at the end, at the last point."""
+        if self.setting.end_cost is None:
+            return jnp.zeros((), w.dtype)
+        of = self.local(w, self.setting.intervals - 1, STAGES - 1, sizes, task)
+        return self.costs(self.setting.end_cost, "`end_cost`", task, of.params, of.at) / sizes.cost
+
+    def met(self, z: Array, k: Any, sizes: Sizes, task: Task) -> Array:
+        """The linear equations of interval k: the states that it must meet, over their sizes."""
+        state = jnp.concatenate([sizes.q, sizes.v])
+        start, last = z[self.x + self.shape.block :][: self.x], z[self.shape.block : self.x + self.shape.block]
+        off = lambda x, target: jnp.where(jnp.isfinite(target), x - jnp.where(jnp.isfinite(target), target, 0) / state, 0)
+        again = jnp.where(k == self.setting.intervals - 1, task.returns * (last - start), 0)
+        return jnp.concatenate([off(last, jnp.asarray(task.nodes)[k]), jnp.where(k == 0, off(start, task.start), 0), again])
 
     def chain(self, sizes: Sizes, task: Task) -> Chain:
         """The problem."""
         everywhere = lambda bound: jnp.broadcast_to(bound, (self.setting.intervals, STAGES, bound.size))
         ends = []
         for i, infinite in enumerate((-jnp.inf, jnp.inf)):
-            like = self.whole(jnp.full(self.shape.intervals * self.shape.block + self.shape.border, infinite), sizes, task)
+            like = self.taken_apart(jnp.full(self.shape.intervals * self.shape.block + self.shape.border, infinite), sizes, task)
             like = like._replace(u=everywhere(task.inputs[i]), slack=everywhere(task.limits[i]))
             like = like._replace(duration=task.durations[i], chosen=task.chosen[i])
             ends.append(self.put_together(like, sizes, task))
-        evaluate = lambda z, k, args: self.interval(z, k, *args)
-        return Chain(self.shape, evaluate, jnp.arange(self.setting.intervals), (sizes, task), *ends)
+        nothing, k = jnp.zeros(self.shape.local, sizes.q.dtype), jnp.arange(self.setting.intervals)
+        met = lambda k: (jax.jacfwd(lambda z: self.met(z, k, sizes, task))(nothing), -self.met(nothing, k, sizes, task))
+        return Chain(self.shape, self.D, self.equations, *jax.vmap(met)(k), self.end, (sizes, task), *ends)
 
     # motions
 
