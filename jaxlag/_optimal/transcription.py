@@ -342,7 +342,7 @@ class Transcription:
         s, params = self.setting, self.params(task, guess.chosen)
         of = jax.tree.map(lambda x: x[:, -1], (guess.q, guess.v, guess.u))
         times = task.t + guess.duration * jnp.arange(1, s.intervals + 1) / s.intervals
-        a = v / guess.duration
+        a, change = v / guess.duration, jnp.max(jnp.abs(guess.q - wide(guess.start[: self.n], guess.q)), axis=(0, 1))
         zero = lambda size: jnp.zeros((s.intervals, size), q.dtype)
         at = Moment(times, of[0], of[1], zero(self.n), zero(s.multipliers), of[2])
         kinds = {"q": 0, "v": 0, "a": 0, "multipliers": 0, "u": 0}
@@ -355,17 +355,17 @@ class Transcription:
         most = lambda x: jnp.max(jnp.abs(x), axis=0, initial=0.0)
         known = lambda x: jnp.where(jnp.isfinite(x) & (x > 0), x, 1)
         terms = most(left) + jnp.max(jnp.abs(of_balance["a"]) @ a, axis=0)
-        terms = terms + jnp.max(jnp.abs(of_balance["q"]) @ q, axis=0) + jnp.max(jnp.abs(of_balance["v"]) @ v, axis=0)
+        terms = terms + jnp.max(jnp.abs(of_balance["q"]) @ change, axis=0) + jnp.max(jnp.abs(of_balance["v"]) @ v, axis=0)
         balance = known(terms)
         position = known(jnp.max(jnp.abs(of_position["q"]) @ q, axis=0, initial=0.0))
         velocity = known(jnp.max(jnp.abs(of_velocity["v"]) @ v, axis=0, initial=0.0))
         inverse = lambda parts: 1 / known(jnp.max(jnp.stack([most(jnp.max(x, axis=1, initial=0.0)) for x in parts]), axis=0))
+        multipliers = self._held(of_balance, balance)
+        balance = jnp.maximum(balance, jnp.max(jnp.abs(of_balance["multipliers"]) @ multipliers, axis=0))
         by_u = [jnp.abs(of_balance["u"]) / balance[None, :, None], jnp.abs(of_velocity["u"]) / velocity[None, :, None]]
         width = (task.inputs[1] - task.inputs[0]) / 2
         u = jnp.where(jnp.isfinite(width) & (width > 0), width, inverse([*by_u]))
-        multipliers = inverse([jnp.abs(of_balance["multipliers"]) / balance[None, :, None]])
-        for name, size in (("multipliers", multipliers), ("u", u)):
-            balance = jnp.maximum(balance, jnp.max(jnp.abs(of_balance[name]) @ size, axis=0))
+        balance = jnp.maximum(balance, jnp.max(jnp.abs(of_balance["u"]) @ u, axis=0))
         drift = inverse([jnp.swapaxes(jnp.abs(of_position["q"]), 1, 2) / v[None, :, None]])
         limited = jax.vmap(lambda at: self.limited(task, params, at))(at)
         ends = jnp.stack([jnp.where(jnp.isfinite(end), jnp.abs(end), 0) for end in task.limits])
@@ -374,6 +374,21 @@ class Transcription:
         cost = self._size_of_cost(task, params, at, a, u, guess.duration)
         chosen = known(jnp.abs(guess.chosen))
         return Sizes(q, v, u, multipliers, drift, limits, chosen, cost, balance, position, velocity)
+
+    def _held(self, slopes, balance):
+        """Multipliers that hold forces of these sizes, in the metric of the masses, at half of the points."""
+
+        def one(M, G):
+            size = per_root(jnp.diagonal(M))
+            scaled = size[:, None] * G
+            lengths = jnp.linalg.norm(scaled, axis=0)
+            lengths = jnp.where(lengths > 0, lengths, 1)
+            return jnp.abs(jnp.linalg.pinv(scaled / lengths[None])) @ (size * balance) / lengths
+
+        if not self.setting.multipliers:
+            return jnp.zeros(0, balance.dtype)
+        size = jnp.median(jax.vmap(one)(slopes["a"], slopes["multipliers"]), axis=0)
+        return jnp.where(jnp.isfinite(size) & (size > 0), size, 1)
 
     def _size_of_cost(self, task, params, at, a, u, duration):
         """What it comes to with inputs, speeds and accelerations of their sizes."""

@@ -1,11 +1,13 @@
-"""Best motions beside CasADi with IPOPT: a cart-pole and an acrobot swing up, a double pendulum on a cart, each with the same polynomials.
+"""Best motions beside CasADi and opty, both with IPOPT: a cart-pole and an acrobot swing up, a double pendulum on a cart.
 
 `optimise_motion` and CasADi collocate the same equations at the same five Radau points of each of 40 intervals, from the same straight
 guess (one start, no refinement); IPOPT has its defaults but for the tolerance and no printing. Times of the first call, which builds and
 compiles, and of later ones (medians, one beside the other); costs; how far the simulated motion is off, which is computed within the time.
+opty collocates at midpoints, here of 200 intervals, whose costs are off by 2e-3 of themselves; it writes and compiles C.
 Then three ways to solve the transcribed problem of the block with a limited force on 10 intervals: this package's interior-point method,
 and SciPy's trust-constr and SLSQP with its derivatives.
 
+pip install casadi opty    # opty needs cyipopt, which is built with coinor-libipopt-dev and liblapack-dev (Debian)
 python tests/benchmarks/bench_optimal.py
 """
 
@@ -99,6 +101,34 @@ def casadis(L, push, end, T, most):
     return lambda: (float(solver(**given)["f"]), solver.stats())
 
 
+def optys(L, push, end, T, most, nodes=201):
+    """The same problem for opty and IPOPT."""
+    import sympy as sm
+    from opty import Problem
+
+    t, names = sm.Symbol("t"), list(end)
+    q, v, u = [sm.Function(n)(t) for n in names], [sm.Function("v_" + n)(t) for n in names], sm.Function("u")(t)
+    Q, V = sm.symbols([f"q_{n}" for n in names]), sm.symbols([f"v_{n}" for n in names])
+    lagrangian = sm.sympify(L(sm, dict(zip(names, Q, strict=True)), dict(zip(names, V, strict=True))))
+    along = dict(zip([*Q, *V], [*q, *v], strict=True))
+    rows = [x.diff(t) - y for x, y in zip(q, v, strict=True)]
+    for i, name in enumerate(names):
+        momentum, force = lagrangian.diff(V[i]).subs(along), lagrangian.diff(Q[i]).subs(along)
+        rows.append(momentum.diff(t) - force - push.get(name, 0) * u)
+    h, k = T / (nodes - 1), 2 * len(names)
+    goal = np.array([*end.values(), *[0.0] * len(names)])
+    ends = [x.subs(t, 0.0) for x in (*q, *v)] + [x.subs(t, T) - value for x, value in zip((*q, *v), goal, strict=True)]
+    cost = lambda free: h * np.sum(free[k * nodes :] ** 2)
+    slope = lambda free: np.append(np.zeros(k * nodes), 2 * h * free[k * nodes :])
+    given = {"instance_constraints": tuple(ends), "bounds": {u: (-most, most)}, "time_symbol": t, "integration_method": "midpoint"}
+    problem = Problem(cost, slope, sm.Matrix(rows), (*q, *v), nodes, h, **given)
+    for name, value in (("print_level", 0), ("sb", "yes"), ("tol", 4e-10)):
+        problem.add_option(name, value)
+    share = np.linspace(0, 1, nodes)
+    guess = np.concatenate([np.outer(goal[: len(names)], share).ravel(), np.repeat(goal[: len(names)] / T, nodes), np.zeros(nodes)])
+    return lambda: problem.solve(guess)[1]
+
+
 def seconds(run, rounds):
     taken = []
     for _ in range(rounds):
@@ -121,12 +151,14 @@ def main():
     for name, problem in PROBLEMS.items():
         run, best, first_of_ours = first(lambda problem=problem: ours(*problem))
         solve, (cost, stats), first_of_casadi = first(lambda problem=problem: casadis(*problem))
-        rounds = [(seconds(run, 1), seconds(solve, 1)) for _ in range(ROUNDS)]
-        again, peer = (statistics.median(times) for times in zip(*rounds, strict=True))
+        solve_midpoints, info, first_of_opty = first(lambda problem=problem: optys(*problem))
+        rounds = [(seconds(run, 1), seconds(solve, 1), seconds(solve_midpoints, 1)) for _ in range(ROUNDS)]
+        again, peer, other = (statistics.median(times) for times in zip(*rounds, strict=True))
         numbers = f"{first_of_ours:9.1f}{again:9.4f}{int(best.steps):7}{float(best.cost):14.7f}   {best.check():.1e}"
-        print(f"{name + ', jaxlag':44}{numbers}   {statistics.median(a / b for a, b in rounds):.2f} of IPOPT's time", flush=True)
+        print(f"{name + ', jaxlag':44}{numbers}   {statistics.median(a / b for a, b, _ in rounds):.2f} of CasADi's time", flush=True)
         ended = "" if stats["success"] else f"   {stats['return_status']}"
         print(f"{name + ', CasADi + IPOPT':44}{first_of_casadi:9.1f}{peer:9.4f}{stats['iter_count']:7}{cost:14.7f}{ended}", flush=True)
+        print(f"{name + ', opty + IPOPT':44}{first_of_opty:9.1f}{other:9.4f}{'':7}{info['obj_val']:14.7f}", flush=True)
     of_solvers()
 
 
