@@ -231,6 +231,7 @@ WINGS = {  # each imports only from those above it, and each file of a wing only
     "_optimal": [
         "radau",
         "block_system",
+        "chain",
         "interior_point",
         "sensitivity",
         "input",

@@ -7,7 +7,8 @@ import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
 
 from .._program.implicit import implicit_root
-from .interior_point import Chain, Point, factorised
+from .chain import Chain
+from .interior_point import Point, factorised
 
 
 def differentiable(chain_of: Callable[[Any], Chain], args: Any, point: Point, mu: Any) -> Point:

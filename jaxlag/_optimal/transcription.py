@@ -22,8 +22,8 @@ from .._model.flat import Flat, bind
 from .._model.injection import call
 from .._model.system import System
 from .block_system import Shape
+from .chain import Chain
 from .input import Held, is_called
-from .interior_point import Chain
 from .radau import derivatives, interpolation, points, weights
 
 STAGES = 5  # points of an interval: order 9; a swing-up is off by 2e-9 with 40 intervals of 5 points, by 2e-4 with 3
