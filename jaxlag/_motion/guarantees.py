@@ -4,6 +4,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from .._model.injection import asks_for
@@ -37,12 +38,14 @@ def verified(
     passed = ts < reached if equations.events else ts <= reached  # behind the end of a motion there is nothing
     there = finite | (passed & (result == RESULTS.successful))
     of_numbers = [(finite, RESULTS.undefined), (agree[:-1], RESULTS.no_multipliers)]
-    for projected, reason in [*of_numbers, *_guarantees(equations, ts, sample, evidence, rtol)]:
-        broken = there & ~projected
-        first = jnp.argmax(broken)
-        there = there & (jnp.cumsum(broken) == 0)
-        result = RESULTS.where(jnp.any(broken), reason, result)
-        reached = jnp.where(jnp.any(broken), jnp.minimum(reached, ts[first]), reached)
+    kept, reasons = zip(*of_numbers, *_guarantees(equations, ts, sample, evidence, rtol), strict=True)
+    every = jnp.stack(kept)  # one reduction for all: each is a kernel or two to compile
+    first = jnp.min(jnp.where(there & ~jnp.all(every, axis=0), np.arange(len(ts)), len(ts)))
+    of_first, broken = every[:, jnp.minimum(first, len(ts) - 1)], first < len(ts)
+    for holds, reason in reversed(list(zip(of_first, reasons, strict=True))):
+        result = RESULTS.where(broken & ~holds, reason, result)
+    there = there & (np.arange(len(ts)) < first)
+    reached = jnp.where(broken, jnp.minimum(reached, ts[jnp.minimum(first, len(ts) - 1)]), reached)
 
     def masked(leaf):
         return nan_unless(there.reshape(-1, *[1] * (leaf.ndim - 1)), leaf) if jnp.issubdtype(leaf.dtype, jnp.floating) else leaf

@@ -148,10 +148,13 @@ def _nearest(equations: EquationsOfMotion, flat: Flat, at: StatesAt, params, sea
 
 def with_status(ys, result, conditions, inputs) -> tuple[Array, RESULTS]:
     """States that were not reached as NaN; and the reason that the motion ended, the start or the input included."""
-    finite = jnp.all(jnp.array([jnp.all(jnp.isfinite(x)) for x in jax.tree.leaves(inputs) if eqx.is_inexact_array(x)]))
-    between = jnp.diff(inputs[-1])  # of times; traced ones may repeat the first or the last, as padding does, others where served
-    served = jnp.all(jnp.isfinite(ys[: between.size + 1])) | (result != RESULTS.successful) | jnp.all(between != 0)
-    ordered = jnp.all(between >= 0) & served
+    *given, ts = inputs
+    between = jnp.diff(ts, append=jnp.inf)  # of times; traced ones may repeat the first or the last, as padding does, others where served
+    found = jnp.all(jnp.isfinite(ys[: ts.size]), axis=1) if ys.ndim > 1 else jnp.ones(ts.size, bool)  # a start alone has no samples
+    known, served, apart, rising = jnp.all(jnp.stack([jnp.isfinite(ts), found, between != 0, between >= 0]), axis=1)  # one reduction
+    numbers = [ts[:0], *(jnp.ravel(x) for x in jax.tree.leaves(given) if eqx.is_inexact_array(x))]
+    finite = known & jnp.all(jnp.isfinite(jnp.concatenate(numbers)))
+    ordered = rising & (served | (result != RESULTS.successful) | apart)
     conditions = (*conditions, (ordered, RESULTS.unordered), (finite, RESULTS.not_finite))
     for passed, reason in conditions:
         result = RESULTS.where(passed, result, reason)

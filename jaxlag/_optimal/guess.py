@@ -15,6 +15,7 @@ from .solution import OptimalMotion
 from .transcription import STAGES, Path, Setting, Task, Transcription, per_root
 
 WAYS, BEND = 8, 0.5  # of how many, bent by this part of their size, the smoothest are taken
+ROUNDING = 0.75  # power of ε: a coordinate goes nowhere that goes through less than this part of another, in the metric of the masses
 PROJECTIONS = 20  # of Newton's steps onto the constraints
 
 
@@ -68,8 +69,10 @@ def sizes_of_states(of: Transcription, task: Task, path: Path) -> tuple[Array, A
     given = jnp.where(jnp.isfinite(given), jnp.abs(given), 0)
     q = jnp.maximum(largest(path.q), jnp.max(given[:, : of.n], axis=0))
     v = jnp.maximum(largest(path.v), jnp.max(given[:, of.n :], axis=0))
-    reach = of.reach(task, path)
-    q = jnp.where(q > 0, q, jnp.maximum(v * path.duration, reach))
+    reach, masses = of.reach(task, path)
+    weighed = jnp.sqrt(jnp.maximum(masses, 0)) * q
+    goes = (q > 0) & (weighed >= jnp.finfo(q.dtype).eps ** ROUNDING * jnp.max(weighed) * (masses > 0))
+    q = jnp.where(goes, q, jnp.maximum(v * path.duration, reach))
     q = jnp.where(q > 0, q, 1)
     return q, jnp.maximum(v, q / path.duration)
 

@@ -4,8 +4,8 @@ r"""Minima of sums over a chain of intervals, with equations and bounds, by an i
 
 Newton's method on the equations of a minimum of f - μ Σ ln(x - l) - μ Σ ln(u - x), with μ → 0. The symmetric system is solved by the
 positive definite matrix W + JᵀJ/δ of the chain, refined until it is that of J alone: so constraints may be redundant. Where it is not
-positive, W is raised. Steps are taken back until a filter of violation and cost accepts them; where none is, the violation alone is made
-smaller, by Levenberg and Marquardt's method.
+positive, W is raised. Steps are taken back until a filter of violation and cost accepts them, or corrected first where equations bend;
+where none is accepted, the violation alone is made smaller, by Levenberg and Marquardt's method.
 
 Source: Wächter & Biegler, Mathematical Programming 106 (2006) 25-57 (its numbers in brackets); Nocedal & Wright, Numerical Optimization,
 2nd ed., chapter 19; Friedlander & Orban, Math. Prog. Comp. 4 (2012) 71-107 (the regularised system).
@@ -31,11 +31,12 @@ SHORT = 0.3  # share of a step of restoration, of which the next is damped more
 REFINED = 3  # solutions of what is left
 LARGEST, SMALLEST = 2.0, 1e-4  # of violations, over those at the start (21)
 MARGIN, ARMIJO = 1e-5, 1e-4  # by which a step must be better (18, 20)
+BENT = 0.99  # of the violation before, which a correction of a step leaves at most for another to follow
 SHARES = 30  # of a step, each half of the one before
 KEPT = 60  # points in the filter
-ACCEPTABLE = 2 / 3  # power of the tolerance, an error at which a search that comes no further has found a minimum: 5e-7
+ACCEPTABLE = 4 / 7  # power of the tolerance, an error at which a search that comes no further has found a minimum: 5e-7
 SPREAD = 1e10  # by which a multiplier of a bound may differ from μ over the distance (16)
-CONVERGED, STEP_LIMIT, INFEASIBLE, STUCK = 0, 1, 2, 3
+CONVERGED, STEP_LIMIT, INFEASIBLE, STUCK, LEAPING = 0, 1, 2, 3, 4  # the last is for others to say, of points that satisfy the equations
 
 
 class Point(NamedTuple):
@@ -72,8 +73,8 @@ class _State(NamedTuple):
     error: Array
 
 
-def minimum(chain: Chain, start: Float[Array, " n"], *, tolerance: float, steps: int) -> Found:
-    """The minimum near a start."""
+def minimum(chain: Chain, start: Float[Array, " n"], *, tolerance: float, steps: int, corrections: int = 0) -> Found:
+    """The minimum near a start; steps that violate more than before are corrected so often at most."""
     x = _inside(chain, start)
     _, c = chain.values(x)
     finite = lambda bound, value: jnp.where(jnp.isfinite(bound), value, 0.0)
@@ -84,7 +85,7 @@ def minimum(chain: Chain, start: Float[Array, " n"], *, tolerance: float, steps:
     state = _State(
         point, zero + FIRST, _empty(x.dtype), zero, zero + RAISED, jnp.array(False), zero, limits, count, count - 1, zero + jnp.inf
     )
-    state = jax.lax.while_loop(lambda s: (s.status < 0) & (s.steps < steps), lambda s: _step(chain, s, tolerance), state)
+    state = jax.lax.while_loop(lambda s: (s.status < 0) & (s.steps < steps), lambda s: _step(chain, s, tolerance, corrections), state)
     f, c = chain.values(state.point.x)
     status = jnp.where(state.status < 0, STEP_LIMIT, state.status)
     nearly = (state.error <= tolerance**ACCEPTABLE) & (status != INFEASIBLE)
@@ -134,28 +135,26 @@ def _error(chain, point, c, gradient, mu):
     return jnp.maximum(jnp.maximum(slope, complementary) / dual, jnp.max(jnp.abs(c), initial=0.0))
 
 
-def _step(chain: Chain, s: _State, tolerance: float) -> _State:
+def _step(chain: Chain, s: _State, tolerance: float, corrections: int) -> _State:
     of = chain.linearised(s.point.x, s.point.y)
     gradient = of.gradient + of.backwards(s.point.y)
     s = s._replace(error=_error(chain, s.point, of.c, gradient, 0.0))
     found = s._replace(status=jnp.full_like(s.status, CONVERGED))
-    return jax.lax.cond(s.error <= tolerance, lambda: found, lambda: _moved(chain, s, of, gradient, tolerance))
+    return jax.lax.cond(s.error <= tolerance, lambda: found, lambda: _moved(chain, s, of, gradient, tolerance, corrections))
 
 
-def _moved(chain: Chain, s: _State, of: Linearised, gradient: Array, tolerance: float) -> _State:
+def _moved(chain: Chain, s: _State, of: Linearised, gradient: Array, tolerance: float, corrections: int) -> _State:
     (x, y, _, _), f, c = s.point, of.f, of.c
     mu = _barrier_now(chain, s, c, gradient, tolerance)
     kept = jnp.where(mu < s.mu, _empty(x.dtype), s.filter)
     below, above = _distances(chain, x)
     of_barrier = mu * (1 / above - 1 / below)  # where there is no bound, 1/∞
-    dx, dy, raised = _direction(chain, s, of, gradient + of_barrier)
     phi, theta = _barrier(chain, x, f, mu), jnp.sum(jnp.abs(c))
-    slope = jnp.sum((of.gradient + of_barrier) * dx)
     most = jnp.maximum(TO_BOUND, 1 - mu)
-    trials = _Trials(chain, x, mu, theta, phi, slope, kept, s.limits)
-    alpha_max = jnp.minimum(_way(below, dx, most), _way(above, -dx, most))
-    ways = lambda: trials.restored(dx, alpha_max, c, s.before), lambda: trials.searched(dx, alpha_max)
-    alpha, new_x, accepted, of_cost, left = jax.lax.cond(s.restoring, *ways)
+    share = lambda dx: jnp.minimum(_way(below, dx, most), _way(above, -dx, most))
+    of_step = lambda dx: jnp.sum((of.gradient + of_barrier) * dx)
+    trials = _Trials(chain, x, mu, theta, phi, of_step, share, kept, s.limits, corrections)
+    (alpha, dx, dy, new_x, accepted, of_cost), raised, left = _step_taken(chain, s, of, gradient + of_barrier, trials)
     zl, zu = _multipliers_of_bounds(chain, s.point, dx, new_x, mu, most)
     point = Point(new_x, jnp.where(s.restoring, jnp.where(left, 0.0, y), y + alpha * dy), zl, zu)
     begins = ~accepted & ~s.restoring
@@ -190,19 +189,20 @@ def _barrier_now(chain, s, c, gradient, tolerance):
     return jax.lax.while_loop(near, lower, s.mu)
 
 
-def _direction(chain, s, of, slope):
-    """A step of x and y, and by how much W was raised: Newton's; or Levenberg and Marquardt's to satisfy the equations alone, short where
-    a bound is near.
+def _step_taken(chain, s, of, slope, trials):
+    """A step, by how much W was raised, and whether a restoration has ended: Newton's; or Levenberg and Marquardt's to satisfy the
+    equations alone, short where a bound is near.
     """
     below, above = _distances(chain, s.point.x)
 
     def newton():
         kkt, raised = factorised(of, s.point.below / below + s.point.above / above, s.raised)
-        return *kkt(-slope, -of.c), raised
+        return trials.searched(lambda c: kkt(-slope, -c), of.c), raised, jnp.array(False)
 
     def to_equations():
         damped = factors(of.chain.shape, of.matrix(of.squares(), 1.0), s.damping * (1 + 1 / below**2 + 1 / above**2))
-        return solved(of.chain.shape, damped, -of.backwards(of.c)), jnp.zeros_like(of.c), s.raised
+        taken, left = trials.restored(solved(of.chain.shape, damped, -of.backwards(of.c)), of.c, s.before)
+        return taken, s.raised, left
 
     return jax.lax.cond(s.restoring, to_equations, newton)
 
@@ -267,6 +267,26 @@ def factorised(of: Linearised, sigma: Array, raised: Array) -> tuple[Callable, A
     return lambda *right: jax.lax.custom_linear_solve(product, right, solve, symmetric=True), raised
 
 
+class _Taken(NamedTuple):
+    """The share of a step that was taken, the step of x and y, x there; whether it was accepted, and whether the cost decided that."""
+
+    alpha: Array
+    dx: Array
+    dy: Array
+    x: Array
+    accepted: Bool[Array, ""]
+    of_cost: Bool[Array, ""]
+
+
+class _Whole(NamedTuple):
+    """A step of x and y, the share of it up to a bound, and the slope of φ along it."""
+
+    dx: Array
+    dy: Array
+    most: Array
+    slope: Array
+
+
 class _Trials(NamedTuple):
     """What a step from x may lead to: shares of it, one half of the other, until one is accepted."""
 
@@ -275,51 +295,82 @@ class _Trials(NamedTuple):
     mu: Array
     theta: Array
     phi: Array
-    slope: Array  # of φ along the step
+    slope: Callable  # of φ along a step
+    share: Callable  # of a step, up to a bound
     filter: Array
     limits: Array
+    corrections: int
 
     def _looked_at(self, x):
         f, c = self.chain.values(x)
         return jnp.sum(jnp.abs(c)), _barrier(self.chain, x, f, self.mu), c
 
-    def _is_better(self, theta, phi, alpha):
+    def _is_better(self, theta, phi, alpha, slope):
         """Whether the filter accepts, and whether the cost was what decided (19, 20)."""
         finite = jnp.isfinite(theta) & jnp.isfinite(phi)
         rounding = 10 * jnp.finfo(self.x.dtype).eps * jnp.abs(self.phi)
-        falls = (self.slope < 0) & (alpha * jnp.abs(self.slope) ** 2.3 > self.theta**1.1)
+        falls = (slope < 0) & (alpha * jnp.abs(slope) ** 2.3 > self.theta**1.1)
         by_cost = falls & (self.theta <= self.limits[1])
-        armijo = phi - self.phi - rounding <= ARMIJO * alpha * self.slope
+        armijo = phi - self.phi - rounding <= ARMIJO * alpha * slope
         either = (theta <= (1 - MARGIN) * self.theta) | (phi - rounding <= self.phi - MARGIN * self.theta)
         outside = jnp.all((theta < self.filter[:, 0]) | (phi - rounding < self.filter[:, 1])) & (theta <= self.limits[0])
         return finite & outside & jnp.where(by_cost, armijo, either), by_cost
 
-    def searched(self, dx, alpha_max):
-        """α, x there, whether it was accepted, and whether for its cost"""
+    def searched(self, solve: Callable, c: Array) -> _Taken:
+        """The step `solve(c)`, or the first of its halves that is accepted."""
+        no, one = jnp.array(False), jnp.zeros((), int)
+        if self.corrections:
+            whole, taken = self._corrected(solve, c)
+        else:
+            whole = self._whole(*solve(c))
+            taken, one = _Taken(whole.most, whole.dx, whole.dy, self.x, no, no), one - 1
+
+        def half(state):
+            count, _ = state
+            alpha = whole.most / 2.0**count
+            return count + 1, self._tried(alpha, whole.dx, whole.dy, alpha, whole.slope)[0]
+
+        return jax.lax.while_loop(lambda s: ~s[1].accepted & (s[0] <= SHARES), half, (one + 1, taken))[1]
+
+    def _whole(self, dx, dy):
+        return _Whole(dx, dy, self.share(dx), self.slope(dx))
+
+    def _tried(self, alpha, dx, dy, least, slope):
+        x = self.x + alpha * dx
+        theta, phi, there = self._looked_at(x)
+        return _Taken(alpha, dx, dy, x, *self._is_better(theta, phi, least, slope)), theta, there
+
+    def _corrected(self, solve, c):
+        """The step, and the whole of it; where that violates more than before, as equations that bend do, with what is violated at its end
+        asked for as well (section 2.4).
+        """
+
+        def once(state):
+            count, whole, taken, asked, before, _ = state
+            step = self._whole(*solve(asked))
+            whole = jax.tree.map(lambda new, old: jnp.where(count == 0, new, old), step, whole)
+            taken, theta, there = self._tried(step.most, step.dx, step.dy, whole.most, whole.slope)
+            bends = jnp.where(count == 0, theta >= self.theta, theta <= BENT * before) & jnp.isfinite(theta)
+            return count + 1, whole, taken, step.most * asked + there, theta, bends & ~taken.accepted
+
+        no, zero = jnp.array(False), jnp.zeros_like(self.theta)
+        nothing = _Whole(jnp.zeros_like(self.x), jnp.zeros_like(c), zero, zero)
+        start = jnp.zeros((), int), nothing, _Taken(zero, nothing.dx, nothing.dy, self.x, no, no), c, zero, ~no
+        _, whole, taken, *_ = jax.lax.while_loop(lambda s: s[5] & (s[0] <= self.corrections), once, start)
+        return whole, taken
+
+    def restored(self, dx: Array, c: Array, before: Array) -> tuple[_Taken, Array]:
+        """The same of a step dx in which violations alone must fall; and whether they did by enough."""
 
         def half(state):
             count, alpha, *_ = state
-            alpha = jnp.where(count == 0, alpha_max, alpha / 2)
-            x = self.x + alpha * dx
-            theta, phi, _ = self._looked_at(x)
-            return count + 1, alpha, x, *self._is_better(theta, phi, alpha)
-
-        start = jnp.zeros((), int), alpha_max, self.x, jnp.array(False), jnp.array(False)
-        _, alpha, x, good, by_cost = jax.lax.while_loop(lambda s: ~s[3] & (s[0] <= SHARES), half, start)
-        return alpha, x, good, by_cost, jnp.array(False)
-
-    def restored(self, dx, alpha_max, c, before):
-        """The same, where violations alone must fall; last, whether they did by enough."""
-
-        def half(state):
-            count, alpha, *_ = state
-            alpha = jnp.where(count == 0, alpha_max, alpha / 2)
+            alpha = jnp.where(count == 0, alpha, alpha / 2)
             x = self.x + alpha * dx
             theta, phi, c_there = self._looked_at(x)
             falls = jnp.sum(c_there**2) <= (1 - ARMIJO * alpha) * jnp.sum(c**2)
             return count + 1, alpha, x, jnp.isfinite(theta) & falls, theta, phi
 
-        start = jnp.zeros((), int), alpha_max, self.x, jnp.array(False), self.theta, self.phi
+        start = jnp.zeros((), int), self.share(dx), self.x, jnp.array(False), self.theta, self.phi
         _, alpha, x, good, theta, phi = jax.lax.while_loop(lambda s: ~s[3] & (s[0] <= SHARES), half, start)
         outside = jnp.all((theta < self.filter[:, 0]) | (phi < self.filter[:, 1]))
-        return alpha, x, good, jnp.array(False), good & outside & (theta <= 0.9 * before)
+        return _Taken(alpha, dx, jnp.zeros_like(c), x, good, jnp.array(False)), good & outside & (theta <= 0.9 * before)

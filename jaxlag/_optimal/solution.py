@@ -18,12 +18,14 @@ from .._motion.simulate import simulate
 from .._motion.trajectory import Trajectory
 from .._program.jit import compiled, is_concrete
 from .input import Piecewise
-from .interior_point import CONVERGED, INFEASIBLE, STEP_LIMIT
+from .interior_point import CONVERGED, INFEASIBLE, LEAPING, STEP_LIMIT
 
 REASONS = {
     CONVERGED: "a minimum",
     STEP_LIMIT: "`steps` were not enough. Allow more, give a nearer `guess`, or fewer `nodes` at first.",
     INFEASIBLE: "no motion satisfies all that is asked.",
+    LEAPING: "coordinates leap from point to point, as no motion does: `start` and `end` may lie where constraints leave no way between "
+    "them. Give more `nodes`, or a `guess` that goes all the way.",
 }
 NO_PROGRESS = "no step lowers the cost further, though the conditions of a minimum do not hold: look for a kink in `cost` or the system."
 EXACT = 1e-10  # tolerance of the motion that checks it

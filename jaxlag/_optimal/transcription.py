@@ -303,10 +303,19 @@ class Transcription:
         """All points of collocation, (N, s)."""
         N = self.setting.intervals
         times = task.t + path.duration / N * (np.arange(N)[:, None] + self.c)
-        before = jnp.concatenate([path.start[None], jnp.concatenate([path.q, path.v], axis=-1)[:-1, -1]])
-        values = jnp.concatenate([before[:, None], jnp.concatenate([path.q, path.v], axis=-1)], axis=1)
-        slopes = jnp.einsum("ij,kjx->kix", self.D, values) * N / path.duration
-        return Moment(times, path.q, path.v, slopes[..., self.n :], path.multipliers, path.u)
+        return Moment(times, path.q, path.v, self._slopes(path)[..., self.n :], path.multipliers, path.u)
+
+    def _slopes(self, path: Path) -> Array:
+        """Those of q and v, (N, s, x)."""
+        states = jnp.concatenate([path.q, path.v], axis=-1)
+        before = jnp.concatenate([path.start[None], states[:-1, -1]])
+        values = jnp.concatenate([before[:, None], states], axis=1)
+        return jnp.einsum("ij,kjx->kix", self.D, values) * self.setting.intervals / path.duration
+
+    def leap(self, path: Path, sizes: Sizes) -> Array:
+        """How far q̇ is from v at most, over its size: what keeps holonomic constraints makes up for rounding and discretisation alone."""
+        off = self._slopes(path)[..., : self.n] - path.v
+        return jnp.max(jnp.abs(off) / wide(sizes.v, off))
 
     def with_start(self, path: Path, task: Task) -> Moment:
         """The start, and all points of collocation one after the other."""
@@ -318,8 +327,10 @@ class Transcription:
             lambda first, rest: jnp.concatenate([first[None], rest.reshape(STAGES * len(rest), *rest.shape[2:])]), first, at
         )
 
-    def reach(self, task: Task, path: Path) -> Array:
-        """How far inputs and forces move each coordinate in the time: until the force that its own change makes holds it, if one does."""
+    def reach(self, task: Task, path: Path) -> tuple[Array, Array]:
+        """How far inputs and forces move each coordinate in the time: until the force that its own change makes holds it, if one does; and
+        its mass.
+        """
         params, zero = self.params(task, path.chosen), jnp.zeros(self.n, path.q.dtype)
 
         def one(at):
@@ -328,12 +339,14 @@ class Transcription:
             size = per_root(jnp.diagonal(M))
             inverse = jnp.outer(size, size) * jnp.linalg.pinv(M * jnp.outer(size, size))
             slowest = 1 / path.duration**2
-            return jnp.abs(inverse @ balance(zero, at.q)) / jnp.maximum(jnp.abs(jnp.diagonal(inverse @ stiffness)), slowest)
+            moved = jnp.abs(inverse @ balance(zero, at.q)) / jnp.maximum(jnp.abs(jnp.diagonal(inverse @ stiffness)), slowest)
+            return moved, jnp.diagonal(M)
 
         ends = [jnp.where(jnp.isfinite(end), end, 1) for end in task.inputs]
         at = jax.tree.map(lambda x: x[:, -1], self.moments(path, task)._replace(multipliers=0 * path.multipliers))
         of_each = [jax.vmap(one)(at._replace(u=jnp.broadcast_to(wide(end, at.u), at.u.shape))) for end in (*ends, 0 * ends[0])]
-        return jnp.max(jnp.nan_to_num(jnp.stack(of_each)), axis=(0, 1))
+        moved, masses = (jnp.max(jnp.nan_to_num(jnp.stack(x)), axis=(0, 1)) for x in zip(*of_each, strict=True))
+        return moved, masses
 
     # sizes
 

@@ -138,6 +138,54 @@ def test_the_brachistochrone():
     np.testing.assert_allclose(best.q, cycloid, atol=2e-4)
 
 
+@pytest.mark.parametrize("end", [0.5 * np.pi, np.pi])
+def test_a_pendulum_in_two_forms(end):
+    """From hanging to the side, and up to where it stands, in φ and in x, y with a rod: J and λ agree to 1e-8, and J with SciPy's. That the
+    end is x = l sin π, rounding of zero, says nothing about how far x goes on the way.
+    """
+    params, m, l, g = {"m": 0.7, "l": 0.4, "g": 9.81}, 0.7, 0.4, 9.81
+    by_angle = jl.System(lambda q, qdot, m, l, g: 0.5 * m * l**2 * qdot**2 + m * g * l * jnp.cos(q), force=lambda u: u)
+    in_x_y = jl.System(
+        lambda q, qdot, m, g: 0.5 * m * qdot @ qdot - m * g * q[1],
+        force=lambda q, u, l: u * jnp.array([-q[1], q[0]]) / l**2,
+        holonomic={"rod": lambda q, l: jnp.hypot(q[0], q[1]) - l},
+    )
+    at = lambda phi: (jnp.array([l * np.sin(phi), -l * np.cos(phi)]), jnp.zeros(2))
+    turn = {"duration": 1.0, "control": {"u": None}, "cost": effort, "starts": 1, "refinements": 0, "nodes": 80}
+    one = jl.optimise_motion(by_angle, (0.0, 0.0), (end, 0.0), params, **turn)
+    other = jl.optimise_motion(in_x_y, at(0.0), at(end), params, **turn)
+    np.testing.assert_allclose(other.cost, one.cost, rtol=1e-8)
+    pull = m * (l * np.asarray(one.qdot) ** 2 + g * np.cos(one.q))  # of the rod, by Newton's law along it
+    np.testing.assert_allclose(-other.multipliers["rod"], pull, atol=1e-8 * np.max(np.abs(pull)))
+    assert other.check() < 1e-9 and int(other.steps) <= 12  # 44 and 7 without corrections of steps along which the rod bends
+
+    def costates(t, y):  # of H = u² + p ω + r (u − m g l sin φ)/(m l²), whose u is −r/(2 m l²)
+        phi, omega, p, r = y
+        u = -r / (2 * m * l**2)
+        return np.vstack([omega, (u - m * g * l * np.sin(phi)) / (m * l**2), r * g / l * np.cos(phi), -p])
+
+    ends = lambda a, b: np.array([a[0], a[1], b[0] - end, b[1]])
+    t, phi = np.linspace(0, 1, 81), np.interp(np.linspace(0, 1, 81), one.ts, one.q)
+    start = np.vstack([phi, np.gradient(phi, t), 0 * t, -2 * m * l**2 * np.interp(t, one.ts, one.u["u"])])
+    found = integrate.solve_bvp(costates, ends, t, start, tol=1e-10, max_nodes=50000)
+    s = np.linspace(0, 1, 4001)
+    np.testing.assert_allclose(one.cost, integrate.simpson((found.sol(s)[3] / (2 * m * l**2)) ** 2, x=s), rtol=1e-8)
+
+
+@pytest.mark.parametrize("l", [1.0, 1e-6])
+def test_what_leaps_is_no_motion(l):
+    """A bead on one of two rails: no motion leads to the other, though points of collocation satisfy all equations with none in between."""
+    bead = jl.System(lambda qdot: 0.5 * qdot @ qdot, force=lambda u: jnp.array([u, 0.0]), holonomic={"rails": lambda q: q[1] ** 2 - l**2})
+    start, end = (jnp.array([0.0, -l]), jnp.zeros(2)), (jnp.array([l, l]), jnp.zeros(2))
+    across = {"duration": 1.0, "control": {"u": None}, "cost": effort, "nodes": 6}
+    with pytest.raises(ValueError, match=r"coordinates leap from point to point.*`start` and `end`.*Give more `nodes`, or a `guess`"):
+        jl.optimise_motion(bead, start, end, **across)
+    best = jl.optimise_motion(bead, start, end, **across, throw=False)
+    assert not best.converged and "leap" in str(best)
+    along = jl.optimise_motion(bead, start, (jnp.array([l, -l]), jnp.zeros(2)), **across)
+    np.testing.assert_allclose(along.cost, 12 * l**2, rtol=1e-8)
+
+
 # Kelly, SIAM Review 59 (2017) 849-904, section 6: masses of cart and pole, length; 1 m in 2 s, a force of at most 20 N, a track of 2 m
 KELLY = {"m1": 1.0, "m2": 0.3, "l": 0.5, "g": 9.81}
 
