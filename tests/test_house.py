@@ -490,3 +490,14 @@ def test_mutations_are_of_what_stands_in_the_package():
     for mutation in found:
         assert mutate.mutated(mutation, (mutate.ROOT / mutation.file).read_text())
         assert all((mutate.ROOT / "tests" / path).exists() for path in mutation.first), mutation.wrong
+
+
+def test_benchmarks_import_what_their_siblings_have():
+    folder = pathlib.Path(__file__).parent / "benchmarks"
+    trees = {path.stem: ast.parse(path.read_text()) for path in folder.glob("*.py")}
+    names = lambda tree: {n.id for n in ast.walk(tree) if isinstance(n, ast.Name)} | {getattr(n, "name", "") for n in tree.body}
+    defined = {stem: names(tree) for stem, tree in trees.items()}
+    imports = [(stem, n) for stem, tree in trees.items() for n in ast.walk(tree) if isinstance(n, ast.ImportFrom) and n.module in trees]
+    assert imports
+    missing = [f"{stem}: {n.module}.{x.name}" for stem, n in imports for x in n.names if x.name not in defined[n.module]]
+    assert not missing, missing

@@ -318,19 +318,18 @@ class _Trials(NamedTuple):
 
     def searched(self, solve: Callable, c: Array) -> _Taken:
         """The step `solve(c)`, or the first of its halves that is accepted."""
-        no, one = jnp.array(False), jnp.zeros((), int)
         if self.corrections:
-            whole, taken = self._corrected(solve, c)
+            halvings, (whole, taken) = 1, self._corrected(solve, c)
         else:
-            whole = self._whole(*solve(c))
-            taken, one = _Taken(whole.most, whole.dx, whole.dy, self.x, no, no), one - 1
+            halvings, whole, no = 0, self._whole(*solve(c)), jnp.array(False)
+            taken = _Taken(whole.most, whole.dx, whole.dy, self.x, no, no)
 
         def half(state):
             count, _ = state
             alpha = whole.most / 2.0**count
             return count + 1, self._tried(alpha, whole.dx, whole.dy, alpha, whole.slope)[0]
 
-        return jax.lax.while_loop(lambda s: ~s[1].accepted & (s[0] <= SHARES), half, (one + 1, taken))[1]
+        return jax.lax.while_loop(lambda s: ~s[1].accepted & (s[0] <= SHARES), half, (jnp.array(halvings), taken))[1]
 
     def _whole(self, dx, dy):
         return _Whole(dx, dy, self.share(dx), self.slope(dx))

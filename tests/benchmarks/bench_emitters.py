@@ -38,7 +38,7 @@ PROGRAMS = {
     "vehicle, motion": (ride, 3000.0),
     "vehicle, derivative": (jax.jacfwd(lambda b: ride(b).q), 3000.0),
     "vehicle, 1024 motions": (rides, np.linspace(2500.0, 3500.0, 1024)),
-    "pendulum on a rod with friction": swing("on a rod"),
+    "pendulum on a rod with friction": swing("friction on a rod"),
     "8 links, 1024 accelerations": (lambda states: jax.vmap(by_jaxlag)(*states), STATES),
     "the same by hand in arrays": (lambda states: jax.vmap(by_arrays)(*states), STATES),
 }

@@ -12,7 +12,7 @@ import time
 import jax
 import jax.numpy as jnp
 import numpy as np
-from bench_first_use import CODES
+from bench_first_use import VEHICLE
 from timing import medians, once
 
 import jaxlag as jl
@@ -37,7 +37,7 @@ def of_a_fit(repeats=50):
     fit()
     whole_fit, search = (importlib.import_module(f"jaxlag._fit.{name}") for name in ("fit", "minimise"))
     parts = {
-        "setting up the problem": (whole_fit, "_checked_problem"),
+        "setting up the problem": (whole_fit, "checked_problem"),
         "residuals with Jacobian": (search, "linearise"),
         "report": (whole_fit, "report"),
     }
@@ -68,7 +68,7 @@ def of_a_fit(repeats=50):
 
 def of_a_first_motion(name, processes=5):
     """Seconds of the parts of a first motion in a fresh process, as reported by JAX; nested parts are counted in both."""
-    code = CODES[name].split("for name, action in")[0]
+    code = VEHICLE[name].split("for name, action in")[0]
     ending = """
 spent.clear()
 jax.block_until_ready(motion())
@@ -100,7 +100,7 @@ def of_many_motions():
 
 def main():
     tables = {"a repeated fit": of_a_fit(), "1024 motions": of_many_motions()}
-    tables |= {f"a first motion, {name}": of_a_first_motion(name) for name in CODES}
+    tables |= {f"a first motion, {name}": of_a_first_motion(name) for name in VEHICLE}
     for title, parts in tables.items():
         whole = sum(parts.values())
         print(f"\n**{title}: {1e3 * whole:.3g} ms**\n")

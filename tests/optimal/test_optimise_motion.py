@@ -138,7 +138,7 @@ def test_the_brachistochrone():
     np.testing.assert_allclose(best.q, cycloid, atol=2e-4)
 
 
-@pytest.mark.parametrize("end", [0.5 * np.pi, np.pi])
+@pytest.mark.parametrize("end", [pytest.param(0.5 * np.pi, marks=pytest.mark.slow), np.pi])
 def test_a_pendulum_in_two_forms(end):
     """From hanging to the side, and up to where it stands, in φ and in x, y with a rod: J and λ agree to 1e-8, and J with SciPy's. That the
     end is x = l sin π, rounding of zero, says nothing about how far x goes on the way.
