@@ -11,10 +11,11 @@ from jaxtyping import Array, PyTree
 
 from .._mechanics.friction_elements import find_elements
 from .._mechanics.lagrange import imbalance
-from .._model.flat import bind
+from .._model.flat import Flat, bind, bound_from
 from .._model.injection import check_function
 from .._model.numbers import count, library, number, numbers, refuse_nan
 from .._model.paths import is_within, leaf_names, listed
+from .._model.reading import Source
 from .._model.system import System
 from .._model.validation import parameters, without_contacts, without_events
 from .._program.jit import compiled, is_concrete
@@ -26,6 +27,11 @@ Ends = tuple[Array | np.ndarray, Array | np.ndarray]  # lower and upper bounds
 STATES = 3  # at random, at which it is asked whether a control does anything
 
 
+def _counted(flat: Flat, t: Any, q: Any, v: Any) -> tuple[int, int, bool]:
+    """How many rows all constraints have, and the holonomic ones; and whether there is dry friction."""
+    return flat.rows, flat.rows_of_bilateral, find_elements(flat) is not None
+
+
 def stated(system: System, boundary: Boundary, params: PyTree, given: Mapping[str, Any]) -> tuple[Setting, Task]:
     """Of the arguments of `optimise_motion`, `given` by name."""
     limits = _refuse(system, given)
@@ -34,8 +40,9 @@ def stated(system: System, boundary: Boundary, params: PyTree, given: Mapping[st
     bounds = {name: _pair(pair, f"`control[{name!r}]`", dtype) for name, pair in given["control"].items()}
     shapes = tuple((name, np.shape(low)) for name, (low, _) in bounds.items())
     moves, is_signal = _moves(system, like, params, shapes)
-    flat = bind(system, like, {**params, **_held(shapes, is_signal, dtype)})
-    if find_elements(flat) is not None:
+    source = Source.of(system, like, {**params, **_held(shapes, is_signal, dtype)}, None)
+    multipliers, positions, rubs = source.read(_counted, bound_from)
+    if rubs:
         raise ValueError(
             "`system` must have a smooth dissipation in `optimise_motion`, but has dry friction, whose phases are not searched. Replace "
             "it by a force where it slips, and by a holonomic constraint where it sticks, or smooth it."
@@ -54,8 +61,8 @@ def stated(system: System, boundary: Boundary, params: PyTree, given: Mapping[st
         is_signal=is_signal,
         intervals=count(given["nodes"], "`nodes`", cure="Give the number of intervals."),
         is_free=durations is not None,
-        multipliers=flat.rows,
-        positions=flat.rows_of_bilateral,
+        multipliers=multipliers,
+        positions=positions,
         limited=sizes,
         chosen=chosen[0].size,
         steps=count(given["steps"], "`steps`", cure="Give a number of steps."),
