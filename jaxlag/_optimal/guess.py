@@ -70,9 +70,14 @@ def sizes_of_states(of: Transcription, task: Task, path: Path) -> tuple[Array, A
     q = jnp.maximum(largest(path.q), jnp.max(given[:, : of.n], axis=0))
     v = jnp.maximum(largest(path.v), jnp.max(given[:, of.n :], axis=0))
     reach, masses = of.reach(task, path)
-    weighed = jnp.sqrt(jnp.maximum(masses, 0)) * q
-    goes = (q > 0) & (weighed >= jnp.finfo(q.dtype).eps ** ROUNDING * jnp.max(weighed) * (masses > 0))
-    q = jnp.where(goes, q, jnp.maximum(v * path.duration, reach))
+    roots = jnp.sqrt(jnp.maximum(masses, 0))
+    most = jnp.max(roots * q)
+    goes = (q > 0) & (roots * q >= jnp.finfo(q.dtype).eps ** ROUNDING * most * (masses > 0))
+    # An input without bounds has no size of its own: what it moves goes as far as the others, in the metric of the masses.
+    as_others = jnp.where((most > 0) & (masses > 0), most / jnp.where(masses > 0, roots, 1), jnp.inf)
+    bounded = jnp.all(jnp.isfinite(jnp.stack(task.inputs)))
+    by_forces = jnp.minimum(jnp.maximum(v * path.duration, reach), as_others)
+    q = jnp.where(goes, q, jnp.where(bounded | jnp.isinf(as_others), by_forces, as_others))
     q = jnp.where(q > 0, q, 1)
     return q, jnp.maximum(v, q / path.duration)
 

@@ -138,8 +138,8 @@ def test_the_brachistochrone():
     np.testing.assert_allclose(best.q, cycloid, atol=2e-4)
 
 
-@pytest.mark.parametrize("end", [pytest.param(0.5 * np.pi, marks=pytest.mark.slow), np.pi])
-def test_a_pendulum_in_two_forms(end):
+@pytest.mark.parametrize(("end", "steps"), [pytest.param(0.5 * np.pi, 12, marks=pytest.mark.slow), (np.pi, 20)])
+def test_a_pendulum_in_two_forms(end, steps):
     """From hanging to the side, and up to where it stands, in φ and in x, y with a rod: J and λ agree to 1e-8, and J with SciPy's. That the
     end is x = l sin π, rounding of zero, says nothing about how far x goes on the way.
     """
@@ -157,7 +157,7 @@ def test_a_pendulum_in_two_forms(end):
     np.testing.assert_allclose(other.cost, one.cost, rtol=1e-8)
     pull = m * (l * np.asarray(one.qdot) ** 2 + g * np.cos(one.q))  # of the rod, by Newton's law along it
     np.testing.assert_allclose(-other.multipliers["rod"], pull, atol=1e-8 * np.max(np.abs(pull)))
-    assert other.check() < 1e-9 and int(other.steps) <= 12  # 44 and 7 without corrections of steps along which the rod bends
+    assert other.check() < 1e-9 and int(other.steps) <= steps  # to the side 44 without corrections of steps along which the rod bends
 
     def costates(t, y):  # of H = u² + p ω + r (u − m g l sin φ)/(m l²), whose u is −r/(2 m l²)
         phi, omega, p, r = y
@@ -170,6 +170,29 @@ def test_a_pendulum_in_two_forms(end):
     found = integrate.solve_bvp(costates, ends, t, start, tol=1e-10, max_nodes=50000)
     s = np.linspace(0, 1, 4001)
     np.testing.assert_allclose(one.cost, integrate.simpson((found.sol(s)[3] / (2 * m * l**2)) ** 2, x=s), rtol=1e-8)
+
+
+def test_a_pendulum_in_any_units():
+    """From hanging to standing, x from rounding to rounding, by an input without bounds: cost and derivative, with lengths and the clock
+    by 1e9 and 1e-9.
+    """
+    in_x_y = jl.System(
+        lambda q, qdot, m, g: 0.5 * m * qdot @ qdot - m * g * q[1],
+        force=lambda q, u, l: u * jnp.array([-q[1], q[0]]) / l**2,
+        holonomic={"rod": lambda q, l: jnp.hypot(q[0], q[1]) - l},
+    )
+    found = []
+    for m, s in ((1.0, 1.0), (1e-9, 1e9), (1e9, 1e-9)):
+
+        def cost(mass, m=m, s=s):
+            at = lambda phi: (0.4 * m * jnp.array([np.sin(phi), -np.cos(phi)]), jnp.zeros(2))
+            params = {"m": mass, "l": 0.4 * m, "g": 9.81 * m / s**2}
+            given = {"duration": s, "control": {"u": None}, "cost": effort, "starts": 1, "refinements": 0}
+            return jl.optimise_motion(in_x_y, at(0.0), at(np.pi), params, **given).cost / (m**4 / s**3)
+
+        found.append(jax.value_and_grad(cost)(0.7))
+    np.testing.assert_allclose(found[0][1], 2 * found[0][0] / 0.7, rtol=1e-6)  # J ~ m²
+    np.testing.assert_allclose(found[1:], [found[0]] * 2, rtol=1e-8)
 
 
 @pytest.mark.parametrize("l", [1.0, 1e-6])
