@@ -60,6 +60,7 @@ def on_contacts(equations: Any, given: Any, guess: Float[Array, " u"], near: Cal
     def turn(tried: Tried) -> Tried:
         here = fixed._replace(closed=tried.closed)
         root = near(here, equations.multipliers_at(here, guess, units))
+        root = root._replace(w=_with_nothing_at_open(equations, here, root.w))
         flips = _wrong(equations, here, root.w) & root.found
         holds = root.found & ~jnp.any(flips)
         moved = jnp.linalg.norm((root.w - guess)[: equations.moving.size] / jnp.where(units > 0, units, 1)[equations.moving])
@@ -72,10 +73,12 @@ def on_contacts(equations: Any, given: Any, guess: Float[Array, " u"], near: Cal
         done = (holds & (tried.met == 0)) | (met > jnp.sum(order < count))
         return Tried(met, jnp.where(goes_on, tried.changes + 1, 0), closed, chosen, kept, distance, done)
 
-    first = near(fixed, guess)._replace(found=jnp.array(False))
+    first = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), jax.eval_shape(near, fixed, guess))._replace(w=guess)
     start = Tried(jnp.array(0), jnp.array(0), fixed.closed, fixed.closed, first, jnp.asarray(jnp.inf, guess.dtype), jnp.array(False))
     found = jax.lax.while_loop(lambda tried: ~tried.done, turn, start)
-    return given._replace(closed=found.chosen), jax.lax.stop_gradient(found.root)
+    chosen, root = given._replace(closed=found.chosen), found.root
+    there = near(jax.lax.stop_gradient(chosen), root.w)  # once more, with those that happen to touch
+    return chosen, jax.lax.stop_gradient(there._replace(found=root.found & there.found))
 
 
 def _order(equations: Any, given: Any, guess: Float[Array, " u"]) -> Int[Array, " c"]:
@@ -110,6 +113,12 @@ class AtContacts(NamedTuple):
         reach = jnp.max(jnp.maximum(jnp.abs(q), jnp.abs(given.q)) / lengths, initial=0.0)
         largest = jnp.max(jnp.abs(forces), initial=0.0)
         return cls(flat.gaps(given.t, q) / size, forces, little * reach, little * largest, G * lengths[None] / size[:, None])
+
+
+def _with_nothing_at_open(equations: Any, given: Any, w: Float[Array, " u"]) -> Float[Array, " u"]:
+    """w with no force at the contacts that are open: there no equation holds it, and what is left of it is rounding."""
+    start = equations.sizes[2] + equations.rows_of_bilateral
+    return w.at[start : start + given.closed.size].multiply(given.closed)
 
 
 def _wrong(equations: Any, given: Any, w: Float[Array, " u"]) -> Bool[Array, " c"]:
