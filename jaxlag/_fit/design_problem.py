@@ -131,12 +131,11 @@ class DesignProblem:
     def of_limits(self, y: np.ndarray, finer: int = 1) -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:
         """Of each limit its margins over all motions, their derivatives, and their times."""
         found: list[list[tuple[np.ndarray, np.ndarray, np.ndarray]]] = [[] for _ in self.limits]
-        shares = np.linspace(0.0, 1.0, finer * (ALONG - 1) + 1)
         functions = tuple({limit.name: limit.function for limit in self.limits}.items())
         for i, (part, own) in enumerate(zip(self.parts, self.split(y), strict=True)):
             if part.batch is None or not self.limits:
                 continue
-            said, slopes = jax.tree.map(np.asarray, along_the_motion(part, jnp.asarray(own), functions, shares))
+            shares, said, slopes = _along(part, own, functions, finer)
             begin, *_, end = np.asarray(part.batch.ts[0])
             for of_limit, limit in zip(found, self.limits, strict=True):
                 margin, slope = limit.margins(said[limit.name], slopes[limit.name])
@@ -206,6 +205,18 @@ def limits_of(within: Mapping[str, Any] | None, parts: Sequence[Planned]) -> tup
     if limits and all(part.batch is None for part in parts):
         raise ValueError("`within` must limit motions, but the plan has no `Experiment`. Use `bounds`.")
     return tuple(limits)
+
+
+def _along(part: Planned, y: np.ndarray, functions: tuple[tuple[str, Callable], ...], finer: int) -> tuple[np.ndarray, Any, Any]:
+    """Shares of the time, what functions say there and its derivatives; finer by further motions with as many samples: one program."""
+    coarse = np.linspace(0.0, 1.0, ALONG)
+    found = [(coarse, *along_the_motion(part, jnp.asarray(y), functions, coarse))]
+    for k in range(1, finer):
+        shares = np.append(0.0, coarse[:-1] + k / finer * coarse[1])  # a motion begins at its start
+        found.append(jax.tree.map(lambda x: x[1:], (shares, *along_the_motion(part, jnp.asarray(y), functions, shares))))
+    shares, said, slopes = jax.tree.map(lambda *x: np.concatenate(x), *found)
+    order = np.argsort(shares)
+    return jax.tree.map(lambda x: x[order], (shares, said, slopes))
 
 
 def _sized(part: Planned, scale: Any) -> Planned:

@@ -9,7 +9,7 @@ from .constrained_minimum import ASTRAY, KEPT, Minimum, constrained_minimum, nea
 from .design_criteria import is_sharp
 from .design_problem import SHARP, SHARPNESS, DesignProblem
 
-REACH, SMALLEST, BOXES = 1.0, 1e-4, 30  # of one search, in units of what is chosen, and how many follow each other
+REACH, SMALLEST, BOXES = 1 / 64, 1e-4, 30  # of a search that begins where one went astray, in units of what is chosen; how many follow
 FINER = 8  # times more than those at which limits are kept in the search, at which that is checked
 ROUNDS = 5  # of searches with limits moved by what was found between those times
 
@@ -44,7 +44,7 @@ def _step_by_step(problem: DesignProblem, sharpness: float, y: np.ndarray, steps
         is_at_edge = np.any((np.abs(found.y - y) > reach * (1 - KEPT)) & (found.y > lower) & (found.y < upper))
         y = np.concatenate([part.settled(own) for part, own in zip(problem.parts, problem.split(found.y), strict=True)])
         if found.reason == ASTRAY:
-            if reach < SMALLEST or (reach < REACH / 100 and last - found.cost < tolerance):
+            if reach < SMALLEST or (reach < REACH and last - found.cost < tolerance):
                 return found
             reach = min(reach / 4, REACH)
         elif not is_at_edge or found.reason or not np.isfinite(found.cost):

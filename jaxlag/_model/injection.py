@@ -9,7 +9,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from .._program.user_calls import asked
 from .user_errors import explain_tracing_errors
 
 STATE_NAMES = ("t", "q", "qdot", "qddot", "multipliers", "params", "states")  # "states": as they flow, for composed functions
@@ -93,7 +92,7 @@ def call(function: Callable, role: str, params: Any, /, **state: Any) -> Any:
         elif p.name in available:
             keywords[p.name] = available[p.name]
     with explain_tracing_errors(role):
-        returned = asked(function, positional, keywords)
+        returned = function(*positional, **keywords)
     return floating(returned, role, jnp.result_type(float, *filter(_is_floating, jax.tree.leaves(state))))
 
 

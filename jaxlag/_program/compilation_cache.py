@@ -23,10 +23,10 @@ def keep_compiled(folder: str | os.PathLike | None = None, *, max_bytes: int = 2
     r"""Keeps compiled programs on disk, so that the next process reads them instead of compiling.
 
     Call it once, before the first motion. It sets JAX's persistent compilation cache for all programs of the process. On a CPU, calls from
-    Python, such as `simulate`, a gradient of it and `fit`, skip tracing, too: the cache key is your functions' jaxprs, with shapes,
-    settings, and the versions of JAX and jaxlag. Functions that were called before this one, functions that have a derivative rule of their
-    own (`jax.custom_jvp`) or call Python, and motions within your own `jit` are traced as usual. Only `simulate(..., progress=True)`
-    compiles again, because the compiled program calls its progress bar.
+    Python, such as `simulate`, a gradient of it and `fit`, skip tracing, too: the cache key is your functions, by their code and all that
+    it refers to, with shapes, settings, and the versions of JAX and jaxlag. Functions that have a derivative rule of their own
+    (`jax.custom_jvp`) or refer to what may be anything, such as an open file, and motions within your own `jit` are traced as usual. Only
+    `simulate(..., progress=True)` compiles again, because the compiled program calls its progress bar.
 
     **Arguments:**
 

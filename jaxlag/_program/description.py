@@ -1,27 +1,42 @@
-"""Objects and programs in words: where the words are equal, so is what they describe.
+"""Objects in words: where the words are equal, so is what they describe. A function is described by its code and all that this refers to.
 
-What cannot be described for certain is refused: objects of unknown kinds, and functions with a derivative rule of their own, whose rule
-no program shows before it is differentiated.
+What cannot be described for certain is refused: objects of unknown kinds, code that reads a file or changes what others refer to, a
+function with a derivative rule of its own, and one that was described before and refers to something else now: of what was traced with it
+a part may be left.
 """
 
+import builtins
 import dataclasses
+import dis
 import enum
+import functools
 import hashlib
 import sys
+import types
 from collections.abc import Callable, Mapping
 from typing import Any
 
+import equinox as eqx
 import jax
 import numpy as np
-from jax.extend import core
-from jax.extend.core import primitives
 
-from .user_calls import Call
+from .registry import Table, remembered
 
-KNOWN = ("jax", "jaxlib", "jaxlag", "diffrax", "equinox", "optimistix", "lineax", "optax", "numpy", "jaxtyping", "builtins")
-WITH_METHODS = ("jaxlag", "diffrax", "optimistix", "lineax", "optax")  # packages whose classes a user derives others from
-PRIMITIVES = {x for x in vars(primitives).values() if isinstance(x, core.Primitive)}  # of JAX itself
-PLAIN = (type(None), bool, int, float, complex, str, bytes, type(...), slice)
+PACKAGES = ("jax", "jaxlib", "jaxlag", "diffrax", "equinox", "optimistix", "lineax", "optax", "numpy", "jaxtyping")  # of known versions
+OF_PYTHON = ("builtins", "math", "functools", "operator", "_operator", "dataclasses", "abc", "enum", "typing", "types", "collections")
+KNOWN = (*PACKAGES, *OF_PYTHON)
+PLAIN = (type(None), bool, int, float, complex, str, bytes, type(...))
+CONTAINERS = (tuple, frozenset, list, dict, set)
+UNCERTAIN = ("eval", "exec", "globals", "locals", "vars", "open", "input", "__import__", "id")  # builtin functions
+MISSING = object()
+MANY = 4096  # numbers of an array that may change: more take too long to be compared at each call
+WRITTEN_IN_PYTHON = 1 << 9  # a flag of classes
+DEPTH = 50  # of what refers to what
+UNSAID = {  # members of a class that its objects do nothing with
+    *("__module__", "__qualname__", "__doc__", "__dict__", "__weakref__", "__annotations__", "__match_args__", "__orig_bases__"),
+    *("__dataclass_fields__", "__dataclass_params__", "__abstractmethods__", "_abc_impl", "__parameters__", "__firstlineno__"),
+    *("__static_attributes__", "__annotate_func__", "__annotations_cache__", "__repr__"),
+}
 
 
 class NotDescribable(Exception):
@@ -29,13 +44,17 @@ class NotDescribable(Exception):
 
 
 class Words:
-    """Words for objects, hashed as they come; and the objects that have an identity, in the order in which they were met."""
+    """Words for objects, hashed as they come; the objects that have an identity, in the order in which they were met; and for each thing
+    that may change whether it is `unchanged`.
+    """
 
-    def __init__(self) -> None:
+    def __init__(self, within: tuple[Any, ...] = ()) -> None:
         self.hash = hashlib.sha256()
         self.objects: list[Any] = []  # described by their parts
-        self.functions: list[Callable] = []  # of the user, of which only the signature is described here
+        self.unchanged: list[Callable[[], bool]] = []
+        self._within = within  # functions that are being described
         self._places: dict[int, int] = {}
+        self._frozen = 0  # how many objects that may not change are being described
 
     def digest(self) -> str:
         """Of all words so far."""
@@ -45,168 +64,241 @@ class Words:
         """Adds words."""
         self.hash.update(repr(words).encode())
 
-    def structure(self, structure: Any, within: bool = False) -> None:
-        """A structure of a pytree, with what it holds beside its leaves. What stands `within` a solver has methods that are called, and has
-        to be of a package, as has what is derived from one.
-        """
+    def structure(self, structure: Any) -> None:
+        """A structure of a pytree, with what it holds beside its leaves."""
         node = structure.node_data()
         if node is None:
             self.say("leaf" if structure.num_leaves else "none")
             return
         kind, static = node
-        if not _is_known(kind) and (within or _is_derived(kind)):
-            raise NotDescribable(f"methods of {kind!r}")
-        self.say("node", _name(kind), structure.num_nodes)
+        self.say("node", structure.num_nodes)
+        self.value(kind)
         self.value(static)
         for child in structure.children():
-            self.structure(child, within or _root(kind) in WITH_METHODS[1:])
+            self.structure(child)
 
     def value(self, x: Any) -> None:
         """A constant."""
         if isinstance(x, jax.core.Tracer):
             raise NotDescribable("a number that is traced")
         if isinstance(x, enum.Enum):
-            self.say(_name(type(x)), x.name)
+            self.value(type(x))
+            self.say(x.name)
         elif type(x) in PLAIN:
             self.say(type(x).__name__, x)
         elif isinstance(x, (np.ndarray, np.generic, jax.Array)):
-            array = np.asarray(x)
-            self.say("array", str(array.dtype), array.shape, bool(getattr(x, "weak_type", False)), array.tobytes())
+            self._array(x)
         elif isinstance(x, np.dtype):
             self.say("dtype", str(x))
-        elif isinstance(x, (core.ClosedJaxpr, core.Jaxpr)):
-            self.program(x)
+        elif isinstance(x, slice):
+            self.value((x.start, x.stop, x.step))
         elif isinstance(x, jax.tree_util.PyTreeDef):
             self.structure(x)
         elif isinstance(x, jax.core.ShapedArray):
             self.say("shape", x.shape, str(x.dtype), x.weak_type)
-        elif isinstance(x, type):
-            self.say("class", _name(x))
-        else:
-            self._thing(x)
-
-    def _thing(self, x):
-        """What is made of parts, or a function."""
-        if id(x) in self._places:
+        elif isinstance(x, types.CodeType):
+            self._code(x)
+        elif isinstance(x, types.ModuleType):
+            if not _is_known(x) or x.__name__.startswith("numpy.random"):
+                raise NotDescribable(f"{x.__name__}, which may change")
+            self.say("module", x.__name__)
+        elif id(x) in self._places:
             self.say("again", self._places[id(x)])
-            return
-        self.say(_name(type(x)))
-        if not isinstance(x, (dict, tuple, list, frozenset)):
+        elif type(x) in CONTAINERS:
+            self._container(x)
+        else:
             self._places[id(x)] = len(self.objects)
             self.objects.append(x)
-        if isinstance(x, Mapping) and type(x) is dict:
-            self._parts(list(x.items()))
-        elif isinstance(x, (tuple, list)):
-            self._parts(list(x))
-        elif isinstance(x, (frozenset, set)):
-            self._parts(sorted(x))
-        elif _is_of_package(x):
+            self._object(x)
+
+    def _array(self, x):
+        may_change = not isinstance(x, (np.generic, jax.Array))
+        if may_change and (self._frozen or type(x) is not np.ndarray or x.size > MANY or x.dtype == object):
+            raise NotDescribable("numbers that may change")
+        array = np.asarray(x)
+        content = array.tobytes()
+        self.say("array", may_change, type(x).__name__, str(array.dtype), array.shape, bool(getattr(x, "weak_type", False)), content)
+        if may_change:
+            self.unchanged.append(lambda: x.tobytes() == content)
+
+    def _container(self, x):
+        self.say("container", type(x).__name__, len(x))
+        if type(x) in (list, dict, set):
+            if self._frozen:
+                raise NotDescribable("a container that may change")
+            self._may_change(x)
+        try:
+            for part in x.items() if type(x) is dict else sorted(x) if isinstance(x, (frozenset, set)) else x:
+                self.value(part)
+        except TypeError as error:  # no order
+            raise NotDescribable(str(error)) from error
+
+    def _may_change(self, x):
+        """A container, or the namespace of a class."""
+        parts = lambda: [*x, *x.values()] if isinstance(x, Mapping) else list(x)
+        before = parts()
+        self.unchanged.append(lambda: len(now := parts()) == len(before) and all(map(_is, now, before)))
+
+    def _object(self, x):
+        """What is told by its name, or made of parts."""
+        if isinstance(x, type):
+            self._class(x)
+        elif _is_found_by_name(x):
             self.say(x.__module__, x.__qualname__)
-        elif dataclasses.is_dataclass(x) and not callable(x) and not _is_derived(type(x)):
-            self._parts([(field.name, getattr(x, field.name, None)) for field in dataclasses.fields(x)])
-        elif type(x).__module__.split(".")[0] == "jax" and (not callable(x) or isinstance(x, jax.sharding.Mesh)) and "0x" not in repr(x):
-            self.say(repr(x))  # parts of equations: shardings, meshes, dimensions
-        elif callable(x):
+        elif isinstance(x, types.FunctionType):
             self._function(x)
-        elif _is_known(type(x)) and getattr(x, "__dict__", None) == {}:  # a mark that is told by its class
+        elif isinstance(x, types.MethodType):
+            self.say("method")
+            self.value(x.__func__)
+            self.value(x.__self__)
+        elif isinstance(x, functools.partial):
+            self.say("partial")
+            for part in (x.func, x.args, tuple(sorted(x.keywords.items()))):
+                self.value(part)
+        else:
+            self.value(type(x))
+            self._parts(x)
+
+    def _parts(self, x):
+        known = _is_known(type(x))
+        if isinstance(x, tuple):
+            self.value(tuple(x))
+        elif dataclasses.is_dataclass(x) and (known or isinstance(x, eqx.Module) or type(x).__dataclass_params__.frozen):
+            self._frozen += not known
+            for field in dataclasses.fields(x):
+                self.say(field.name)
+                self.value(getattr(x, field.name, None))
+            self._frozen -= not known
+        elif _root(type(x)) in (*PACKAGES, "dataclasses") and getattr(x, "__dict__", None) == {}:  # a mark, told by its class
             pass
+        elif _root(type(x)) == "jax" and (not callable(x) or isinstance(x, jax.sharding.Mesh)) and "0x" not in repr(x):
+            self.say(repr(x))  # shardings, meshes, dimensions
         else:
             raise NotDescribable(repr(x))
 
-    def _parts(self, parts):
-        self.say(len(parts))
-        for part in parts:
-            self.value(part)
+    def _class(self, kind):
+        """A class by its name, or the user's by its members that are called."""
+        self.say("class", kind.__module__, kind.__qualname__)
+        if _is_known(kind):
+            if kind.__flags__ & WRITTEN_IN_PYTHON and _by_name(kind) is not kind:
+                raise NotDescribable(f"{kind!r}, which its name does not tell")
+            return
+        self.value(type(kind))
+        self.value(kind.__bases__)
+        self._may_change(vars(kind))
+        for name, member in sorted(vars(kind).items()):
+            if name in UNSAID or isinstance(member, (types.MemberDescriptorType, types.GetSetDescriptorType)):
+                continue
+            self.say(name, type(member).__name__)
+            is_function = isinstance(member, types.FunctionType)
+            inner = [] if is_function else [getattr(member, key) for key in ("fget", "method", "__func__") if hasattr(member, key)]
+            self.value(inner[0] if inner else member)
 
     def _function(self, function):
-        """What is asked of a user's function by name: its arguments, and those of the functions it is composed of."""
-        import inspect
+        """By its code and all that this refers to. One is refused that referred to something else when it was described before."""
+        if function in self._within:
+            self.say("itself", self._within.index(function))
+            return
+        if len(self._within) > DEPTH:
+            raise NotDescribable("functions that call functions that call functions")
+        own = Words((*self._within, function))
+        own._frozen = self._frozen
+        own.value(function.__code__)
+        own.value(function.__defaults__)
+        own.value(tuple(sorted((function.__kwdefaults__ or {}).items())))
+        for name, x in sorted(vars(function).items()):
+            own.say(name)
+            own.value(x)
+        own._closure(function)
+        own._globals(function)
+        code, defaults = function.__code__, function.__defaults__
+        own.unchanged.append(lambda: function.__code__ is code and function.__defaults__ is defaults)
+        if not self._within and _DESCRIBED.setdefault(function, own.digest()) != own.digest():
+            _DESCRIBED[function] = "changed"
+            raise NotDescribable(f"{function!r}, which refers to something else than before")
+        self.say("function", own.digest())
+        self.unchanged += own.unchanged
 
-        declared = inspect.signature(function).parameters.values()
-        self.say("function", len(self.functions), [(p.name, str(p.kind), p.default is p.empty) for p in declared])
-        self.functions.append(function)
-        for part in getattr(function, "composed_of", ()):
-            self.say("of", [(p.name, str(p.kind)) for p in inspect.signature(part).parameters.values()])
+    def _closure(self, function):
+        for cell in function.__closure__ or ():
+            if (x := _content(cell)) is MISSING:
+                raise NotDescribable("a name without a value")
+            self.value(x)
+            self.unchanged.append(lambda cell=cell, x=x: _content(cell) is x)
 
-    def program(self, program: Any) -> None:
-        """A program of JAX: its equations with their parameters, variables by the order in which they appear."""
-        jaxpr = getattr(program, "jaxpr", program)
-        names: dict[Any, int] = {}
-        name = lambda v: names.setdefault(v, len(names))
-        shape = lambda v: (str(v.aval), bool(getattr(v.aval, "weak_type", False)))
-        if jaxpr.effects:
-            raise NotDescribable(f"effects {jaxpr.effects}")
-        self.say("program", [(name(v), shape(v)) for v in (*jaxpr.constvars, *jaxpr.invars)])
-        for equation in jaxpr.eqns:
-            if equation.primitive.name.startswith("custom_") and equation.primitive.name != "custom_linear_solve":
-                raise NotDescribable(f"{equation.primitive.name}, which has a derivative rule of its own")
-            if equation.primitive not in PRIMITIVES:
-                raise NotDescribable(f"{equation.primitive.name}, which is not of JAX")
-            self.say(equation.primitive.name, str(equation.ctx))
-            for v in equation.invars:
-                self.value(v.val) if isinstance(v, core.Literal) else self.say(name(v))
-            for key, value in sorted(equation.params.items()):
-                self.say(key)
-                self.value(value)
-            self.say([(name(v), shape(v)) for v in equation.outvars])
-        for v in jaxpr.outvars:
-            self.value(v.val) if isinstance(v, core.Literal) else self.say(name(v))
-        for constant in getattr(program, "consts", ()):
-            self.value(constant)
-        if self.functions:
-            raise NotDescribable(f"a program that calls {self.functions[-1]!r}")
+    def _globals(self, function):
+        scope = function.__globals__
+        for name in _names(function.__code__):
+            self.say(name)
+            if name in scope:
+                x = scope[name]
+                self.value(x)
+                self.unchanged.append(lambda name=name, x=x: scope.get(name) is x)
+            elif not hasattr(builtins, name) or name in UNCERTAIN:
+                raise NotDescribable(f"{name}, which may be anything")
+            else:
+                self.unchanged.append(lambda name=name: name not in scope)
 
-    def answer(self, function: Callable, call: Call) -> None:
-        """What a user's function returns for such arguments, as a program. Nothing of this may be a function in its turn."""
-        shapes, filled = call.arguments()
-
-        def returned(arrays):
-            positional, by_name = filled(arrays)
-            leaves, structure = jax.tree.flatten(function(*positional, **by_name))
-            is_unknown = [isinstance(leaf, jax.Array) for leaf in leaves]
-            self.value([None if unknown else leaf for leaf, unknown in zip(leaves, is_unknown, strict=True)])
-            self.structure(structure)
-            return [leaf for leaf, unknown in zip(leaves, is_unknown, strict=True) if unknown]
-
-        self.program(jax.make_jaxpr(returned)(shapes))
+    def _code(self, code):
+        """But for its place in a file."""
+        variables = code.co_varnames, code.co_freevars, code.co_cellvars, code.co_argcount, code.co_posonlyargcount, code.co_kwonlyargcount
+        self.say("code", code.co_code, code.co_names, variables, code.co_flags, getattr(code, "co_exceptiontable", b""))
+        for x in code.co_consts:
+            self.value(x)
 
 
-def answer_of(function: Callable, call: Call) -> str | None:
-    """The digest of what a function returns for such arguments; None where that has no certain description."""
-    words = Words()
+_DESCRIBED = Table(weak=True)  # of each function its words when it was met first
+
+
+@remembered
+def _names(code: types.CodeType) -> tuple[str, ...]:
+    """Global names that code refers to."""
+    found = set()
+    for instruction in dis.get_instructions(code):
+        name = instruction.argval
+        if instruction.opname in ("LOAD_GLOBAL", "LOAD_NAME"):
+            found.add(name)
+        elif instruction.opname in ("STORE_GLOBAL", "DELETE_GLOBAL") or (
+            instruction.opname == "IMPORT_NAME" and name.split(".")[0] not in KNOWN
+        ):
+            raise NotDescribable(f"code that has to do with {name}")
+    if found & {"np", "numpy", "onp"} and "random" in code.co_names:
+        raise NotDescribable("random numbers")
+    within = [_names(x) for x in code.co_consts if isinstance(x, types.CodeType)]
+    return tuple(sorted(found.union(*within)))
+
+
+def _content(cell):
+    """What a function closes over."""
     try:
-        words.answer(function, call)
-    except Exception:  # a function may do anything with arguments of unknown numbers
-        return None
-    return words.digest()
+        return cell.cell_contents
+    except ValueError:
+        return MISSING
 
 
-def _name(kind: type) -> str:
-    return f"{kind.__module__}.{kind.__qualname__}"
+def _is(a, b):
+    return a is b
 
 
 def _root(x: Any) -> str:
-    """The package that a class or function is of."""
-    module = getattr(x, "__module__", None)
-    return module.split(".")[0] if isinstance(module, str) else ""
+    """The package that a class or function says that it is of, or a module is."""
+    name = x.__name__ if isinstance(x, types.ModuleType) else getattr(x, "__module__", None)
+    return name.split(".")[0] if isinstance(name, str) else ""
 
 
 def _is_known(x: Any) -> bool:
-    """Whether it is a class or function of a package whose version is known."""
+    """Whether its version is known."""
     return _root(x) in KNOWN
 
 
-def _is_derived(kind: type) -> bool:
-    """Whether it is a class of the user's that is derived from one of those packages."""
-    return not _is_known(kind) and any(_root(base) in WITH_METHODS for base in kind.__mro__)
-
-
-def _is_of_package(x: Any) -> bool:
-    """Whether it is a function of a package whose version is known, found by its name."""
-    name = getattr(x, "__qualname__", None)
-    if not (_is_known(x) and isinstance(name, str)):
-        return False
-    found = sys.modules.get(x.__module__)
-    for part in name.split("."):
+def _by_name(x: Any) -> Any:
+    """What stands under the name of a class or function in its module."""
+    found: Any = sys.modules.get(x.__module__)
+    for part in x.__qualname__.split("."):
         found = getattr(found, part, None)
-    return found is x
+    return found
+
+
+def _is_found_by_name(x: Any) -> bool:
+    """Whether it is a function of a package whose version is known, found by its name."""
+    return _is_known(x) and isinstance(getattr(x, "__qualname__", None), str) and _by_name(x) is x

@@ -18,6 +18,7 @@ from jaxtyping import PyTree
 
 from .kept_programs import KEPT
 from .registry import remembered
+from .static import Static
 
 OLD_EMITTERS = {"xla_cpu_use_fusion_emitters": False}
 with jax.ensure_compile_time_eval():
@@ -80,9 +81,8 @@ def _program(function, **options):
     """The compiled `function(arrays, static)`."""
 
     def on_leaves(arrays, static):
-        leaves, structure = static
-        merged = [array if leaf is None else leaf for array, leaf in zip(arrays, leaves, strict=True)]
-        given, named = jax.tree.unflatten(structure, merged)
+        merged = [array if leaf is None else leaf for array, leaf in zip(arrays, static.leaves, strict=True)]
+        given, named = jax.tree.unflatten(static.structure, merged)
         with _TRACED:
             return function(*given, **named)
 
@@ -96,7 +96,7 @@ def _split(given, named):
     is_array = [isinstance(leaf, (np.ndarray, jax.Array, np.number)) for leaf in leaves]
     arrays = [leaf if traced else None for leaf, traced in zip(leaves, is_array, strict=True)]
     static = tuple([None if traced else leaf for leaf, traced in zip(leaves, is_array, strict=True)])
-    return arrays, (static, structure)
+    return arrays, Static.of(static, structure)
 
 
 def is_called_by_python(arrays: Iterable[Any] = ()) -> bool:

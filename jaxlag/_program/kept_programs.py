@@ -2,8 +2,7 @@
 
 JAX's persistent cache finds a compiled program by the program, which has to be traced and lowered first: more than half of the time of a
 second process. Here it is found by what it is traced from: the function of this package, the shapes of its arguments and all else that it
-is given, versions and settings; and, for each of the user's functions, what it returns for each kind of arguments, as a program of JAX.
-Where anything of that has no certain description, the program is traced as ever.
+is given, the user's functions too, versions and settings. Where anything of that has no certain description, the program is traced as ever.
 """
 
 import contextlib
@@ -28,9 +27,8 @@ import numpy as np
 from jax.tree_util import PyTreeDef, default_registry
 
 from .cache_of_jax import ELSEWHERE, compiled_afresh, loaded, written
-from .description import NotDescribable, Words, answer_of
+from .description import NotDescribable, Words
 from .registry import Table
-from .user_calls import LEDGER, Call
 
 PACKAGE = Path(__file__).parents[1]
 VERSIONS = ("jax", "jaxlib", "diffrax", "equinox", "optimistix", "lineax", "optax", "numpy", "scipy")
@@ -62,7 +60,6 @@ class KeptPrograms:
     def keep_in(self, folder: Path | None) -> None:
         """From here on programs are kept in this folder, or in none, or none that cannot be written to."""
         self.folder = folder if folder is not None and os.access(folder, os.W_OK | os.X_OK) else None
-        LEDGER.digest = None if self.folder is None else answer_of
         self._found.clear()
 
     def called(self, program: Any, function: Callable, arrays: list, static: Any) -> Any:
@@ -83,13 +80,13 @@ class KeptPrograms:
             if (found := _read(self.folder, words, arrays)) is not None:
                 return found
             lowered = _lowered(program, arrays, static)
-            name, head = _head(words, lowered.out_tree)
+            head = _head(words, lowered.out_tree)
             with compiled_afresh():
                 compiled = lowered.compile()
         except (NotDescribable, OSError, *ELSEWHERE):
             return None
         with contextlib.suppress(Exception):  # a full disk; a program that calls Python, which says so in many ways
-            _write(self.folder / name, head + written(compiled))
+            _write(self.folder / _name(words), head + written(compiled))
         return compiled
 
 
@@ -119,7 +116,7 @@ def _lowered(program, arrays, static):
 
 
 def _words_for(function, arrays, static):
-    """All that a program is made of but the user's functions, which are listed."""
+    """All that a program is made of."""
     if any(getattr(jax.config, name) for name in BY_HAND):
         raise NotDescribable("programs that the user looks into")
     words, kinds = Words(), list(map(_kind, arrays))
@@ -127,15 +124,13 @@ def _words_for(function, arrays, static):
         raise NotDescribable("arrays on other devices")
     words.say(_surroundings(), str(_settings()), str(kinds))
     words.value(function)
-    if words.functions:
-        raise NotDescribable("a function that its name does not tell")
-    leaves, structure = static
-    try:
-        words.value(leaves)
-        words.structure(structure)
-    except (TypeError, ValueError) as error:  # a function without a signature
-        raise NotDescribable(str(error)) from error
+    static.describe(words)
     return words
+
+
+def _name(words) -> str:
+    """Of the file of a program."""
+    return f"jaxlag-{words.digest()}-cache"
 
 
 def _kind(array):
@@ -153,34 +148,17 @@ def _first_device():
     return jax.sharding.SingleDeviceSharding(jax.devices()[0])
 
 
-def _digest(*parts: Any) -> str:
-    return hashlib.sha256(repr(parts).encode()).hexdigest()[:32]
-
-
-def _answers(words, calls: list[tuple[Call, ...]]) -> list[list[str | None]]:
-    """What the user's functions return for these calls now."""
-    return [[answer_of(function, call) for call in of_one] for function, of_one in zip(words.functions, calls, strict=True)]
-
-
-def _head(words, out_tree) -> tuple[str, bytes]:
-    """Name and beginning of the file of a program: what is given, how the user's functions are called and what they return, which has to
-    be what they returned when they were called, and what the program returns itself.
-    """
-    noted = [LEDGER.of(function) for function in words.functions]
-    calls, then = [tuple(of_one) for of_one in noted], [list(of_one.values()) for of_one in noted]
-    if not all(calls) or _answers(words, calls) != then:
-        raise NotDescribable("a function of the user's of which not all is known")
+def _head(words, out_tree) -> bytes:
+    """The beginning of the file of a program: the structure of what it returns."""
     content = io.BytesIO()
     try:
-        for part in (calls, out_tree):
-            _Pickler(content, words.objects).dump(part)
+        _Pickler(content, words.objects).dump(out_tree)
         content.seek(0)
-        if [_Unpickler(content, words.objects).load() for _ in range(2)] != [calls, out_tree]:
+        if _Unpickler(content, words.objects).load() != out_tree:
             raise NotDescribable("something that is not the same when it is read again")
     except Exception as error:  # what cannot be pickled says so in many ways
         raise NotDescribable(str(error)) from error
-    head = content.getvalue()
-    return f"jaxlag-{words.digest()}-{hashlib.sha256(head).hexdigest()[:32]}-{_digest(then)}-cache", head
+    return content.getvalue()
 
 
 def _write(path, content):
@@ -193,23 +171,16 @@ def _write(path, content):
 
 def _read(folder, words, arrays):
     """The program in the folder that is asked for; None if there is none that can be read."""
-    asked: dict[str, str | None] = {}  # the answers to each set of calls
-    for file in sorted(folder.glob(f"jaxlag-{words.digest()}-*-cache")):
-        *_, head, answers, _ = file.name.split("-")
-        if asked.get(head, answers) != answers:
-            continue
-        try:
-            digest, content = (whole := file.read_bytes())[:32], io.BytesIO(whole[32:])
-            if hashlib.sha256(content.getbuffer()).digest() != digest:
-                continue
-            asked[head] = asked.get(head) or _digest(_answers(words, _Unpickler(content, words.objects).load()))
-            if asked[head] == answers:
-                _have_lapack()
-                out_tree = _Unpickler(content, words.objects).load()
-                return loaded(content.read(), jax.tree.structure(((arrays,), {})), out_tree)
-        except Exception:  # a file of another kind; what was loaded would have been the same program
-            continue
-    return None
+    try:
+        whole = (folder / _name(words)).read_bytes()
+        digest, content = whole[:32], io.BytesIO(whole[32:])
+        if hashlib.sha256(content.getbuffer()).digest() != digest:
+            return None
+        _have_lapack()
+        out_tree = _Unpickler(content, words.objects).load()
+        return loaded(content.read(), jax.tree.structure(((arrays,), {})), out_tree)
+    except Exception:  # no file, or one of another kind; what was loaded would have been the same program
+        return None
 
 
 @functools.cache

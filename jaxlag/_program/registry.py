@@ -16,10 +16,11 @@ _CLEAR: list[Callable[[], None]] = []  # one for each table
 
 
 class Table(MutableMapping):
-    """Values by key; with `weak`, for as long as the key lives."""
+    """Values by key; with `weak` for as long as the key lives, or with `weak="values"` the value."""
 
-    def __init__(self, *, weak: bool = False, most: int = MOST) -> None:
-        self.entries: MutableMapping[Any, Any] = weakref.WeakKeyDictionary() if weak else {}
+    def __init__(self, *, weak: bool | str = False, most: int = MOST) -> None:
+        of_values: MutableMapping[Any, Any] = weakref.WeakValueDictionary()
+        self.entries = of_values if weak == "values" else weakref.WeakKeyDictionary() if weak else {}
         self.most = None if weak else most
         _CLEAR.append(self.entries.clear)
 

@@ -61,7 +61,7 @@ import jaxlag as jl
 with warnings.catch_warnings(record=True) as caught:
     warnings.simplefilter("always")
     for i in range(3):
-        system = jl.System(lambda qdot: 0.5 * qdot**2)
+        system = jl.System(lambda qdot, i=i: 0.5 * (1 + i) * qdot**2)
         jl.mass_matrix(system, 0.0, 0.0)
 print(json.dumps([(w.filename, w.lineno) for w in caught if "must be made once" in str(w.message)]))
 """
