@@ -128,7 +128,14 @@ def check_statement(node, comment, names):
             np.testing.assert_allclose(x, float(text), rtol=0, atol=resolution(text), err_msg=comment)
 
 
-@pytest.mark.parametrize("name", WITH_EXAMPLES)
+SHOWN_ELSEWHERE = {  # by the example of the function that makes it, or draws it: `log_density`, `optimise_motion`, `response_curve`, ...
+    *("MultiStart", "plot.optimal_motion", "plot.posterior", "plot.recovery", "plot.response_curve"),
+    *("results.Design", "results.Discovery", "results.LogDensity", "results.OptimalMotion", "results.Posterior"),
+    *("results.Posterior.bands", "results.Posterior.plot", "results.ResponseCurve.plot"),
+}
+
+
+@pytest.mark.parametrize("name", [pytest.param(name, marks=[pytest.mark.slow] * (name in SHOWN_ELSEWHERE)) for name in WITH_EXAMPLES])
 def test_an_example_runs_and_gives_what_it_states(name, compilation_cache, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)  # some write files
     for code in re.findall(r"```python\n(.*?)```", inspect.getdoc((PUBLIC | METHODS)[name]), re.S):

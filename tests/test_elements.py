@@ -87,6 +87,7 @@ def test_a_drop_on_an_end_stop_against_events_of_scipy():
         np.testing.assert_allclose(slope, (by_hand(*(given + step), 1.2)[0] - by_hand(*(given - step), 1.2)[0]) / 2e-5, rtol=1e-5)
 
 
+@pytest.mark.slow
 def test_where_a_stop_is_follows_from_a_recording():
     """Place, stiffness and damping together."""
     system = jl.System(
@@ -109,6 +110,7 @@ def test_bad_tables_are_refused():
     assert np.isfinite(jax.jit(elements.table)(0.3, jnp.asarray(XS), jnp.asarray(YS)))
 
 
+@pytest.mark.slow
 def test_slopes_where_parameters_are_zero():
     """Those towards positive ones: of a stop that is not yet there, a gap without width, a drive without force."""
     stop = jl.System(FREE, force=lambda q, qdot, a, c, d: elements.end_stop(q - a, qdot, c, d))

@@ -30,6 +30,7 @@ def angle(params):
     return jl.simulate(LOSSY_GEAR, two(0.0), two(0.0), np.array([0.0, 1.0]), params, rtol=1e-11, atol=1e-13).q["1"][-1]
 
 
+@pytest.mark.slow
 def test_the_lossy_gear_of_modelica():
     np.testing.assert_allclose(angle(DEMO), -0.9056530023, atol=2e-9)
 
@@ -158,6 +159,7 @@ def swung_by_hand(phi, T):
     return solve_ivp(lambda t, y: [y[1], acceleration(*y)], [0, T], [phi, 0.0], rtol=1e-11, atol=1e-13).y[0, -1]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("unit", [1.0, 1e-6])
 def test_a_pin_that_rubs(unit):
     """At rest within the friction circle, l sin φ < μ r, and not without; and on the way."""
@@ -174,6 +176,7 @@ def test_derivatives_of_a_pin_that_rubs():
     np.testing.assert_allclose(jax.jacfwd(of)(0.3), jax.grad(of)(0.3), rtol=1e-9)
 
 
+@pytest.mark.slow
 def test_any_norm_of_multipliers_is_solved_for():
     """That of NumPy has no slope where λ = 0, from where it is searched for."""
     plain = pendulum(lambda qdot, multipliers, mu, r: mu * r * jnp.linalg.norm(multipliers["pin"]) * jnp.abs(qdot["phi"]))

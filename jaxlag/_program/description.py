@@ -52,9 +52,9 @@ class Words:
         self.hash = hashlib.sha256()
         self.objects: list[Any] = []  # described by their parts
         self.unchanged: list[Callable[[], bool]] = []
-        self._within = within  # functions that are being described
+        self._within = within  # what of the user's is being described
         self._places: dict[int, int] = {}
-        self._frozen = 0  # how many objects that may not change are being described
+        self._frozen = False  # whether an object that may not change is being described
 
     def digest(self) -> str:
         """Of all words so far."""
@@ -146,7 +146,8 @@ class Words:
         elif _is_found_by_name(x):
             self.say(x.__module__, x.__qualname__)
         elif isinstance(x, types.FunctionType):
-            self._function(x)
+            self.say("function")
+            self._of_the_user(x, Words._function)
         elif isinstance(x, types.MethodType):
             self.say("method")
             self.value(x.__func__)
@@ -155,20 +156,26 @@ class Words:
             self.say("partial")
             for part in (x.func, x.args, tuple(sorted(x.keywords.items()))):
                 self.value(part)
-        else:
+        elif _is_known(type(x)) or isinstance(x, tuple):
             self.value(type(x))
             self._parts(x)
+        elif isinstance(x, eqx.Module) or (dataclasses.is_dataclass(x) and type(x).__dataclass_params__.frozen):
+            self._of_the_user(x, Words._frozen_parts)
+        else:
+            raise NotDescribable(repr(x))
+
+    def _frozen_parts(self, x):
+        self._frozen = True
+        self.value(type(x))
+        self._parts(x)
 
     def _parts(self, x):
-        known = _is_known(type(x))
         if isinstance(x, tuple):
             self.value(tuple(x))
-        elif dataclasses.is_dataclass(x) and (known or isinstance(x, eqx.Module) or type(x).__dataclass_params__.frozen):
-            self._frozen += not known
+        elif dataclasses.is_dataclass(x):
             for field in dataclasses.fields(x):
                 self.say(field.name)
                 self.value(getattr(x, field.name, None))
-            self._frozen -= not known
         elif _root(type(x)) in (*PACKAGES, "dataclasses") and getattr(x, "__dict__", None) == {}:  # a mark, told by its class
             pass
         elif _root(type(x)) == "jax" and (not callable(x) or isinstance(x, jax.sharding.Mesh)) and "0x" not in repr(x):
@@ -194,30 +201,35 @@ class Words:
             inner = [] if is_function else [getattr(member, key) for key in ("fget", "method", "__func__") if hasattr(member, key)]
             self.value(inner[0] if inner else member)
 
-    def _function(self, function):
-        """By its code and all that this refers to. One is refused that referred to something else when it was described before."""
-        if function in self._within:
-            self.say("itself", self._within.index(function))
-            return
+    def _of_the_user(self, x, parts):
+        """A function or an object of the user's. One is refused that was made of, or referred to, something else when it was met before."""
+        for i, around in enumerate(self._within):
+            if around is x:
+                self.say("itself", i)
+                return
         if len(self._within) > DEPTH:
             raise NotDescribable("functions that call functions that call functions")
-        own = Words((*self._within, function))
+        own = Words((*self._within, x))
         own._frozen = self._frozen
-        own.value(function.__code__)
-        own.value(function.__defaults__)
-        own.value(tuple(sorted((function.__kwdefaults__ or {}).items())))
-        for name, x in sorted(vars(function).items()):
-            own.say(name)
-            own.value(x)
-        own._closure(function)
-        own._globals(function)
-        code, defaults = function.__code__, function.__defaults__
-        own.unchanged.append(lambda: function.__code__ is code and function.__defaults__ is defaults)
-        if not self._within and _DESCRIBED.setdefault(function, own.digest()) != own.digest():
-            _DESCRIBED[function] = "changed"
-            raise NotDescribable(f"{function!r}, which refers to something else than before")
-        self.say("function", own.digest())
+        parts(own, x)
+        if not self._within and _DESCRIBED.setdefault(x, own.digest()) != own.digest():
+            _DESCRIBED[x] = "changed"
+            raise NotDescribable(f"{x!r}, which refers to something else than before")
+        self.say(own.digest())
         self.unchanged += own.unchanged
+
+    def _function(self, function):
+        """By its code and all that this refers to."""
+        self.value(function.__code__)
+        self.value(function.__defaults__)
+        self.value(tuple(sorted((function.__kwdefaults__ or {}).items())))
+        for name, x in sorted(vars(function).items()):
+            self.say(name)
+            self.value(x)
+        self._closure(function)
+        self._globals(function)
+        code, defaults = function.__code__, function.__defaults__
+        self.unchanged.append(lambda: function.__code__ is code and function.__defaults__ is defaults)
 
     def _closure(self, function):
         for cell in function.__closure__ or ():
@@ -247,7 +259,7 @@ class Words:
             self.value(x)
 
 
-_DESCRIBED = Table(weak=True)  # of each function its words when it was met first
+_DESCRIBED = Table(weak=True)  # of each function and object of the user's its words when it was met first
 
 
 @remembered
@@ -256,7 +268,7 @@ def _names(code: types.CodeType) -> tuple[str, ...]:
     found = set()
     for instruction in dis.get_instructions(code):
         name = instruction.argval
-        if instruction.opname in ("LOAD_GLOBAL", "LOAD_NAME"):
+        if instruction.opname in ("LOAD_GLOBAL", "LOAD_NAME", "LOAD_FROM_DICT_OR_GLOBALS"):
             found.add(name)
         elif instruction.opname in ("STORE_GLOBAL", "DELETE_GLOBAL") or (
             instruction.opname == "IMPORT_NAME" and name.split(".")[0] not in KNOWN

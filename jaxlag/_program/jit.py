@@ -84,7 +84,9 @@ def _program(function, **options):
         merged = [array if leaf is None else leaf for array, leaf in zip(arrays, static.leaves, strict=True)]
         given, named = jax.tree.unflatten(static.structure, merged)
         with _TRACED:
-            return function(*given, **named)
+            returned = function(*given, **named)
+        static.was_traced()
+        return returned
 
     on_leaves.__name__ = getattr(function, "__name__", "on_leaves")  # the name of the program
     return jax.jit(on_leaves, static_argnums=1, **options)

@@ -119,6 +119,8 @@ def _words_for(function, arrays, static):
     """All that a program is made of."""
     if any(getattr(jax.config, name) for name in BY_HAND):
         raise NotDescribable("programs that the user looks into")
+    if not static.has_words:
+        raise NotDescribable("what may be anything")
     words, kinds = Words(), list(map(_kind, arrays))
     if any(len(kind) > 3 for kind in kinds):
         raise NotDescribable("arrays on other devices")

@@ -16,7 +16,7 @@ ALIKE = 8  # calls of equal content, the latest of which are known at once
 class Static:
     """Leaves that are no arrays, and the structure; equal where their words are, or where there are none where they are themselves."""
 
-    __slots__ = ("__weakref__", "_alike", "_hash", "_key", "leaves", "structure", "unchanged")
+    __slots__ = ("__weakref__", "_alike", "_hash", "_key", "has_words", "leaves", "structure", "unchanged")
 
     def __init__(self, leaves: tuple, structure: Any) -> None:
         self.leaves, self.structure = leaves, structure
@@ -29,6 +29,7 @@ class Static:
             self._key, self.unchanged = words.digest(), words.unchanged
         except Exception:  # an object of the user's may do anything when it is looked at
             pass
+        self.has_words = isinstance(self._key, str)
         self._hash = hash(self._key)
 
     def __hash__(self) -> int:
@@ -42,6 +43,11 @@ class Static:
             if not is_so():
                 return False
         return True
+
+    def was_traced(self) -> None:
+        """Has been evaluated: a function that has changed what it refers to itself, as one that counts its calls, is not watched further."""
+        if not self._is_unchanged():
+            self.unchanged = []
 
     def describe(self, words: Words) -> None:
         """Says what it is."""

@@ -84,6 +84,7 @@ def test_pull_in():
     np.testing.assert_allclose([fold.value, fold.q], [limit, d / 3], rtol=1e-7)
 
 
+@pytest.mark.slow
 def test_with_constraints():
     """The arch in x, y with bars of variable length as coordinates: the same folds; λ balances the load."""
 

@@ -134,6 +134,7 @@ def test_derivatives_of_folds(orbit):
     np.testing.assert_allclose(jax.grad(at)(0.1), (at(0.1 + h) - at(0.1 - h)) / (2 * h), rtol=1e-5)
 
 
+@pytest.mark.slow
 def test_in_other_units():
     """Micrometres, kiloseconds, tonnes: the same curve, in numbers of other sizes."""
     length, time, mass = 1e6, 1e-3, 1e-3
@@ -170,6 +171,7 @@ def hartog(w, F):
     return np.sqrt(V**2 - (F * U) ** 2)
 
 
+@pytest.mark.slow
 def test_den_hartog():
     """The published digit: F = 0.3 of the drive, ω = 1.3: X = 1.315348196714902; and along the curve."""
     start = jl.periodic(dry, -1.2, 0.65, {"w": 1.3, "F": 0.3}, section=once)
@@ -449,6 +451,7 @@ def test_a_section_that_is_no_longer_met():
     np.testing.assert_allclose(curve.amplitude["q"], 2 * np.sqrt(curve.values), rtol=1e-3)
 
 
+@pytest.mark.slow
 def test_in_single_precision_and_late():
     """float32; and a drive that began long ago."""
     start = jl.periodic(duffing, 0.4, 0.0, PARAMS, section=once, t=1e6 * 4 * np.pi)
@@ -574,6 +577,7 @@ def test_random_pairs_of_oscillators():
             np.testing.assert_allclose(np.sort(np.abs(got)), np.sort(np.abs(expected)), rtol=1e-5, atol=1e-7)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("length", "time"), [(1.0, 1.0), (1e-9, 1e9), (1e9, 1e-9)])
 def test_from_rest_in_any_units(length, time):
     """Over the amplitude of a drive that is zero at first, at rest: q = F/|ω₀² − ω² + 2iδω|."""

@@ -372,12 +372,6 @@ def example(name):
     return names
 
 
-@pytest.mark.parametrize("name", plot.__all__)
-def test_the_example_in_the_docstring_runs(name):
-    names = example(name)
-    assert len(plt.get_fignums()) <= 1 and "plot" in names  # none, where another test has drawn it already
-
-
 def test_a_batch_is_refused():
     batch = jax.tree.map(lambda x: jnp.stack([x, x]), motion(1.0))
     with pytest.raises(ValueError, match=re.escape("`trajectory` must be one motion, but is a batch of shape (2,). Take one")):

@@ -107,6 +107,7 @@ def test_the_spectrum_of_residuals(unit):
     assert spectrum(ts, np.full(300, np.nan)) is None and spectrum(ts, np.zeros(300)) is None
 
 
+@pytest.mark.slow
 def test_what_cannot_be_printed_is_left_out_with_its_reason(tmp_path):
     """A force by Bessel functions."""
     table = lambda q: -4 * q * jax.scipy.special.i0e(0.1 * q)

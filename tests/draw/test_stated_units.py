@@ -65,6 +65,7 @@ def test_units_that_are_given_stand_in_their_place(motion):
     assert labels(motion.plot(names=("x",), units={"x": "mm"})) == ["t (s)", "x (mm)"]
 
 
+@pytest.mark.slow
 def test_units_of_a_fit(fit):
     assert labels(fit.plot())[:2] == ["", "x (m)"] and "t (s)" in labels(fit.plot())
     rows = {row["name"]: row["unit"] for row in fit.to_dict()["parameters"]}

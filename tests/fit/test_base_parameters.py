@@ -124,6 +124,7 @@ def test_what_is_determined_is_not_remarked():
 SPRINGS = jl.System(lambda q, qdot, m, c1, c2: 0.5 * m * qdot**2 - 0.5 * (c1 + c2) * q**2, dissipation=lambda qdot, b: 0.5 * b * qdot**2)
 
 
+@pytest.mark.slow
 def test_the_sum_of_two_springs_has_the_error_of_one():
     one = jl.fit(osc.SYSTEM, osc.record(0), osc.START, free=("c", "b"))
     two = jl.fit(SPRINGS, osc.record(0), {"m": 1.0, "c1": 1.0, "c2": 2.0, "b": 0.6}, free=("c1", "c2", "b"))

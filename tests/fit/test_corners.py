@@ -122,6 +122,7 @@ def test_predictions_of_events_have_their_errors():
     np.testing.assert_allclose(found.standard_errors["x"][8], abs(np.sin(2.0) / 4) * error, rtol=1e-3)
 
 
+@pytest.mark.slow
 def test_a_start_with_too_few_events_is_refused():
     with pytest.raises(ValueError, match="fewer events happen than were measured"):
         jl.fit(ringing, listened(), {"c": 0.5}, free=("c",))
@@ -170,6 +171,7 @@ def test_priors_have_a_mean(prior):
         jl.fit(SYSTEM, jl.Experiment(TIMES, noisy(6), 1.0, 0.0), START, free=("c",), priors={"c": prior})
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("unit", [1e-6, 1.0, 1e3])
 def test_a_start_at_rest_in_dry_friction(unit):
     """What sticks at the start has no velocity to be seen: "0 ± 0" stood there. The estimates against the numbers that made the record."""

@@ -80,6 +80,7 @@ def test_what_is_to_be_expected_of_a_lag_of_one_channel(fitted):
         np.testing.assert_allclose(shown[name], z, atol=1e-5 * np.max(np.abs(z)))
 
 
+@pytest.mark.slow
 def test_lags_by_channel_that_are_numbers_make_one_kind(fitted):
     """In either order; a validation finds residuals like the noise, and where the lag is left out ten times as large ones."""
     lags = {"laser": LAG, "acceleration": 0.0}

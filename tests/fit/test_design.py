@@ -85,6 +85,7 @@ def test_box_and_lucas(second):
     assert any(name.startswith("bound of times") for name in found.binding)
 
 
+@pytest.mark.slow
 def test_sample_times_of_a_motion_whose_start_is_unknown():
     """b alone matters, and v₀ is unknown: of two samples the later one is 1.278 m/b after the first."""
     plan = jl.Experiment(
@@ -176,6 +177,7 @@ def test_two_experiments_are_chosen_together():
     np.testing.assert_allclose(np.sort([one.omega[0] for one in found.experiments]), np.sort(best.x), rtol=1e-4)
 
 
+@pytest.mark.slow
 def test_a_start_on_a_constraint_and_the_force_of_a_rod():
     """A pendulum in x and y, whose rod carries no more than 1.5 of its weights: the start stays on the circle."""
     m, g, l = 0.2, 9810.0, 300.0  # kg, mm/s², mm
@@ -196,6 +198,7 @@ def test_a_start_on_a_constraint_and_the_force_of_a_rod():
     np.testing.assert_allclose(3 + 2 * q0["y"] / l, 1.5, atol=2e-6)
 
 
+@pytest.mark.slow
 def test_derivatives_of_the_cost_with_dry_friction():
     """By all that is chosen, against differences; from rest, in mm."""
     from jaxlag._fit.design_plan import Planned

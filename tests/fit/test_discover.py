@@ -117,6 +117,7 @@ def test_a_double_pendulum():
     found_as(found, {"outer": outer, "both": both, "weight_1": g1, "weight_2": g2})
 
 
+@pytest.mark.slow
 def test_a_spherical_pendulum():
     def rates(t, y):
         a, _, u, w = y
@@ -137,6 +138,7 @@ def test_a_spherical_pendulum():
     found_as(found, {"around": 1.0, "weight": 9.81})
 
 
+@pytest.mark.slow
 def test_a_bob_on_a_rod_in_x_and_y():
     """In mm and t: weight and air, where the rod is a constraint; what is constant along it has no influence."""
     m, l, g, b = 2e-4, 300.0, 9810.0, 3e-4
@@ -188,6 +190,7 @@ def speed_of(qdot):
     return {"w": qdot["a"]}
 
 
+@pytest.mark.slow
 def test_three_losses_in_one_bearing():
     """At a ratio of signal to noise of 40 dB."""
     laws = {"dry": 0.02, "viscous": 4e-4, "drag": 2e-5}
@@ -196,6 +199,7 @@ def test_three_losses_in_one_bearing():
     found_as(found, laws, within=0.05)
 
 
+@pytest.mark.slow
 def test_laws_that_a_speed_cannot_tell_apart():
     """At 20 rad/s, hardly changing, every loss is a constant: one of them, and no one knows which."""
     record = spun(lambda t: 0.02 + 3e-4 * np.sin(2 * t), {"viscous": 1e-3}, 20.0, 10.0, lambda w: 1.0)

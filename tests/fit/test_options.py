@@ -30,6 +30,7 @@ def test_fits_of_each_with_a_robust_loss():
         np.testing.assert_allclose([found.estimates[name] for name in FREE], expected.x, rtol=1e-5)
 
 
+@pytest.mark.slow
 def test_fits_of_each_estimate_the_noise_of_each_where_a_loss_is_robust():
     """One record in millimetres with ten times the noise: each as by `fit` alone, and its sigma near the true one."""
     observe = lambda q, gain: gain * q
@@ -47,6 +48,7 @@ def test_fits_of_each_estimate_the_noise_of_each_where_a_loss_is_robust():
     assert 7 < fits[0].sigma < 15 and 50 < fits[1].sigma < 150
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("start", [jl.MultiStart(16), pytest.param(jl.Regress(), marks=pytest.mark.slow)])
 def test_fits_of_each_from_a_poor_start(start):
     """c of 4 and 9 from 30, from where neither is found."""

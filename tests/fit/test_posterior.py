@@ -30,6 +30,7 @@ def given(unit):
     return PARAMS | {"F": 2.0 * unit}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("unit", UNITS)
 def test_a_linear_model_with_known_noise(unit):
     """A normal density, with the mean and the deviation of the fit; a prior adds its own."""

@@ -28,6 +28,7 @@ def test_missing_samples_have_errors_too(loss):
     np.testing.assert_allclose(upper - lower, 2 * found.quantile(0.95) * by_hand, rtol=1e-4, atol=1e-8)
 
 
+@pytest.mark.slow
 def test_what_depends_on_what_is_not_determined_has_no_finite_error():
     """A swing tells c/m alone: another swing has a finite band, the force of the spring, in N and in nN, has none."""
     system = jl.System(lambda q, qdot, m, c: 0.5 * m * qdot**2 - 0.5 * c * q**2)

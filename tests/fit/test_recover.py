@@ -17,6 +17,7 @@ def pushed_for(second, T=41, **options):
     return jl.Experiment(ts, None, q0=0.0, qdot0=0.0, sigma=0.01, **options), ts
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("second", "seed"), [(1.0, 0), (1e-4, 1)])
 def test_a_linear_model(second, seed):
     """se = σ/√Σ(t²/2)²; errors of 400 fits are normal, without bias, and as large as that, and intervals hold the truth."""

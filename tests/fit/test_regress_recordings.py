@@ -30,6 +30,7 @@ def driven():
     return table, jl.Signal(table["t"], table["torque"])
 
 
+@pytest.mark.slow
 def test_a_drive_that_sticks_at_times_under_a_digital_controller():
     """24 841 samples; the maker knows nothing of jaxlag."""
     ts, q, v, u = drive.recording()
@@ -41,6 +42,7 @@ def test_a_drive_that_sticks_at_times_under_a_digital_controller():
         assert abs(found.estimates[name] / true - 1) < 1e-3, name
 
 
+@pytest.mark.slow
 def test_a_worn_drive_whose_friction_is_unlike_in_both_directions():
     """Strokes at constant speeds: in wide windows M, Fv and Fc are hardly told apart, and their errors there know nothing of the rest."""
     ts, q, v, u, a = drive.worn()

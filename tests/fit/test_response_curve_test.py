@@ -17,6 +17,7 @@ oscillator = jl.System(
 period = lambda w: 2 * jnp.pi / w
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("unit", [1.0, 1e-6])
 def test_amplitudes_and_phases_of_a_closed_form(unit):
     """A linear oscillator, at rest at first, also of micrometres: x = Re P exp(iωt)/(c − m ω² + i b ω)."""

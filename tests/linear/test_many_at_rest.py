@@ -234,6 +234,7 @@ WITHOUT_A_HOOK = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "holonomic",
     [

@@ -319,6 +319,7 @@ rolling = lambda w, r: FLAT | {"phi": w, "x": r * w}
 REFERENCE = {"critical_spin": 0.5773502691896257, "eigen_w0p3": 0.764198926981712}  # Neimark & Fufaev; w = 0.3, unit m, r and g
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("w", [0.3, 0.5, 0.65, 3.0])
 def test_a_coin_rolls_upright_if_it_is_fast_enough(w):
     """λ² = 4g/(5r) − 12 ω²/5; five coordinates, three velocities, of which all but one pair is free."""
@@ -527,6 +528,7 @@ def test_damping_ratios_where_there_is_no_damping(derivative):
     np.testing.assert_allclose(derivative(lambda b: turned(b=b).eigenvalues.real)(0.0), [-0.5, -1.5], rtol=1e-9)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name, expected", [("w", [-4 / 3, 8 / 3]), ("p", [1 / 3, -1 / 6])])
 def test_second_derivatives_by_what_turns_an_undamped_system(name, expected):
     """Of λ⁴ + (5 + 4w²) λ² + 4 + p² = 0."""
@@ -534,12 +536,14 @@ def test_second_derivatives_by_what_turns_an_undamped_system(name, expected):
     np.testing.assert_allclose(jax.jacfwd(jax.jacfwd(frequency))(0.0), expected, rtol=1e-7)
 
 
+@pytest.mark.slow
 def test_shapes_of_an_undamped_system_are_real_and_move_with_what_drives_it():
     """q̂ = (1, x₂) with (ω² − 4) x₂ = p, at ω = 1."""
     assert turned().shapes.dtype == float
     np.testing.assert_allclose(jax.jacfwd(lambda p: turned(p=p).shapes)(0.0)[0], [0, -1 / 3], atol=1e-12)
 
 
+@pytest.mark.slow
 def test_derivatives_of_an_undamped_system_that_is_free_to_move():
     """Two masses and the spring between them: the modes under `grad` are those without it."""
     system = jl.System(lambda q, qdot, c: 0.5 * qdot @ qdot - 0.5 * c * (q[1] - q[0]) ** 2)

@@ -22,6 +22,7 @@ def valley(q, k, h):
 bead = jl.System(falls, unilateral={"valley": valley})
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("length", "time", "mass"), UNITS)
 def test_a_bead_in_a_valley(length, time, mass):
     """ω = √(g k) where it lies, though it may depart; and its derivatives by all parameters, forward and reverse."""
@@ -65,6 +66,7 @@ def test_half_a_disc_rocks():
     np.testing.assert_allclose(at.multipliers["floor"], 1.7 * 9.81, rtol=1e-12)
 
 
+@pytest.mark.slow
 def test_a_floor_that_is_shaken():
     """What stands on it, and carries a mass on a spring: ω₀²/(ω₀² − ω²); and the force in the contact."""
 
@@ -88,6 +90,7 @@ def test_a_floor_that_is_shaken():
     np.testing.assert_allclose(force, -(omega**2) * (5.0 + 2.0 * response), rtol=1e-10)
 
 
+@pytest.mark.slow
 def test_what_falls_goes_through_no_wall():
     """A mass on a spring beside a wall, x = min(a, wall) and λ = max(0, c (a − wall)); one program for starts and springs on both sides."""
     system = jl.System(lambda q, qdot, c, a: 0.5 * qdot**2 - 0.5 * c * (q - a) ** 2, unilateral={"wall": lambda q, wall: wall - q})
@@ -101,6 +104,7 @@ def test_what_falls_goes_through_no_wall():
     np.testing.assert_allclose([slopes["c"], slopes["a"], slopes["wall"]], [1.8, 30.0, -30.0], rtol=1e-12)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("length", "mass"), [(1.0, 1.0), (1e6, 1e-3), (1e-6, 1e3)])
 def test_a_table_on_four_feet(length, mass):
     """Forces of the feet of least norm where all press, and of three of them where one would pull; nothing holds what tips."""
@@ -165,6 +169,7 @@ def test_random_springs_between_walls(scale):
     assert set(counts) >= {0, 1, 2, 3}
 
 
+@pytest.mark.slow
 def test_a_block_on_a_slope_is_held_by_friction():
     """As long as μ > tan α; put beside the slope, it comes down to it."""
 
@@ -198,6 +203,7 @@ def test_where_a_contact_is_not_pressed():
     np.testing.assert_array_equal(free.A[2:], 0)
 
 
+@pytest.mark.slow
 def test_along_a_motion():
     """Of a bead that falls onto a valley and stays: a part on which nothing opens or closes."""
     params = {"m": 2.0, "g": 9.81, "k": 3.0, "h": 0.7}

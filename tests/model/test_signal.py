@@ -120,6 +120,7 @@ def test_an_oscillator_under_a_held_force(samples):
     np.testing.assert_allclose(sharp.qddot, held - C * y[:, 0] - B * y[:, 1], atol=1e-10)
 
 
+@pytest.mark.slow
 def test_jumps_are_stepped_on():
     """The same force in a function of time is found there too; passed over: seven times the steps, most of them rejected, less exact."""
     samples = np.linspace(0, 10, 41)

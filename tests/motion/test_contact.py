@@ -97,6 +97,7 @@ def test_a_step_ends_before_a_second_impact(unit):
     np.testing.assert_allclose(motion.contacts["floor"].changed[-1], end_of_bouncing(height, 0.5, g), rtol=1e-9)
 
 
+@pytest.mark.slow
 def test_derivatives_of_the_end_of_bouncing():
     """By h, e, g; forward, reverse and of second order."""
     at, together = jnp.array([H, E, G]), lambda function: lambda at: function(*at)

@@ -120,6 +120,7 @@ def laws(params, before, after):
     return max(off)
 
 
+@pytest.mark.slow
 def test_random_impacts_of_two_contacts():
     """The laws hold, to rounding, whatever sticks, slides and opens."""
     rng, kinds = np.random.default_rng(0), set()
@@ -172,6 +173,7 @@ def thrown_by_hand(mu, T, velocity=(1.0, 0.5, -1.0), spin=SPIN):
     return np.concatenate([x, after, [-e * down - g * rest], turn])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("unit", UNITS)
 def test_a_ball_with_spin(unit):
     """It slides through the first bounce with μ = 0.02, and grips with 0.2; by Poisson's law nothing else, for nothing is coupled."""

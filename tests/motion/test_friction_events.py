@@ -178,6 +178,7 @@ def test_a_bound_that_touches_zero_is_no_failure():
     assert found.succeeded and found.stats["transitions"][-1] > 4
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("pulse", [-4.0, -8.0, -30.0])
 @pytest.mark.parametrize("wide", [0.02, 0.1])
 @pytest.mark.parametrize("steady", [0.3, 0.45])

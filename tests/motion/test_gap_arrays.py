@@ -17,6 +17,7 @@ def balls(restitution, law=None):
     return jl.System(lambda q, qdot, m, g: jnp.sum(0.5 * m * qdot["y"] ** 2 - m * g * q["y"]), unilateral={"floor": contact})
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("metre", [1.0, 1e-6])
 @pytest.mark.parametrize("law", [jl.NewtonRestitution(), jl.PoissonRestitution()])
 def test_each_gap_has_its_restitution(law, metre):
@@ -68,6 +69,7 @@ def motions():
     return [jl.simulate(body(array), *START, ts, PARAMS) for array in (True, False)]
 
 
+@pytest.mark.slow
 def test_an_array_is_as_many_contacts(motions):
     """The same motion, forces and impacts as of contacts by name."""
     one, two = motions
@@ -111,6 +113,7 @@ def test_what_is_shown(motions, tmp_path):
     plot.forces(motion)
 
 
+@pytest.mark.slow
 def test_events_of_an_array():
     """An event that names the contact happens at the impact of any of its gaps."""
     system = jl.System(

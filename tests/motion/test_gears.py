@@ -64,6 +64,7 @@ def test_efficiency_of_a_worm_gear():
             np.testing.assert_allclose(motion.work()["worm"][-1], -mu * 50.0 * 9.81 * 0.1 / 60 * 20.0, rtol=1e-9)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("metre", "second", "kilogram", "t0"), [(1.0, 1.0, 1.0, 0.0), (1e9, 1e-6, 1e3, 1e9), (1e-3, 1e3, 1e-6, 0.0)])
 def test_a_locked_worm_holds_its_load(metre, second, kilogram, t0):
     """In any units, from a height that is not zero; and that its friction did no work balances."""

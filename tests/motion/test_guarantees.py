@@ -116,6 +116,7 @@ def test_a_mechanism_driven_beyond_its_reach(system, q0):
         jl.simulate(system, q0, 0 * q0, TS)
 
 
+@pytest.mark.slow
 def test_a_crank_driven_beyond_its_reach():
     """cos q = ½ + t is followed up to t = ½, whoever asks; its derivative by a factor of the angle is that of arccos."""
     run = lambda a: jl.simulate(turned, 1.0, 0.0, TS, {"a": a}, throw=False).q

@@ -100,6 +100,7 @@ def check_random_machines(count, seed, surfaces=4):
     assert seen > count
 
 
+@pytest.mark.slow
 def test_random_machines_against_events_of_scipy():
     check_random_machines(30, 0)
 
@@ -110,6 +111,7 @@ def test_many_random_machines_against_events_of_scipy(surfaces):
     check_random_machines(70, surfaces, surfaces)
 
 
+@pytest.mark.slow
 def test_a_table_is_located_knot_by_knot():
     """Energy of ½q̇² + a·V(q) with V broken is kept to rounding, from knot to knot; the last position is that of parabolas."""
     knots = np.linspace(-2, 2, 21)
@@ -175,6 +177,7 @@ OF_A_STATE = jl.System(FREE, force=lambda z, f: jnp.where(z > 0.2, f, 0.0), stat
 OF_BOTH = jl.System(FREE, force=lambda t, q, t0, f, c: jnp.where(t + c * q > t0, f, 0.0))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("system", [OF_TIME, OF_A_STATE, OF_BOTH], ids=["time", "a state", "time and position"])
 @pytest.mark.parametrize("derivative", [jax.jacfwd, jax.jacrev])
 def test_a_load_that_begins(system, derivative):
@@ -218,6 +221,7 @@ def test_a_motion_that_rattles_about_a_jump_is_named():
         jl.simulate(system, 1.0, 0.0, np.array([0.0, 12.0]), max_steps=20_000)
 
 
+@pytest.mark.slow
 def test_a_witness_that_jumps_where_others_pass_through_zero():
     """A force f on the first third of each cell of width a, and −f/2 on the rest: potential energy is that of straight pieces."""
     system = jl.System(FREE, force=lambda q, a, f: f * jnp.where(jnp.mod(q, a) < a / 3, 1.0, -0.5))
@@ -241,6 +245,7 @@ def test_a_witness_that_jumps_where_others_pass_through_zero():
         np.testing.assert_allclose(jax.grad(last)(x, unit)[0], slope, rtol=1e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("solver", [diffrax.Kvaerno5(), jl.Dopri5(), diffrax.Tsit5()])
 def test_other_solvers(solver):
     """A half period of contact, and back: q(T) = a − (T − a − π/ω); an implicit stage that was not solved for ended the motion."""
@@ -251,6 +256,7 @@ def test_other_solvers(solver):
     np.testing.assert_allclose(slopes, [2.0, -np.pi / 16], rtol=1e-5)
 
 
+@pytest.mark.slow
 def test_friction_and_a_constraint_whose_numbers_jump():
     """A block on a straight wire slides from friction F into friction 3F at a: v² = v₀² − 2 F a, and on for (v²)/(6F)."""
     system = jl.System(
@@ -276,6 +282,7 @@ FLOORS = pytest.mark.parametrize(  # in the loop for each purpose, too
 )
 
 
+@pytest.mark.slow
 @FLOORS
 def test_a_floor_that_bends(events):
     """A ball without restitution slides along a floor and leaves it where the floor falls away: x = a + v t, y = −g t²/2."""
@@ -297,6 +304,7 @@ def test_a_floor_that_bends(events):
 STOP = jl.System(lambda q, qdot, a, c: 0.5 * qdot**2 - 0.5 * c * jnp.maximum(q - a, 0.0) ** 2)
 
 
+@pytest.mark.slow
 def test_many_motions_samples_and_steps():
     """As one by one: at samples between the ends of steps, for members with surfaces of their own, and step by step."""
     ts, stops = np.linspace(0, 3, 31), np.array([0.4, 0.9, 1.4])
@@ -327,6 +335,7 @@ def test_none_is_located_where_that_is_chosen_or_there_are_many():
     assert not surface.located and jl.examine(STOP, 0.3, 0.0, {"a": 0.5, "c": 4.0}).surfaces[0].located
 
 
+@pytest.mark.slow
 @FLOORS
 def test_a_floor_that_rises_strikes(events):
     """A ball slides along a floor up to a slope of 45° at a, with restitution e: q̇ = (1, 0) becomes ((1 − e)/2, (1 + e)/2)."""
@@ -346,6 +355,7 @@ def test_a_floor_that_rises_strikes(events):
         np.testing.assert_allclose(jax.jacfwd(last)(0.4, length), [0.75, -0.75], rtol=1e-7)
 
 
+@pytest.mark.slow
 def test_second_derivatives():
     """Of the slope that one runs up: the block is at rest at a + v²/2f."""
     system = jl.System(FREE, force=lambda q, a, f: jnp.where(q > a, -f, 0.0))
@@ -367,6 +377,7 @@ SATURATED = jl.System(
 )
 
 
+@pytest.mark.slow
 def test_a_controller_that_saturates():
     """By position, velocity and integral; against events of SciPy between the three linear systems."""
 
@@ -399,6 +410,7 @@ def test_a_controller_that_saturates():
         np.testing.assert_allclose(slope, difference, rtol=1e-5, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_an_event_of_a_velocity_beside_a_surface():
     """With constant forces: where q̇ = v₁, beyond a."""
     system = jl.System(FREE, force=lambda q, a: jnp.where(q > a, 3.0, 1.0), events={"fast": jl.Event(lambda qdot: qdot - 2.5)})
@@ -433,6 +445,7 @@ def test_a_relay_with_hysteresis(length, time):
     np.testing.assert_allclose(slope, 4 * b / (F * np.tanh(b * half / 2) ** 2), rtol=1e-6)
 
 
+@pytest.mark.slow
 def test_the_transmission_error_of_a_gear_with_play():
     """Under a load M the driven wheel lags by half the play and M/c, and leads by as much where M is reversed; and derivatives."""
     mesh = jl.System(

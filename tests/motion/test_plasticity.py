@@ -161,6 +161,7 @@ def by_phases(x, z, m, k, c, F, ts):
     return np.array([dict(found)[t] for t in ts])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("length", "mass", "time"),
     [

@@ -190,6 +190,7 @@ LEAD = jl.System(
 )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("L", "T", "t0"), [(1.0, 1.0, 0.0), (1e-9, 1e6, 1e9)])
 @pytest.mark.parametrize(("a", "b"), [(1.0, 0.3), (1.0, 0.0), (0.0, 0.3)])
 def test_the_work_of_a_drive_that_gives_the_only_coordinate(L, T, t0, a, b):
@@ -213,6 +214,7 @@ def test_the_work_of_a_drive_that_gives_the_only_coordinate(L, T, t0, a, b):
         np.testing.assert_allclose(derivative(lambda x: run(x)[0])(x), by_hand, atol=2e-6)
 
 
+@pytest.mark.slow
 def test_works_of_a_net_that_hooks_hold():
     """What a constraint holds does no work: with works along the motion takes no more steps (20 times as many where the hooks set them)."""
     flat = np.stack(np.meshgrid(*2 * [0.1 * np.arange(20)], [0.0], indexing="ij"), axis=-1)[:, :, 0]

@@ -86,6 +86,7 @@ def motions(name, units, count):
         yield motion(length * q, length / time * v, params)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "units"),
     [("two elements", (1e-6, 1e-3)), ("beside a slider", (1e3, 1e-6)), ("on a rod", (1.0, 1.0)), ("on a floor", (1e-6, 1e-3))],
@@ -143,6 +144,7 @@ EVENTFUL = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["two elements", "smooth, on a rod", "beyond a stop"])
 def test_events_are_those_of_a_loop_for_each_purpose(name, monkeypatch):
     _compare_events(name, monkeypatch, 12)
@@ -192,6 +194,7 @@ def _compare_events(name, monkeypatch, count):
     assert failed <= count / 60  # a loop for each purpose ends where a slip turns at infinitely many impacts
 
 
+@pytest.mark.slow
 def test_where_all_times_are_the_same_there_is_the_start():
     """Behind the impact there, and in the mode that holds."""
     ball = jl.System(lambda q, qdot, g: 0.5 * qdot**2 - g * q, unilateral={"floor": jl.Contact(lambda q: q, 0.8)})
@@ -230,6 +233,7 @@ def loops(program):
             yield from loops(part)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("name", "most"), [("on a rod", 8), ("in a plane", 4)])
 def test_equations_stand_once_in_the_loop(name, most):
     """Of an energy that holds erf, derivatives and the projection included; a loop for each purpose held 19 and 7 of them."""

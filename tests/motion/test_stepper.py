@@ -56,6 +56,7 @@ def test_a_block_under_forces_that_jump(late):
     assert state.t == late + 40 * dt and state.result == jl.results.RESULTS.successful
 
 
+@pytest.mark.slow
 def test_a_ball_that_bounces():
     """At times beside its impacts, by closed form."""
     g, dt = 9.81 * LENGTH / TIME**2, 0.01 * TIME
@@ -71,6 +72,7 @@ def test_a_ball_that_bounces():
     np.testing.assert_allclose(q, expected, atol=1e-9 * LENGTH)
 
 
+@pytest.mark.slow
 def test_a_ball_at_rest_is_lifted():
     """A force that jumps leaves it on the floor while it is less than the weight, and then none of its derivatives moves it."""
     pushed_ball = jl.System(ball.lagrangian[0][1], force=lambda u: u, unilateral=dict(ball.unilateral))
@@ -90,6 +92,7 @@ def test_a_ball_at_rest_is_lifted():
         np.testing.assert_allclose(found, expected, rtol=1e-7, atol=1e-9 * dt**2 / LENGTH)
 
 
+@pytest.mark.slow
 def test_derivatives_of_all_orders():
     """Of cos(√c t) by c, forward, reverse and twice; and by each of the forces on the way, beside differences."""
     n, dt = 7, 0.3 * TIME
@@ -104,6 +107,7 @@ def test_derivatives_of_all_orders():
         np.testing.assert_allclose(derivative(end)(c), derivative(exact)(c), rtol=1e-6)
 
 
+@pytest.mark.slow
 def test_derivatives_by_forces_that_jump():
     """By each of the forces, and by a bound; none while a block rests under less than that, be it zero or not."""
     dt, F = 0.7 * TIME, 3e-3 * LENGTH / TIME**2
@@ -138,6 +142,7 @@ def test_a_batch_of_starts():
     np.testing.assert_allclose(states.t, 1.0)
 
 
+@pytest.mark.slow
 def test_constraints_states_and_events_are_those_of_simulate():
     """A rod with friction in its joint, a filter of its height, and a kick each time that it passes the lowest point."""
     system = jl.System(
@@ -200,6 +205,7 @@ def test_derivatives_by_many_numbers():
         np.testing.assert_allclose(found, expected, rtol=1e-5, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_single_precision():
     """Steps and their states keep the precision that they are given."""
     stepper = jl.stepper(ball, 0.05, {"g": 9.81})

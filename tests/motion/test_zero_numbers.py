@@ -108,6 +108,7 @@ def test_a_stepper_and_a_batch_at_rest(a):
             np.testing.assert_allclose(2e-4 * mode(of)(jnp.asarray(a)), 0.0, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_second_derivatives_at_rest():
     of = lambda a: end_of(a)[-1]
     quiet = jl.System(

@@ -30,6 +30,7 @@ def test_a_block_with_the_least_effort(unit, second):
     assert "cost 12" in str(best) or unit != 1 or second != 1
 
 
+@pytest.mark.slow
 def test_derivatives_of_the_least_effort():
     """J = 12 m² s²/T³, by mass, way and time, forwards and backwards, also where the block is to stay where it is."""
 

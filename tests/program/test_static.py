@@ -226,6 +226,30 @@ def test_what_a_function_refers_to_is_seen_when_it_changes():
     assert Static.of(leaves, jax.tree.structure(0)) != Static.of((scope["make"](),), jax.tree.structure(0))
 
 
+def test_a_function_that_counts_its_calls_is_traced_once(lowered):
+    calls = []
+
+    def kinetic(qdot):
+        calls.append(qdot)
+        return 0.5 * qdot**2
+
+    system = jl.System(kinetic)
+    assert [float(jl.energy(system, 0.0, v)) for v in (1.0, 2.0, 3.0)] == [0.5, 2.0, 4.5]
+    once = len(calls)
+    assert jl.energy(system, 0.0, 4.0) == 8.0 and len(calls) == once and sum(lowered.values()) <= 2
+
+
+def test_a_method_that_changes_is_seen():
+    scope = notebook(
+        "class Mass(eqx.Module):\n    m: float\n    def __call__(self, qdot): return 0.5 * self.m * qdot**2", eqx=eqx, __name__="__main__"
+    )
+    first = jl.System(scope["Mass"](2.0))
+    assert jl.energy(first, 0.0, 1.0) == 1.0
+    exec("def heavier(self, qdot): return self.m * qdot**2\nMass.__call__ = heavier", scope)
+    assert jl.energy(first, 0.0, 1.0) == 2.0
+    assert jl.energy(jl.System(scope["Mass"](2.0)), 0.0, 1.0) == 2.0
+
+
 def test_nothing_is_kept_alive():
     held = jnp.arange(3.0)
     system = jl.System(lambda qdot: 0.5 * held @ held * qdot**2)  # noqa: F821
