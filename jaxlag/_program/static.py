@@ -45,7 +45,7 @@ class Static:
         return True
 
     def was_traced(self) -> None:
-        """Has been evaluated: a function that has changed what it refers to itself, as one that counts its calls, is not watched further."""
+        """A function that has changed what it refers to itself meanwhile, as one that counts its calls, is not watched any longer."""
         if not self._is_unchanged():
             self.unchanged = []
 
