@@ -69,8 +69,28 @@ def fresh_caches():
 
 
 @pytest.fixture
+def monkeypatch(monkeypatch):
+    """Where the package is changed, no program serves that was compiled before, nor one afterwards that was compiled with the change."""
+    changes = []
+
+    def forgetting(change):
+        def changed(*given, **named):
+            jax.clear_caches()
+            changes.append(change)
+            return change(*given, **named)
+
+        return changed
+
+    monkeypatch.setattr, monkeypatch.setitem = forgetting(monkeypatch.setattr), forgetting(monkeypatch.setitem)
+    yield monkeypatch
+    if changes:
+        jax.clear_caches()
+
+
+@pytest.fixture
 def lowered():
-    """How often each program is lowered to be compiled, during a test."""
+    """How often each program is lowered to be compiled, during a test, before which nothing is."""
+    jax.clear_caches()
     counts = collections.Counter()
 
     def listen(event, _, fun_name=None, **__):

@@ -211,7 +211,6 @@ def test_a_regression_does_not_depend_on_units(held):
         np.testing.assert_allclose(*(jax.tree.leaves(of.standard_errors) for of in (other, plain)), rtol=1e-4)
 
 
-@pytest.mark.slow
 def test_standard_errors_are_at_least_the_scatter_of_the_estimates():
     """Of forty recordings with white noise, which tell their standard deviation to 11 %. With a few dozen windows that overlap, errors are
     on the wide side: 2.2 to 2.8 times as large, since each window is judged without its neighbours, as by the jackknife.

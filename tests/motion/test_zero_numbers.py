@@ -86,6 +86,7 @@ def test_a_number_near_zero_is_no_other(tiny):
     np.testing.assert_allclose(jax.jacfwd(of)(jnp.array([tiny, 0.0])), zero, atol=1e-7 * np.max(np.abs(zero)))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("a", [0.0, 1e-3])
 def test_a_stepper_and_a_batch_at_rest(a):
     free = jl.System(

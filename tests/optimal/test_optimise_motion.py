@@ -139,6 +139,7 @@ def test_the_brachistochrone():
     np.testing.assert_allclose(best.q, cycloid, atol=2e-4)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("end", "steps"), [pytest.param(0.5 * np.pi, 12, marks=pytest.mark.slow), (np.pi, 20)])
 def test_a_pendulum_in_two_forms(end, steps):
     """From hanging to the side, and up to where it stands, in φ and in x, y with a rod: J and λ agree to 1e-8, and J with SciPy's. That the
@@ -173,6 +174,7 @@ def test_a_pendulum_in_two_forms(end, steps):
     np.testing.assert_allclose(one.cost, integrate.simpson((found.sol(s)[3] / (2 * m * l**2)) ** 2, x=s), rtol=1e-8)
 
 
+@pytest.mark.slow
 def test_a_pendulum_in_any_units():
     """From hanging to standing, x from rounding to rounding, by an input without bounds: cost and derivative, with lengths and the clock
     by 1e9 and 1e-9.
@@ -487,6 +489,7 @@ def test_in_single_precision():
     np.testing.assert_allclose(best.duration, 2.0, rtol=1e-3)
 
 
+@pytest.mark.slow
 def test_in_a_batch_and_under_jit():
     J = lambda m: (
         jl.optimise_motion(block, REST, (1.0, 0.0), {"m": m}, duration=1.0, control={"u": (-30, 30)}, cost=effort, nodes=4, starts=1).cost
