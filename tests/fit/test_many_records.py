@@ -113,7 +113,6 @@ def test_many_starts_of_many_records(without_zeros):
     assert abs(one.estimates["c"] - 4.0) < 4 * one.standard_errors["c"] and abs(one.estimates["b"] - 0.3) < 4 * one.standard_errors["b"]
 
 
-@pytest.mark.slow
 def test_a_singular_value_decomposition_that_fails_is_no_convergence(monkeypatch):
     """As that of 802 columns did, which was taken for a step of length zero. What counts is then found from the squares."""
     svd = lambda R, full_matrices: tuple(x * jnp.nan for x in np.linalg.svd(np.eye(R.shape[1])))

@@ -30,7 +30,6 @@ def test_fits_of_each_with_a_robust_loss():
         np.testing.assert_allclose([found.estimates[name] for name in FREE], expected.x, rtol=1e-5)
 
 
-@pytest.mark.slow
 def test_fits_of_each_estimate_the_noise_of_each_where_a_loss_is_robust():
     """One record in millimetres with ten times the noise: each as by `fit` alone, and its sigma near the true one."""
     observe = lambda q, gain: gain * q
