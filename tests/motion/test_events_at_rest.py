@@ -34,7 +34,6 @@ def test_a_block_on_an_incline_stays_and_stops_where_it_should(units):
         np.testing.assert_allclose([jax.grad(stop)(mu), jax.jacfwd(stop)(mu)], slope_of_it, rtol=1e-8)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("late", [0.0, 1e9], ids=["from 0", "from 1e9"])
 @pytest.mark.parametrize("units", UNITS.values(), ids=UNITS)
 def test_what_a_force_tears_off_stops_when_it_should(units, late):
@@ -55,7 +54,6 @@ def test_what_a_force_tears_off_stops_when_it_should(units, late):
     assert np.all(np.isnan(held.events["stops"].ts))
 
 
-@pytest.mark.slow
 def test_two_blocks_that_hold_each_other_have_no_event():
     witness = lambda qdot: 0.3 * qdot["a"] + qdot["b"]
     directions = jl.direction.Either(), jl.direction.Falling(), jl.direction.Rising(), jl.direction.Negative()

@@ -113,7 +113,6 @@ def test_what_is_shown(motions, tmp_path):
     plot.forces(motion)
 
 
-@pytest.mark.slow
 def test_events_of_an_array():
     """An event that names the contact happens at the impact of any of its gaps."""
     system = jl.System(
