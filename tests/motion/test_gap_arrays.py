@@ -69,7 +69,6 @@ def motions():
     return [jl.simulate(body(array), *START, ts, PARAMS) for array in (True, False)]
 
 
-@pytest.mark.slow
 def test_an_array_is_as_many_contacts(motions):
     """The same motion, forces and impacts as of contacts by name."""
     one, two = motions

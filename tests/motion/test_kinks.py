@@ -100,7 +100,6 @@ def check_random_machines(count, seed, surfaces=4):
     assert seen > count
 
 
-@pytest.mark.slow
 def test_random_machines_against_events_of_scipy():
     check_random_machines(30, 0)
 
@@ -377,7 +376,6 @@ SATURATED = jl.System(
 )
 
 
-@pytest.mark.slow
 def test_a_controller_that_saturates():
     """By position, velocity and integral; against events of SciPy between the three linear systems."""
 

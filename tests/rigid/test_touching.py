@@ -94,7 +94,6 @@ def test_slip_and_rate_of_the_gap_are_those_of_points(kind):
         np.testing.assert_allclose(slips[-1], against @ axes[:, :2], atol=1e-7)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("kind", KINDS)
 def test_derivatives_of_gaps_and_slips(kind):
     """Forward and reverse, against differences."""
