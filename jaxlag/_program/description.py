@@ -152,7 +152,7 @@ class Words:
             self.say("method")
             self.value(x.__func__)
             self.value(x.__self__)
-        elif isinstance(x, functools.partial):
+        elif type(x) is functools.partial:
             self.say("partial")
             for part in (x.func, x.args, tuple(sorted(x.keywords.items()))):
                 self.value(part)

@@ -3,15 +3,14 @@
 Expected numbers are closed forms: a program that was mistaken for another one would return those of the other.
 """
 
-import dataclasses
 import functools
 
 import diffrax as dfx
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from callables import Spring, Stiff
 
 import jaxlag as jl
 
@@ -55,23 +54,6 @@ def test_a_motion_is_found_where_all_is_the_same_and_only_there(compilation_cach
     for file in tmp_path.glob("jaxlag-*"):  # as after a full disk
         file.write_bytes(file.read_bytes()[:-1000])
     np.testing.assert_allclose(motion(oscillator()), cosine(3.0), atol=1e-7)
-
-
-class Spring(eqx.Module):
-    """A system's function with numbers in it."""
-
-    c: float
-
-    def __call__(self, q, qdot):
-        return 0.5 * qdot**2 - 0.5 * self.c * q**2
-
-
-@dataclasses.dataclass(frozen=True)
-class Stiff:
-    c: float
-
-    def force(self, q):
-        return -self.c * q
 
 
 @pytest.mark.slow

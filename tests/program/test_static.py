@@ -4,7 +4,6 @@ Expected numbers are evaluated by the functions themselves, in Python: a program
 """
 
 import collections
-import dataclasses
 import functools
 import gc
 import math
@@ -17,6 +16,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from callables import Spring, Stiff
 
 import jaxlag as jl
 from jaxlag._program.description import NotDescribable, Words
@@ -108,23 +108,6 @@ def test_what_changes_is_not_mistaken(change, name):
     scope |= {"sin": jnp.sin, "constant": jnp.asarray(1.0)}
     scope.pop("max", None)
     assert value(again()) == pytest.approx(before, rel=1e-12)
-
-
-class Spring(eqx.Module):
-    """A function with numbers in it."""
-
-    c: float
-
-    def __call__(self, q, qdot):
-        return 0.5 * qdot**2 - 0.5 * self.c * q**2
-
-
-@dataclasses.dataclass(frozen=True)
-class Stiff:
-    c: float
-
-    def force(self, q):
-        return -self.c * q
 
 
 def closing_over(x):
